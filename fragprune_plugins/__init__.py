@@ -1,0 +1,35 @@
+"""fragprune: learned fragment pruning for every Gaussian-splatting codebase.
+
+Importing this package imports neither torch nor any host; names load when they are first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fragprune_plugins.engines import rasterize
+    from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "RasterInputs": "types",
+    "RasterOutputs": "types",
+    "Splats": "types",
+    "View": "types",
+    "rasterize": "engines",
+}
+
+__all__ = ["RasterInputs", "RasterOutputs", "Splats", "View", "__version__", "rasterize"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

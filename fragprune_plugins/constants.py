@@ -1,0 +1,43 @@
+"""The field's constants and ours, each once, with its reason.
+
+The native headers hold the same numbers (``native/include/fragprune.h``); a test compares the two.
+"""
+
+from typing import Final
+
+ALPHA_MIN: Final = 1.0 / 255.0
+"""A fragment fainter than one 8-bit step is skipped (forward.cu, renderCUDA)."""
+
+ALPHA_MAX: Final = 0.99
+"""Alpha is capped here, so that one fragment never ends a pixel's transmittance by division."""
+
+TRANSMITTANCE_MIN: Final = 1e-4
+"""A pixel stops before the fragment that would leave less light than (1 - ALPHA_MAX)^2."""
+
+NEAR: Final = 0.2
+"""View-space depth at or below which a Gaussian is culled; the host's only frustum test."""
+
+TILE: Final = 16
+"""Side of a tile in pixels."""
+
+DILATION: Final = 0.3
+"""What vanilla 3DGS adds to the 2D covariance's diagonal, pixels^2."""
+
+FRUSTUM_MARGIN: Final = 1.3
+"""The Jacobian is evaluated with x/z, y/z clamped to this many times the half field of view."""
+
+ANTIALIASING_FLOOR: Final = 2.5e-5
+"""Least ratio of determinants under the square root of the antialiasing compensation."""
+
+RIM_WIDTH: Final = 0.01
+"""Width w, in falloff, of the logistic surrogate s((g - tau)/w) at the rim. Flat from .003 to .03."""
+
+RIM_REACH: Final = 4.6
+"""The backward pass visits fragments down to tau - RIM_REACH * RIM_WIDTH: there s(1-s) is 0.01."""
+
+FALLOFF_MIN: Final = 1e-4
+"""Least falloff the widened backward bound may take: keeps the cutoff -2 ln(.) finite."""
+
+NEUTRAL_LOGIT: Final = -30.0
+"""The neutral threshold's logit. Its cutoff Q = 60 exceeds 2 ln 255 = 11.08, the largest radius
+that the 1/255 skip leaves any Gaussian, so a neutral threshold decides nothing, exactly."""

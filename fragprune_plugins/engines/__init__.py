@@ -1,0 +1,76 @@
+"""Engines: implementations of one contract, rasterization with a threshold per Gaussian."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+from fragprune_plugins.errors import EngineError, InputError
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+ENGINES = ("reference", "cpu")
+
+
+class Engine(Protocol):
+    """What every engine does; inputs that require gradients get them."""
+
+    name: str
+
+    def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
+        """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+
+
+def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
+    """The engine by name; "auto" takes the fastest that runs on the device.
+
+    Raises:
+        EngineError: an unknown name, or an engine that cannot run here.
+    """
+    if name == "auto":
+        from fragprune_plugins.native import loader
+
+        on_cpu = str(device).startswith("cpu")
+        name = "cpu" if on_cpu and loader.available() else "reference"
+    if name == "cpu":
+        from fragprune_plugins.engines.cpu import CpuEngine
+
+        return CpuEngine()
+    if name == "reference":
+        from fragprune_plugins.engines.reference import ReferenceEngine
+
+        return ReferenceEngine()
+    raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
+
+
+def rasterize(
+    inputs: RasterInputs, thresholds: Tensor | None = None, *, engine: str | Engine = "auto"
+) -> RasterOutputs:
+    """Draw splats, each truncated at its own threshold. Differentiable; any engine.
+
+    A fragment of Gaussian i is drawn iff q <= min(-2 ln tau_i, 2 ln(255 o_i)), q its squared
+    Mahalanobis distance; the gradient of tau comes from a logistic surrogate at the rim.
+
+    Args:
+        inputs: camera and Gaussians.
+        thresholds: (N,) falloff in (0, 1), or None.
+        engine: a name ("auto", "reference", "cpu") or an engine object.
+
+    Raises:
+        InputError: thresholds that do not match the Gaussians.
+        EngineError: no such engine here.
+    """
+    n = len(inputs.splats)
+    if thresholds is not None and tuple(thresholds.shape) != (n,):
+        raise InputError(
+            "thresholds",
+            f"shape {tuple(thresholds.shape)}",
+            f"({n},), one per Gaussian",
+            "Pass the thresholds of this very model.",
+        )
+    if isinstance(engine, str):
+        engine = create_engine(engine, inputs.splats.means.device)
+    return engine.rasterize(inputs, thresholds)

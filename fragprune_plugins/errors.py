@@ -1,0 +1,114 @@
+"""Every error a user can meet: where, what was found, what was expected, what to do."""
+
+from __future__ import annotations
+
+
+class FragpruneError(Exception):
+    """Base of all stated failures; the command line prints it without a traceback, exit code 1.
+
+    Args:
+        where: file, seam or option that the error is about.
+        found: what was there.
+        expected: what should have been there.
+        remedy: the next thing to do, in the imperative.
+    """
+
+    code = "error"
+
+    def __init__(self, where: str, found: str, expected: str, remedy: str) -> None:
+        self.where, self.found, self.expected, self.remedy = where, found, expected, remedy
+        super().__init__(f"[{self.code}] {where}: {found}; expected {expected}. {remedy}")
+
+    def as_dict(self) -> dict[str, str]:
+        """The message's parts, for ``--json``."""
+        return {
+            "code": self.code,
+            "where": self.where,
+            "found": self.found,
+            "expected": self.expected,
+            "remedy": self.remedy,
+        }
+
+
+class ModelFileError(FragpruneError):
+    """A PLY that is missing, truncated, empty, not finite, or not a Gaussian splat."""
+
+    code = "model-file"
+
+
+class DatasetError(FragpruneError):
+    """Photographs or cameras that are missing, of an unknown kind, or do not match each other."""
+
+    code = "dataset"
+
+
+class SidecarError(FragpruneError):
+    """A sidecar that is broken or belongs to another model."""
+
+    code = "sidecar"
+
+
+class OutputError(FragpruneError):
+    """A place that cannot be written."""
+
+    code = "output"
+
+
+class AlignmentError(FragpruneError):
+    """Thresholds and Gaussians no longer correspond row by row."""
+
+    code = "row-mismatch"
+
+
+class UnknownHostError(FragpruneError):
+    """No adapter fits the codebase."""
+
+    code = "unknown-host"
+
+
+class SeamError(FragpruneError):
+    """A host lacks a function we wrap, or has it with other parameters."""
+
+    code = "seam"
+
+
+class LateImportError(FragpruneError):
+    """The host imported what we must wrap before we were activated."""
+
+    code = "late-import"
+
+
+class SessionError(FragpruneError):
+    """Activation out of order: twice at once, or none active."""
+
+    code = "session"
+
+
+class EngineError(FragpruneError):
+    """No engine can do what was asked here."""
+
+    code = "engine"
+
+
+class InputError(FragpruneError):
+    """Tensors of the wrong shape, dtype or device."""
+
+    code = "input"
+
+
+class PluginError(FragpruneError):
+    """A plugin that cannot be loaded or breaks a hook's contract."""
+
+    code = "plugin"
+
+
+class UsageError(FragpruneError):
+    """Options that contradict each other; exit code 2."""
+
+    code = "usage"
+
+
+class Interrupted(FragpruneError):  # noqa: N818 - a person's wish, not a fault
+    """Ctrl-C during stage 2, after what was learned has been saved; exit code 130."""
+
+    code = "interrupted"

@@ -1,0 +1,241 @@
+"""What one rasterization takes and gives. Frozen values; shapes are checked on construction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from fragprune_plugins.constants import DILATION
+from fragprune_plugins.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def _check(name: str, tensor: Tensor | None, *shape: int | None) -> None:
+    """Raise InputError unless tensor is None or has the shape (None: any length)."""
+    if tensor is None:
+        return
+    fits = tensor.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, tensor.shape, strict=True)
+    )
+    if not fits:
+        want = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
+        raise InputError(
+            name, f"shape {tuple(tensor.shape)}", f"shape {want}", "Check the call's arguments."
+        )
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera at one moment, in the hosts' convention.
+
+    Matrices act on row vectors (the hosts keep them transposed): ``p_view = [p, 1] @ viewmatrix``.
+
+    Attributes:
+        width: pixels.
+        height: pixels.
+        tan_fov_x: tangent of half the horizontal field of view.
+        tan_fov_y: tangent of half the vertical field of view.
+        viewmatrix: (4, 4) world to camera, x right, y down, z forward.
+        projmatrix: (4, 4) world to clip; it alone decides where means land on the image.
+        campos: (3,) camera centre in the world, for view-dependent colour.
+        background: (3,) RGB.
+    """
+
+    width: int
+    height: int
+    tan_fov_x: float
+    tan_fov_y: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    campos: Tensor
+    background: Tensor
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise InputError(
+                "View", f"{self.width}x{self.height} pixels", "at least 1x1", "Check the camera."
+            )
+        _check("View.viewmatrix", self.viewmatrix, 4, 4)
+        _check("View.projmatrix", self.projmatrix, 4, 4)
+        _check("View.campos", self.campos, 3)
+        _check("View.background", self.background, 3)
+
+    @classmethod
+    def pinhole(
+        cls,
+        rotation: Tensor,
+        translation: Tensor,
+        *,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float | None = None,
+        cy: float | None = None,
+        background: Tensor | None = None,
+    ) -> View:
+        """A pinhole camera; the principal point may be off centre (the hosts ignore theirs).
+
+        Args:
+            rotation: (3, 3) world to camera, ``p_cam = rotation @ p_world + translation``.
+            translation: (3,).
+            width: pixels.
+            height: pixels.
+            fx: focal length, pixels.
+            fy: focal length, pixels.
+            cx: principal point, pixels, COLMAP convention (centre of the image = width / 2).
+            cy: principal point, pixels.
+            background: (3,) RGB; black when None.
+        """
+        import torch
+
+        tan_x, tan_y = width / (2 * fx), height / (2 * fy)
+        view = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
+        view[:3, :3] = rotation.T
+        view[3, :3] = translation
+        # 3DGS's getProjectionMatrix (znear .01, zfar 100), plus the principal point's offset.
+        near, far = 0.01, 100.0
+        clip = torch.zeros_like(view)
+        clip[0, 0] = 1 / tan_x
+        clip[1, 1] = 1 / tan_y
+        clip[2, 0] = 0.0 if cx is None else 2 * cx / width - 1
+        clip[2, 1] = 0.0 if cy is None else 2 * cy / height - 1
+        clip[2, 2] = far / (far - near)
+        clip[2, 3] = 1.0
+        clip[3, 2] = -(far * near) / (far - near)
+        return cls(
+            width=width,
+            height=height,
+            tan_fov_x=tan_x,
+            tan_fov_y=tan_y,
+            viewmatrix=view,
+            projmatrix=view @ clip,
+            campos=-rotation.T @ translation,
+            background=view.new_zeros(3) if background is None else background,
+        )
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians, activated. Either scales and rotations or cov3d; either sh or colors.
+
+    Attributes:
+        means: (N, 3) world.
+        opacities: (N,) in (0, 1).
+        scales: (N, 3) standard deviations, world units.
+        rotations: (N, 4) quaternions w, x, y, z; used as given, the host normalises.
+        cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz; scale_modifier does not apply.
+        sh: (N, K, 3), K = (degree + 1)^2 or more.
+        colors: (N, 3) RGB, used as given.
+        sh_degree: 0 to 3, how many bands of ``sh`` are used.
+    """
+
+    means: Tensor
+    opacities: Tensor
+    scales: Tensor | None = None
+    rotations: Tensor | None = None
+    cov3d: Tensor | None = None
+    sh: Tensor | None = None
+    colors: Tensor | None = None
+    sh_degree: int = 0
+
+    def __post_init__(self) -> None:
+        _check("Splats.means", self.means, None, 3)
+        n = len(self.means)
+        _check("Splats.opacities", self.opacities, n)
+        _check("Splats.scales", self.scales, n, 3)
+        _check("Splats.rotations", self.rotations, n, 4)
+        _check("Splats.cov3d", self.cov3d, n, 6)
+        _check("Splats.sh", self.sh, n, None, 3)
+        _check("Splats.colors", self.colors, n, 3)
+        if (self.scales is None) != (self.rotations is None) or (
+            (self.scales is None) == (self.cov3d is None)
+        ):
+            raise InputError(
+                "Splats",
+                "scales, rotations and cov3d as given",
+                "exactly one of (scales and rotations) or cov3d",
+                "Pass one of the two.",
+            )
+        if (self.sh is None) == (self.colors is None):
+            raise InputError(
+                "Splats",
+                "both or neither of sh and colors",
+                "exactly one of them",
+                "Pass one of the two.",
+            )
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(
+                "Splats.sh_degree", str(self.sh_degree), "0 to 3", "Lower the SH degree."
+            )
+        if self.sh is not None and self.sh.shape[1] < (self.sh_degree + 1) ** 2:
+            raise InputError(
+                "Splats.sh",
+                f"{self.sh.shape[1]} coefficients",
+                f"at least {(self.sh_degree + 1) ** 2} for degree {self.sh_degree}",
+                "Lower the SH degree or pass all coefficients.",
+            )
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+@dataclass(frozen=True)
+class RasterInputs:
+    """One rasterization, of any dialect the engines know.
+
+    Attributes:
+        view: the camera.
+        splats: the Gaussians.
+        means2d_hook: (N, 3) or None; values unused, its gradient is the host's NDC-scaled screen
+            gradient (x0.5 W, x0.5 H) in [:, :2] and 0 in [:, 2].
+        scale_modifier: factor on the scales.
+        dilation: pixels^2 added to the 2D covariance's diagonal.
+        antialiasing: multiply opacity by sqrt(max(2.5e-5, det before / det after dilation)).
+        counts: also count drawn fragments per pixel and per Gaussian.
+    """
+
+    view: View
+    splats: Splats
+    means2d_hook: Tensor | None = None
+    scale_modifier: float = 1.0
+    dilation: float = DILATION
+    antialiasing: bool = False
+    counts: bool = False
+
+    def __post_init__(self) -> None:
+        _check("RasterInputs.means2d_hook", self.means2d_hook, len(self.splats), None)
+
+    def with_counts(self) -> RasterInputs:
+        """The same, counting fragments per pixel and per Gaussian."""
+        return replace(self, counts=True)
+
+
+@dataclass(frozen=True)
+class RasterOutputs:
+    """What every engine returns; adapters pick what their host wants.
+
+    Attributes:
+        image: (3, H, W) RGB with background, not clamped.
+        radii: (N,) int32, the HOST's rule: ceil(3 sigma), 0 when culled by the host, thresholds
+            never change it.
+        invdepth: (1, H, W) sum of alpha T / z, no background term.
+        alpha: (1, H, W) 1 - final transmittance.
+        fragments_per_pixel: scalar, drawn fragments over pixels; differentiable in the thresholds
+            through the rim surrogate, so ``loss + pressure * fragments_per_pixel`` is the fragment
+            pressure.
+        evaluated_per_pixel: (Gaussian, pixel) pairs the engine tested, its waste included.
+        fragments: (H, W) int32 drawn fragments per pixel, when counts were asked for.
+        fragments_per_gaussian: (N,) int32 drawn fragments, when counts were asked for.
+    """
+
+    image: Tensor
+    radii: Tensor
+    invdepth: Tensor
+    alpha: Tensor
+    fragments_per_pixel: Tensor
+    evaluated_per_pixel: float
+    fragments: Tensor | None = None
+    fragments_per_gaussian: Tensor | None = None
