@@ -30,7 +30,7 @@ ANTIALIASING_FLOOR: Final = 2.5e-5
 """Least ratio of determinants under the square root of the antialiasing compensation."""
 
 RIM_WIDTH: Final = 0.01
-"""Width w, in falloff, of the logistic surrogate s((g - tau)/w) at the rim. Flat from .003 to .03."""
+"""Width w, in falloff, of the surrogate s((g - tau)/w) at the rim; results are flat .003 to .03."""
 
 RIM_REACH: Final = 4.6
 """The backward pass visits fragments down to tau - RIM_REACH * RIM_WIDTH: there s(1-s) is 0.01."""

@@ -1,0 +1,197 @@
+"""The threshold store: one truncation threshold per Gaussian of one model, and its optimizer.
+
+Hosts index their optimizer's groups by name and fail on a foreign one, so the store owns its own
+Adam. Row operations mirror what hosts do to theirs, moments included.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.constants import ALPHA_MIN, NEUTRAL_LOGIT
+from fragprune_plugins.errors import AlignmentError, SidecarError
+
+_START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
+_START_MAX = 0.99
+
+
+class ThresholdStore:
+    """Truncation thresholds tau = sigmoid(logit) of N Gaussians, in falloff, each in (0, 1).
+
+    A new store is neutral: the host's own 1/255 skip decides everywhere, exactly, and gradients
+    cannot move it. ``open`` starts learning.
+
+    Args:
+        count: N, number of Gaussians.
+        device: where the model lives.
+        lr: initial learning rate on the logits (science: 0.05 to 0.1; too small shows no effect).
+    """
+
+    def __init__(self, count: int, device: torch.device | str = "cpu", lr: float = 0.05) -> None:
+        self.steps = 0
+        self._bind(torch.full((count,), NEUTRAL_LOGIT, device=device), lr)
+
+    def _bind(self, logits: Tensor, lr: float) -> None:
+        self.logits = logits.detach().clone().requires_grad_(True)
+        # eps as the hosts have it: a larger one freezes thresholds whose gradients are tiny.
+        self.optimizer = torch.optim.Adam([self.logits], lr=lr, eps=1e-15)
+
+    def __len__(self) -> int:
+        return len(self.logits)
+
+    @property
+    def values(self) -> Tensor:
+        """(N,) thresholds in (0, 1); differentiable with respect to the logits."""
+        return torch.sigmoid(self.logits)
+
+    @property
+    def neutral(self) -> bool:
+        """True while no threshold decides anything."""
+        return bool((self.logits <= NEUTRAL_LOGIT).all())
+
+    def open(self, opacities: Tensor) -> None:
+        """Start learning: neutral rows move to just below the skip limit 1/(255 o).
+
+        There the image is still the host's, and the rim's gradient reaches the threshold.
+
+        Args:
+            opacities: (N,) or (N, 1), activated.
+        """
+        opacities = opacities.detach().reshape(-1).to(self.logits)
+        self._expect(len(opacities), "open")
+        limit = (ALPHA_MIN / opacities.clamp_min(1e-12)).clamp_max(_START_MAX)
+        start = torch.logit(limit * (1 - _START_MARGIN))
+        with torch.no_grad():
+            neutral = self.logits <= NEUTRAL_LOGIT
+            self.logits.copy_(torch.where(neutral, start, self.logits))
+
+    def step(self, lr: float | None = None) -> None:
+        """One optimizer step on the gradient gathered since the last; clears it."""
+        if lr is not None:
+            self.optimizer.param_groups[0]["lr"] = lr
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.steps += 1
+
+    def keep(self, mask: Tensor) -> None:
+        """Keep the rows where mask (N,) bool is True, in their order, with their moments."""
+        mask = torch.as_tensor(mask, device=self.logits.device)
+        if mask.dtype != torch.bool or mask.ndim != 1:
+            raise AlignmentError(
+                "ThresholdStore.keep",
+                f"a {mask.dtype} mask of shape {tuple(mask.shape)}",
+                f"a bool mask ({len(self)},)",
+                "Pass the rows to keep as booleans.",
+            )
+        self._expect(len(mask), "keep")
+        self._resize(lambda rows: rows[mask])
+
+    def append(self, count: int, parents: Tensor | None = None) -> None:
+        """Append rows at the end.
+
+        Args:
+            count: how many.
+            parents: (count,) int64, the rows whose thresholds the new ones inherit; neutral when
+                None. Moments of new rows are zero, as the hosts' are.
+        """
+        if parents is None:
+            new = torch.full((count,), NEUTRAL_LOGIT, device=self.logits.device)
+        else:
+            parents = self._rows(parents, count, "append")
+            new = self.logits.detach()[parents]
+        self._resize(lambda rows: torch.cat([rows, rows.new_zeros(count)]), tail=new)
+
+    def copy(self, source: Tensor, target: Tensor) -> None:
+        """Relocation: rows ``target`` take threshold and moments of rows ``source``, both (M,)."""
+        target = self._rows(target, len(target), "copy")
+        source = self._rows(source, len(target), "copy")
+
+        def moved(rows: Tensor) -> Tensor:
+            rows = rows.clone()
+            rows[target] = rows[source]
+            return rows
+
+        self._resize(moved)
+
+    def replace(self, count: int) -> None:
+        """Another population altogether: count neutral rows, fresh moments."""
+        lr = self.optimizer.param_groups[0]["lr"]
+        self._bind(torch.full((count,), NEUTRAL_LOGIT, device=self.logits.device), lr)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Logits, moments and counters; tensors are copies."""
+        state = self.optimizer.state.get(self.logits, {})
+        zeros = torch.zeros_like(self.logits)
+        return {
+            "logits": self.logits.detach().clone(),
+            "exp_avg": state.get("exp_avg", zeros).detach().clone(),
+            "exp_avg_sq": state.get("exp_avg_sq", zeros).detach().clone(),
+            "adam_step": float(state.get("step", 0.0)),
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` gave, bit for bit.
+
+        Raises:
+            SidecarError: the state's parts do not fit together.
+        """
+        rows = {key: state[key] for key in ("logits", "exp_avg", "exp_avg_sq")}
+        if len({tuple(t.shape) for t in rows.values()}) != 1 or rows["logits"].ndim != 1:
+            raise SidecarError(
+                "threshold state",
+                f"shapes {[tuple(t.shape) for t in rows.values()]}",
+                "three equal (N,)",
+                "Use a sidecar written by fragprune.",
+            )
+        device, lr = self.logits.device, self.optimizer.param_groups[0]["lr"]
+        self._bind(rows["logits"].to(device), lr)
+        self.steps = int(state["steps"])
+        if state["adam_step"] > 0:
+            self._set_moments(
+                rows["exp_avg"].to(device).clone(),
+                rows["exp_avg_sq"].to(device).clone(),
+                torch.tensor(float(state["adam_step"])),
+            )
+
+    def _set_moments(self, exp_avg: Tensor, exp_avg_sq: Tensor, step: Tensor) -> None:
+        self.optimizer.state[self.logits] = {
+            "step": step,
+            "exp_avg": exp_avg,
+            "exp_avg_sq": exp_avg_sq,
+        }
+
+    def _resize(self, change: Any, tail: Tensor | None = None) -> None:
+        """Apply a row operation to logits and moments alike; tail overwrites the last logits."""
+        old = self.optimizer.state.get(self.logits)
+        lr = self.optimizer.param_groups[0]["lr"]
+        logits = change(self.logits.detach())
+        if tail is not None and len(tail):
+            logits[-len(tail) :] = tail
+        self._bind(logits, lr)
+        if old:
+            self._set_moments(change(old["exp_avg"]), change(old["exp_avg_sq"]), old["step"])
+
+    def _rows(self, rows: Tensor, count: int, operation: str) -> Tensor:
+        rows = torch.as_tensor(rows, dtype=torch.int64, device=self.logits.device)
+        inside = rows.ndim == 1 and bool(((rows >= 0) & (rows < len(self))).all())
+        if not inside or len(rows) != count:
+            raise AlignmentError(
+                f"ThresholdStore.{operation}",
+                f"{len(rows)} row indices for {count} rows",
+                f"{count} indices in [0, {len(self)})",
+                "Report this with the host's name: its rows changed in a way the adapter misread.",
+            )
+        return rows
+
+    def _expect(self, count: int, operation: str) -> None:
+        if count != len(self):
+            raise AlignmentError(
+                f"ThresholdStore.{operation}",
+                f"{count} Gaussians",
+                f"{len(self)}, one per threshold",
+                "Report this with the host's name: its rows changed without the store seeing it.",
+            )
