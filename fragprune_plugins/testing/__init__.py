@@ -1,0 +1,1 @@
+"""What proves an engine or an adapter: seeded scenes and the conformance kit."""

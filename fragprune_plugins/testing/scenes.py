@@ -1,0 +1,351 @@
+"""Small seeded scenes for tests of engines. Same seed, same scene, in every dtype, on every device.
+
+Everything is drawn in float64 on the CPU from a generator of its own, then cast: a float32 and a
+float64 engine see the same Gaussians up to rounding, and the global random stream is never touched.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
+from fragprune_plugins.types import RasterInputs, Splats, View
+
+SH_DC = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+def random_scene(
+    seed: int,
+    n: int = 60,
+    width: int = 40,
+    height: int = 28,
+    *,
+    sh_degree: int = 1,
+    colors: bool = False,
+    cov3d: bool = False,
+    antialiasing: bool = False,
+    scale_modifier: float = 1.0,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> RasterInputs:
+    """Anisotropic splats of 0.3 to 12 pixels before a turned camera, awkward ones included.
+
+    Of each ten, one hugs a tile border, one lies off the image and one is behind the near plane or
+    behind the camera. Opacities run from 0.02 to 0.999, some colour channels clamp at zero, and
+    the first two share a mean, hence a depth.
+
+    Args:
+        seed: of the whole scene.
+        n: Gaussians; 0 is allowed.
+        width: pixels.
+        height: pixels.
+        sh_degree: 0 to 3; ``sh`` always has all 16 coefficients.
+        colors: give RGB colours instead of ``sh``.
+        cov3d: give 3D covariances instead of scales and rotations.
+        antialiasing: as in ``RasterInputs``.
+        scale_modifier: as in ``RasterInputs``.
+        dtype: of every tensor.
+        device: of every tensor.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    view = random_view(generator, width, height)
+    pixels, depths = _placements(generator, n, width, height)
+    means = unproject(view, pixels, depths)
+    if n > 1:
+        means = torch.cat([means[:1], means[:1], means[2:]])
+    splats = Splats(
+        means=means,
+        opacities=_uniform(generator, 0.02, 0.999, n),
+        scales=_scales(generator, view, depths.abs().clamp(min=0.2)),
+        rotations=_rotations(generator, n),
+        sh=_sh(generator, n),
+        sh_degree=sh_degree,
+    )
+    if colors:
+        splats = replace(splats, sh=None, colors=_uniform(generator, 0.0, 1.2, n, 3), sh_degree=0)
+    if cov3d:
+        splats = with_cov3d(splats)
+    inputs = RasterInputs(
+        view=view, splats=splats, antialiasing=antialiasing, scale_modifier=scale_modifier
+    )
+    return cast(inputs, dtype, device)
+
+
+def random_thresholds(
+    seed: int, n: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> Tensor:
+    """(N,) thresholds, log-uniform in 0.001 to 0.7; of each eight one neutral, one near 1."""
+    generator = torch.Generator().manual_seed(seed)
+    tau = _uniform(generator, math.log(1e-3), math.log(0.7), n).exp()
+    index = torch.arange(n)
+    tau = torch.where(index % 8 == 6, torch.sigmoid(torch.tensor(NEUTRAL_LOGIT).double()), tau)
+    return torch.where(index % 8 == 7, 0.98, tau).to(dtype).to(device)
+
+
+def one_splat(
+    pixel: tuple[float, float] = (8.0, 8.0),
+    *,
+    width: int = 17,
+    height: int = 17,
+    sigma: tuple[float, float] = (2.0, 2.0),
+    angle: float = 0.0,
+    depth: float = 2.0,
+    opacity: float = 0.8,
+    color: tuple[float, float, float] = (0.9, 0.5, 0.1),
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    dtype: torch.dtype = torch.float32,
+) -> RasterInputs:
+    """One flat splat facing an untransformed camera: every pixel can be computed by hand.
+
+    Args:
+        pixel: where its mean lands; (0, 0) is the centre of the first pixel.
+        width: pixels.
+        height: pixels.
+        sigma: standard deviations in the image before dilation, pixels.
+        angle: from the image's x axis to the first of them, radians.
+        depth: view-space depth.
+        opacity: before any compensation.
+        color: RGB.
+        background: RGB.
+        dtype: of every tensor.
+    """
+    view = _plain_view(width, height, background)
+    at = torch.tensor([pixel], dtype=torch.float64)
+    z = torch.tensor([depth], dtype=torch.float64)
+    per_pixel = depth / width  # _plain_view: the focal length is the width
+    splats = Splats(
+        means=unproject(view, at, z),
+        opacities=torch.tensor([opacity]).double(),
+        scales=torch.tensor([[sigma[0] * per_pixel, sigma[1] * per_pixel, 1e-6]]).double(),
+        rotations=torch.tensor([[math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]]).double(),
+        colors=torch.tensor([color]).double(),
+    )
+    return cast(RasterInputs(view=view, splats=splats), dtype)
+
+
+def two_overlapping(
+    *, opacities: tuple[float, float] = (0.6, 0.7), dtype: torch.dtype = torch.float32
+) -> RasterInputs:
+    """A red splat before a green one, stored back first, over a blue background; 24x20 pixels."""
+    back = one_splat(
+        (13.0, 10.0),
+        depth=3.0,
+        opacity=opacities[1],
+        color=(0.0, 1.0, 0.0),
+        background=(0.0, 0.0, 1.0),
+        dtype=dtype,
+        width=24,
+        height=20,
+    )
+    front = one_splat(
+        (10.0, 9.0),
+        sigma=(3.0, 1.5),
+        angle=0.5,
+        opacity=opacities[0],
+        color=(1.0, 0.0, 0.0),
+        dtype=dtype,
+        width=24,
+        height=20,
+    )
+    return replace(back, splats=concatenate(back.splats, front.splats))
+
+
+def stack(
+    opacities: list[float], *, dtype: torch.dtype = torch.float32, width: int = 17, height: int = 17
+) -> RasterInputs:
+    """Splats behind one another at the image's centre, first in front: for transmittance."""
+    layers = [
+        one_splat(
+            ((width - 1) / 2, (height - 1) / 2),
+            width=width,
+            height=height,
+            depth=2.0 + 0.5 * i,
+            opacity=opacity,
+            color=(1.0 / (i + 1), 0.5, 0.1 * (i % 10)),
+            background=(0.2, 0.3, 0.4),
+            dtype=dtype,
+        )
+        for i, opacity in enumerate(opacities)
+    ]
+    joined = layers[0].splats
+    for layer in layers[1:]:
+        joined = concatenate(joined, layer.splats)
+    return replace(layers[0], splats=joined)
+
+
+def behind_camera(*, dtype: torch.dtype = torch.float32) -> RasterInputs:
+    """Three splats that the near plane culls (z = -2, 0.1, exactly 0); nothing is drawn."""
+    scene = one_splat(background=(0.1, 0.2, 0.3), dtype=torch.float64)
+    means = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.1], [0.1, 0.0, 0.0]]).double()
+    splats = concatenate(concatenate(scene.splats, scene.splats), scene.splats)
+    return cast(replace(scene, splats=replace(splats, means=means)), dtype)
+
+
+def empty(
+    width: int = 20, height: int = 18, *, sh_degree: int = 1, dtype: torch.dtype = torch.float32
+) -> RasterInputs:
+    """A scene of no Gaussians at all over a coloured background."""
+    return random_scene(0, 0, width, height, sh_degree=sh_degree, dtype=dtype)
+
+
+def leaves(inputs: RasterInputs) -> tuple[RasterInputs, dict[str, Tensor]]:
+    """The same inputs made of fresh leaves that require gradients, and those leaves by name.
+
+    Names are the fields of ``Splats`` that are present, "background" and "means2d_hook" (zeros).
+    """
+    splats: dict[str, Any] = {
+        name: tensor.detach().clone().requires_grad_()
+        for name, tensor in _tensors(inputs.splats).items()
+    }
+    background = inputs.view.background.detach().clone().requires_grad_()
+    hook = torch.zeros_like(inputs.splats.means).requires_grad_()
+    made = replace(
+        inputs,
+        splats=replace(inputs.splats, **splats),
+        view=replace(inputs.view, background=background),
+        means2d_hook=hook,
+    )
+    return made, {**splats, "background": background, "means2d_hook": hook}
+
+
+def cast(
+    inputs: RasterInputs, dtype: torch.dtype, device: torch.device | str = "cpu"
+) -> RasterInputs:
+    """The same inputs in another dtype, on another device."""
+
+    def convert(value: View | Splats) -> dict[str, Any]:
+        return {k: t.to(dtype).to(device).contiguous() for k, t in _tensors(value).items()}
+
+    hook = inputs.means2d_hook
+    return replace(
+        inputs,
+        view=replace(inputs.view, **convert(inputs.view)),
+        splats=replace(inputs.splats, **convert(inputs.splats)),
+        means2d_hook=None if hook is None else hook.to(dtype).to(device),
+    )
+
+
+def concatenate(first: Splats, second: Splats) -> Splats:
+    """Both, first's rows first; they must have the same fields."""
+    others = _tensors(second)
+    joined: dict[str, Any] = {
+        name: torch.cat([t, others[name]]) for name, t in _tensors(first).items()
+    }
+    return replace(first, **joined)
+
+
+def with_cov3d(splats: Splats) -> Splats:
+    """The same Gaussians given by 3D covariances instead of scales and rotations."""
+    if splats.scales is None or splats.rotations is None:
+        return splats
+    w, x, y, z = splats.rotations.unbind(-1)
+    rotation = torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        dim=-2,
+    )
+    half = rotation * splats.scales[:, None, :]
+    full = half @ half.mT
+    i, j = torch.triu_indices(3, 3)
+    return replace(splats, scales=None, rotations=None, cov3d=full[:, i, j])
+
+
+def random_view(generator: torch.Generator, width: int, height: int) -> View:
+    """A camera turned and moved at random, focal lengths unequal, background not black; float64."""
+    rotation = _rotation_matrix(_rotations(generator, 1)[0])
+    translation = torch.randn(3, generator=generator, dtype=torch.float64)
+    fx, fy = _uniform(generator, 0.8, 1.3, 2).tolist()
+    return View.pinhole(
+        rotation,
+        translation,
+        width=width,
+        height=height,
+        fx=fx * width,
+        fy=fy * width,
+        background=_uniform(generator, 0.0, 1.0, 3),
+    )
+
+
+def unproject(view: View, pixels: Tensor, depths: Tensor) -> Tensor:
+    """(N, 3) world points that land on pixels (N, 2) at depths (N,); inverse of the projection."""
+    size = pixels.new_tensor([view.width, view.height])
+    tangents = pixels.new_tensor([view.tan_fov_x, view.tan_fov_y])
+    ndc = (2 * pixels + 1) / size - 1
+    points = torch.cat([ndc * tangents * depths[:, None], depths[:, None]], dim=1)
+    rotation, translation = view.viewmatrix[:3, :3], view.viewmatrix[3, :3]
+    return (points - translation) @ rotation.T
+
+
+def _plain_view(width: int, height: int, background: tuple[float, float, float]) -> View:
+    """An untransformed camera of focal length width, float64."""
+    return View.pinhole(
+        torch.eye(3, dtype=torch.float64),
+        torch.zeros(3, dtype=torch.float64),
+        width=width,
+        height=height,
+        fx=width,
+        fy=width,
+        background=torch.tensor(background).double(),
+    )
+
+
+def _placements(
+    generator: torch.Generator, n: int, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Pixels (N, 2) and view depths (N,): most inside, some on tile borders, outside, behind."""
+    size = torch.tensor([width, height]).double()
+    pixels = _uniform(generator, -0.05, 1.05, n, 2) * size
+    depths = _uniform(generator, 1.0, 8.0, n)
+    kind = torch.arange(n) % 10
+    border = (pixels / TILE).round() * TILE + _uniform(generator, -0.02, 0.02, n, 2)
+    pixels = torch.where((kind == 3)[:, None], border, pixels)
+    outside = _uniform(generator, 1.1, 2.0, n, 2) * size
+    pixels = torch.where((kind == 5)[:, None], outside, pixels)
+    return pixels, torch.where(kind == 8, _uniform(generator, -3.0, 0.19, n), depths)
+
+
+def _scales(generator: torch.Generator, view: View, depths: Tensor) -> Tensor:
+    """(N, 3) standard deviations of 0.3 to 12 pixels, log-uniform per axis, in world units."""
+    pixels = _uniform(generator, math.log(0.3), math.log(12.0), len(depths), 3).exp()
+    return pixels * (depths * 2 * view.tan_fov_x / view.width)[:, None]
+
+
+def _sh(generator: torch.Generator, n: int) -> Tensor:
+    """(N, 16, 3) coefficients around mid-grey, wide enough that some channels go below zero."""
+    sh = torch.randn(n, 16, 3, generator=generator, dtype=torch.float64) * 0.25
+    dc = _uniform(generator, -0.15, 1.0, n, 1, 3)
+    return torch.cat([(dc - 0.5) / SH_DC, sh[:, 1:]], dim=1)
+
+
+def _rotations(generator: torch.Generator, n: int) -> Tensor:
+    """(N, 4) unit quaternions w, x, y, z."""
+    quaternions = torch.randn(n, 4, generator=generator, dtype=torch.float64)
+    return torch.nn.functional.normalize(quaternions, dim=-1)
+
+
+def _rotation_matrix(quaternion: Tensor) -> Tensor:
+    """(3, 3) rotation of a unit quaternion (4,): the vector part's exponential."""
+    w, x, y, z = quaternion.tolist()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]).double()
+    turn: Tensor = torch.eye(3, dtype=torch.float64) + 2 * w * cross + 2 * cross @ cross
+    return turn
+
+
+def _uniform(generator: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
+    """Uniform float64 numbers in [low, high)."""
+    return torch.rand(*shape, generator=generator, dtype=torch.float64) * (high - low) + low
+
+
+def _tensors(value: View | Splats) -> dict[str, Any]:
+    """The dataclass's fields that are tensors, by name."""
+    pairs = ((f.name, getattr(value, f.name)) for f in fields(value))
+    return {name: tensor for name, tensor in pairs if isinstance(tensor, Tensor)}
