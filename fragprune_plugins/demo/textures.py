@@ -1,0 +1,117 @@
+"""Textures of the demo room: photographs that scikit-image carries in its wheel, or seeded noise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Texture = NDArray[np.float32]
+"""(H, W, 3) linear RGB, wraps around."""
+
+
+def linear(srgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Display values to linear light, by a plain power: both directions are exact inverses."""
+    return np.power(srgb, np.float32(2.2))
+
+
+def displayed(light: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Linear light to display values in [0, 1]."""
+    return np.power(np.clip(light, 0, 1), np.float32(1 / 2.2))
+
+
+def colour(red: float, green: float, blue: float) -> Texture:
+    """One display colour as a (1, 1, 3) texture."""
+    return linear(np.array([[[red, green, blue]]], dtype=np.float32))
+
+
+def photograph(name: str, size: int, rng: np.random.Generator) -> Texture:
+    """A photograph from scikit-image's wheel, (size, size, 3); noise where the wheel lacks it.
+
+    Only the file in the installation is read; nothing is fetched.
+    """
+    import skimage
+    from PIL import Image
+
+    path = Path(skimage.__file__).parent / "data" / name
+    if not path.is_file():
+        return noise(size, rng) * colour(0.8, 0.7, 0.6)
+    with Image.open(path) as image:
+        side = min(image.size)
+        left, top = (image.width - side) // 2, (image.height - side) // 2
+        square = image.convert("RGB").crop((left, top, left + side, top + side))
+        small = square.resize((size, size), Image.Resampling.LANCZOS)
+    return linear(np.asarray(small, dtype=np.float32) / 255)
+
+
+def noise(size: int, rng: np.random.Generator, contrast: float = 0.5) -> Texture:
+    """Fractal noise around 1, (size, size, 3) grey, seamless."""
+    total = np.zeros((size, size), dtype=np.float32)
+    cells, weight = 4, 1.0
+    while cells <= size:
+        grid = rng.standard_normal((cells, cells)).astype(np.float32)
+        total += weight * np.roll(_enlarge(grid, size), size // 3, (0, 1))
+        cells, weight = cells * 2, weight * 0.6
+    total *= contrast / np.abs(total).max()
+    return np.repeat((1 + total)[..., None], 3, axis=2)
+
+
+def planks(size: int, rng: np.random.Generator, count: int = 6) -> Texture:
+    """Wooden boards along the first axis, with grain, knots' worth of waviness and dark joints."""
+    v, u = np.mgrid[0:size, 0:size].astype(np.float32) / size
+    board = np.floor(u * count).astype(int)
+    shade = rng.uniform(0.7, 1.15, count).astype(np.float32)[board]
+    wave = noise(size, rng, 1.0)[..., 0] - 1
+    shift = rng.uniform(0, 1, count).astype(np.float32)[board]
+    # Grain of a whole number of periods: seamless along the board.
+    along = np.sin(2 * np.pi * (v + shift))
+    grain = 0.88 + 0.12 * np.sin(2 * np.pi * (u * count * 5 + 0.5 * along + 1.5 * wave))
+    across = u * count - board
+    joint = np.where((across < 0.03) | (across > 0.97), 0.35, 1.0)
+    joint = np.where(np.abs((v + shift) % 1 - 0.5) < 0.004, 0.35, joint)
+    tint = linear(np.array([0.76, 0.56, 0.37], dtype=np.float32))
+    return ((shade * grain * joint)[..., None] * tint).astype(np.float32)
+
+
+def stripes(size: int, colours: list[Texture], rng: np.random.Generator) -> Texture:
+    """Equal woven stripes across the first axis."""
+    index = np.arange(size) * len(colours) // size
+    rows = np.stack([c[0, 0] for c in colours])[index]
+    return (rows[:, None, :] * noise(size, rng, 0.45)).astype(np.float32)
+
+
+def checker(size: int, first: Texture, second: Texture, count: int = 2) -> Texture:
+    """Squares, ``count`` a side (even, so that they continue when the texture wraps)."""
+    cell = np.arange(size) * count // size
+    odd = ((cell[:, None] + cell[None, :]) % 2).astype(bool)
+    return np.where(odd[..., None], first[0, 0], second[0, 0]).astype(np.float32)
+
+
+def sample(texture: Texture, u: NDArray[np.float32], v: NDArray[np.float32]) -> Texture:
+    """Bilinear look-up at u (right) and v (up), one repeat per unit; returns (n, 3)."""
+    height, width = texture.shape[:2]
+    if height == width == 1:
+        return np.broadcast_to(texture[0, 0], (len(u), 3))
+    x, y = u * width - 0.5, -v * height - 0.5
+    x0, y0 = np.floor(x), np.floor(y)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    left, top = x0.astype(np.int32) % width, y0.astype(np.int32) % height
+    right, bottom = (left + 1) % width, (top + 1) % height
+    flat = texture.reshape(-1, 3)
+    upper = flat[top * width + left] * (1 - fx) + flat[top * width + right] * fx
+    lower = flat[bottom * width + left] * (1 - fx) + flat[bottom * width + right] * fx
+    mixed: Texture = upper * (1 - fy) + lower * fy
+    return mixed
+
+
+def _enlarge(grid: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Resample a wrapping grid to (size, size), smoothly."""
+    at = np.arange(size) / size * len(grid)
+    low = np.floor(at).astype(int)
+    part = (at - low).astype(np.float32)
+    part = part * part * (3 - 2 * part)
+    high = (low + 1) % len(grid)
+    rows = grid[low] * (1 - part)[:, None] + grid[high] * part[:, None]
+    columns: NDArray[np.float32] = rows[:, low] * (1 - part) + rows[:, high] * part
+    return columns

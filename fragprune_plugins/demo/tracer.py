@@ -1,0 +1,278 @@
+"""A small ray caster: boxes, balls and poles, one sun, hard shadows. Vectorised over rays.
+
+Rays are kept as (3, n) float32, coordinate first; every shape is intersected with all rays at
+once, which numpy does without holding the interpreter, so views trace in parallel threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fragprune_plugins.demo.textures import Texture, sample
+
+Array = NDArray[np.float32]
+FAR = np.float32(1e6)
+_SKIN = np.float32(1e-3)  # a shadow ray starts this far off the surface, world units
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a surface looks like.
+
+    Attributes:
+        texture: linear RGB.
+        repeat: world units per repeat; 0 stretches the texture once over each face.
+        gloss: strength of the sun's highlight; 0 is matt.
+        glow: light given off, times the texture.
+    """
+
+    texture: Texture
+    repeat: float = 0.0
+    gloss: float = 0.0
+    glow: float = 0.0
+
+
+class Shape(Protocol):
+    """Something rays hit."""
+
+    @property
+    def material(self) -> Material:
+        """What it looks like."""
+
+    def bound(self) -> tuple[Array, float]:
+        """A ball that holds the shape: its centre (3,) and radius."""
+
+    def distance(self, origin: Array, direction: Array) -> Array:
+        """Where rays (3, n) enter the shape, (n,); FAR where they miss it."""
+
+    def surface(self, point: Array) -> tuple[Array, Array, Array]:
+        """Normal (3, n) and texture coordinates u (n,), v (n,) of points on the surface."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cuboid turned about the vertical.
+
+    Attributes:
+        centre: (x, y, z).
+        half: half the edges.
+        material: of all six faces.
+        yaw: degrees.
+    """
+
+    centre: tuple[float, float, float]
+    half: tuple[float, float, float]
+    material: Material
+    yaw: float = 0.0
+    _turn: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        c, s = np.cos(np.radians(self.yaw)), np.sin(np.radians(self.yaw))
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=np.float32)
+        object.__setattr__(self, "_turn", turn)
+
+    def _local(self, point: Array) -> Array:
+        local: Array = self._turn @ (point - np.array(self.centre, dtype=np.float32)[:, None])
+        return local
+
+    def bound(self) -> tuple[Array, float]:
+        """The ball through the corners."""
+        return np.array(self.centre, dtype=np.float32), float(np.linalg.norm(self.half))
+
+    def distance(self, origin: Array, direction: Array) -> Array:
+        """Slab test."""
+        start, half = self._local(origin), np.array(self.half, dtype=np.float32)[:, None]
+        ray = self._turn @ direction
+        inverse = 1 / np.where(np.abs(ray) < 1e-9, np.float32(1e-9), ray)
+        middle, reach = -start * inverse, half * np.abs(inverse)
+        enter, leave = (middle - reach).max(axis=0), (middle + reach).min(axis=0)
+        return np.where((enter < leave) & (enter > 0), enter, FAR)
+
+    def surface(self, point: Array) -> tuple[Array, Array, Array]:
+        """The face is the one whose plane is nearest."""
+        local, half = self._local(point), np.array(self.half, dtype=np.float32)[:, None]
+        axis = np.argmin(np.abs(np.abs(local) - half), axis=0)
+        every = np.arange(point.shape[1])
+        sign = np.sign(local[axis, every])
+        normal = np.zeros_like(local)
+        normal[axis, every] = sign
+        # Upright texture on the sides, seen from above on the top.
+        across, up = np.where(axis == 0, 1, 0), np.where(axis == 2, 1, 2)
+        mirror = np.where(axis == 0, sign, np.where(axis == 1, -sign, 1.0))
+        u, v = local[across, every] * mirror, local[up, every]
+        if self.material.repeat:
+            u, v = u / self.material.repeat, v / self.material.repeat
+        else:
+            u = 0.5 + 0.5 * u / half[across, 0]
+            v = 0.5 + 0.5 * v / half[up, 0]
+        return self._turn.T @ normal, u.astype(np.float32), v.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A sphere.
+
+    Attributes:
+        centre: (x, y, z).
+        radius: world units.
+        material: wrapped twice around, once from pole to pole.
+    """
+
+    centre: tuple[float, float, float]
+    radius: float
+    material: Material
+
+    def bound(self) -> tuple[Array, float]:
+        """The ball itself."""
+        return np.array(self.centre, dtype=np.float32), self.radius
+
+    def distance(self, origin: Array, direction: Array) -> Array:
+        """Nearest root of the quadratic; directions are unit vectors."""
+        start = origin - np.array(self.centre, dtype=np.float32)[:, None]
+        b = (start * direction).sum(axis=0)
+        c = (start * start).sum(axis=0) - np.float32(self.radius**2)
+        inside = b * b - c
+        t = -b - np.sqrt(np.maximum(inside, 0))
+        return np.where((inside > 0) & (t > 0), t, FAR)
+
+    def surface(self, point: Array) -> tuple[Array, Array, Array]:
+        """Longitude and latitude."""
+        normal = (point - np.array(self.centre, dtype=np.float32)[:, None]) / self.radius
+        u = np.arctan2(normal[1], normal[0]) / np.pi
+        v = np.arcsin(np.clip(normal[2], -1, 1)) / np.pi
+        return normal, u, v
+
+
+@dataclass(frozen=True)
+class Pole:
+    """A cylinder without caps, of any direction.
+
+    Attributes:
+        start: one end.
+        end: the other end.
+        radius: world units.
+        material: ``repeat`` world units per repeat along it, once around.
+    """
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+    material: Material
+
+    def _axis(self) -> tuple[Array, Array, np.float32]:
+        base = np.array(self.start, dtype=np.float32)[:, None]
+        along = np.array(self.end, dtype=np.float32)[:, None] - base
+        length = np.float32(np.linalg.norm(along))
+        return base, along / length, length
+
+    def bound(self) -> tuple[Array, float]:
+        """The ball around the middle."""
+        base, axis, length = self._axis()
+        return (base + axis * length / 2)[:, 0], float(length) / 2 + self.radius
+
+    def distance(self, origin: Array, direction: Array) -> Array:
+        """The quadratic in the plane across the axis, then a test of the height."""
+        base, axis, length = self._axis()
+        start = origin - base
+        rise, height = (direction * axis).sum(axis=0), (start * axis).sum(axis=0)
+        across, offset = direction - axis * rise, start - axis * height
+        a = np.maximum((across * across).sum(axis=0), np.float32(1e-9))
+        b = (across * offset).sum(axis=0)
+        c = (offset * offset).sum(axis=0) - np.float32(self.radius**2)
+        inside = b * b - a * c
+        t = (-b - np.sqrt(np.maximum(inside, 0))) / a
+        at = height + t * rise
+        return np.where((inside > 0) & (t > 0) & (at > 0) & (at < length), t, FAR)
+
+    def surface(self, point: Array) -> tuple[Array, Array, Array]:
+        """Angle around and way along."""
+        base, axis, _ = self._axis()
+        height = ((point - base) * axis).sum(axis=0)
+        normal = (point - base - axis * height) / self.radius
+        u = np.arctan2(normal[1], normal[0] + 1e-6) / (2 * np.pi)
+        return normal, u.astype(np.float32), height / (self.material.repeat or 1.0)
+
+
+@dataclass(frozen=True)
+class World:
+    """Shapes under a sun.
+
+    Attributes:
+        shapes: in any order.
+        sun: (3,) unit vector towards it.
+        sun_colour: linear RGB.
+        sky_colour: ambient light from above, linear RGB.
+        ground_colour: ambient light from below, linear RGB.
+    """
+
+    shapes: tuple[Shape, ...]
+    sun: Array
+    sun_colour: Array
+    sky_colour: Array
+    ground_colour: Array
+
+    def hit(self, origin: Array, direction: Array) -> tuple[Array, NDArray[np.int32]]:
+        """Where rays (3, n) from one point (3, 1) end.
+
+        Returns:
+            Distance to the first surface (n,), and which shape it is (n,), -1 for none.
+        """
+        nearest = np.full(direction.shape[1], FAR, dtype=np.float32)
+        which = np.full(direction.shape[1], -1, dtype=np.int32)
+        for index, shape in enumerate(self.shapes):
+            centre, radius = shape.bound()
+            offset = centre - origin[:, 0]
+            beside = offset @ offset - (offset @ direction) ** 2  # squared distance of the ray
+            near = np.flatnonzero(beside < 1.001 * radius**2)
+            t = shape.distance(origin, direction[:, near])
+            closer = t < nearest[near]
+            nearest[near[closer]] = t[closer]
+            which[near[closer]] = index
+        return nearest, which
+
+    def colour(self, origin: Array, direction: Array) -> Array:
+        """Linear RGB (3, n) that rays (3, n) from one point (3, 1) see; sky where they miss."""
+        t, which = self.hit(origin, direction)
+        seen = np.repeat(self.sky_colour[:, None], direction.shape[1], axis=1)
+        drawn = np.flatnonzero(which >= 0)
+        ray = direction[:, drawn]
+        point = origin + ray * t[drawn]
+        seen[:, drawn] = self.shade(point, which[drawn], ray)
+        return seen
+
+    def shade(self, point: Array, which: NDArray[np.int32], ray: Array) -> Array:
+        """Linear RGB (3, n) of surface points, seen along ray (3, n)."""
+        normal, albedo, extra = np.empty_like(point), np.empty_like(point), np.empty_like(point)
+        for index in np.unique(which):
+            mine, shape = which == index, self.shapes[index]
+            normal[:, mine], u, v = shape.surface(point[:, mine])
+            albedo[:, mine] = sample(shape.material.texture, u, v).T
+            mirror = ray[:, mine] - 2 * (ray[:, mine] * normal[:, mine]).sum(0) * normal[:, mine]
+            shine = np.maximum(self.sun @ mirror, 0) ** 12
+            extra[:, mine] = shape.material.gloss * shine
+            albedo[:, mine] *= 1 + shape.material.glow
+        facing = self.sun @ normal
+        toward = np.flatnonzero(facing > 0)
+        lit = np.zeros(point.shape[1], dtype=np.float32)
+        lit[toward] = ~self.shadowed(point[:, toward] + _SKIN * normal[:, toward])
+        up = (0.5 + 0.5 * normal[2])[None]
+        ambient = self.sky_colour[:, None] * up + self.ground_colour[:, None] * (1 - up)
+        direct = self.sun_colour[:, None] * (lit * np.maximum(facing, 0))
+        seen: Array = albedo * (ambient + direct) + extra * lit * self.sun_colour[:, None]
+        return seen
+
+    def shadowed(self, point: Array) -> NDArray[np.bool_]:
+        """Whether anything stands between the points (3, n) and the sun."""
+        across = np.linalg.svd(self.sun[None])[2][1:]  # the plane that the sun sees, (2, 3)
+        flat = across @ point
+        dark = np.zeros(point.shape[1], dtype=bool)
+        for shape in self.shapes:
+            centre, radius = shape.bound()
+            beside = ((flat - (across @ centre)[:, None]) ** 2).sum(axis=0)
+            near = np.flatnonzero((beside < 1.001 * radius**2) & ~dark)
+            dark[near] = shape.distance(point[:, near], self.sun[:, None]) < FAR
+        return dark
