@@ -1,0 +1,33 @@
+"""Front-to-back blending of fragments along a pixel."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def transmittances(alpha: Tensor) -> Tensor:
+    """(K + 1, P) light left before each fragment of alpha (K, P), and after the last."""
+    return torch.cat([alpha.new_ones(1, alpha.shape[1]), 1 - alpha]).cumprod(0)
+
+
+def alive(alpha: Tensor, transmittance_min: float) -> Tensor:
+    """(K, P) bool: the pixel has not stopped at or before this fragment.
+
+    It stops at the first fragment that would leave less than transmittance_min; that fragment is
+    not blended, nor is any after it. A fragment of alpha 0 stops nothing.
+    """
+    hard = alpha.detach()
+    stops = transmittances(hard)[1:] < transmittance_min
+    return stops.cumsum(0) == 0
+
+
+def blend(alpha: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum of alpha T feature, (C, P), and the final transmittance, (P,).
+
+    Args:
+        alpha: (K, P) of fragments in depth order, 0 where not drawn or stopped.
+        features: (K, C) of each Gaussian.
+    """
+    light = transmittances(alpha)
+    return features.mT @ (alpha * light[:-1]), light[-1]

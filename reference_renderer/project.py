@@ -1,0 +1,152 @@
+"""From Gaussians in the world to footprints on the image, and the tiles those touch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from reference_renderer.covariance import covariances, project_covariances
+from reference_renderer.scene import Camera, Gaussians, Options
+from reference_renderer.sh import sh_colors
+
+TILE = 16
+"""Side of a tile, pixels."""
+
+ANTIALIASING_FLOOR = 2.5e-5
+"""Least ratio of determinants that the antialiasing compensation takes the root of."""
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """K Gaussians on the image.
+
+    Attributes:
+        mean2d: (K, 2) pixels; (0, 0) is the centre of the first pixel.
+        conic: (K, 3) inverse covariance xx, xy, yy, pixels^-2.
+        depth: (K,) view space.
+        opacity: (K,) after antialiasing compensation.
+        color: (K, 3) RGB.
+        radius: (K,) pixels, ceil(3 sigma) of the longer axis; 0 when degenerate.
+    """
+
+    mean2d: Tensor
+    conic: Tensor
+    depth: Tensor
+    opacity: Tensor
+    color: Tensor
+    radius: Tensor
+
+    def take(self, rows: Tensor) -> Footprints:
+        """The footprints of these rows (M,), in their order."""
+        return Footprints(
+            mean2d=self.mean2d[rows],
+            conic=self.conic[rows],
+            depth=self.depth[rows],
+            opacity=self.opacity[rows],
+            color=self.color[rows],
+            radius=self.radius[rows],
+        )
+
+
+def transform(points: Tensor, matrix: Tensor) -> Tensor:
+    """(N, 4) homogeneous row vectors [p, 1] @ matrix, of points (N, 3)."""
+    return points @ matrix[:3] + matrix[3]
+
+
+def rows_in_front(camera: Camera, means: Tensor, near: float) -> Tensor:
+    """(K,) rows of the means (N, 3) beyond the near plane, the host's only frustum test."""
+    return (transform(means.detach(), camera.viewmatrix)[:, 2] > near).nonzero()[:, 0]
+
+
+def project_means(camera: Camera, means: Tensor, hook: Tensor | None) -> Tensor:
+    """(N, 2) pixels of means (N, 3); the hook adds zero and receives the gradient in NDC."""
+    clip = transform(means, camera.projmatrix)
+    ndc = clip[:, :2] * (1 / (clip[:, 3:] + 1e-7))
+    size = means.new_tensor([camera.width, camera.height])
+    mean2d = ((ndc + 1) * size - 1) / 2
+    if hook is None:
+        return mean2d
+    return mean2d + 0.5 * size * (hook - hook.detach())[:, :2]
+
+
+def determinant(cov2d: Tensor) -> Tensor:
+    """(N,) of symmetric matrices given as (N, 3) xx, xy, yy."""
+    return cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] * cov2d[:, 1]
+
+
+def radii_of(cov2d: Tensor) -> Tensor:
+    """(N,) pixels, ceil(3 sigma) of covariances (N, 3); 0 where the determinant is 0."""
+    det = determinant(cov2d)
+    mid = 0.5 * (cov2d[:, 0] + cov2d[:, 2])
+    largest = mid + (mid * mid - det).clamp(min=0.1).sqrt()
+    return torch.where(det == 0, torch.zeros_like(det), (3 * largest.sqrt()).ceil())
+
+
+def invert(cov2d: Tensor) -> Tensor:
+    """(N, 3) inverses of covariances (N, 3); where singular, finite and meaningless."""
+    det = determinant(cov2d)
+    det = torch.where(det == 0, torch.ones_like(det), det)
+    return torch.stack([cov2d[:, 2] / det, -cov2d[:, 1] / det, cov2d[:, 0] / det], dim=-1)
+
+
+def compensation(before: Tensor, after: Tensor) -> Tensor:
+    """(N,) factor on opacity that keeps a dilated Gaussian's weight, from covariances (N, 3)."""
+    det = determinant(after)
+    ratio = determinant(before) / torch.where(det == 0, torch.ones_like(det), det)
+    return ratio.clamp(min=ANTIALIASING_FLOOR).sqrt()
+
+
+def project(
+    camera: Camera, gaussians: Gaussians, hook: Tensor | None, options: Options
+) -> Footprints:
+    """Footprints of Gaussians that are all in front of the camera.
+
+    Args:
+        camera: the view.
+        gaussians: K of them.
+        hook: (K, >= 2) or None.
+        options: scale_modifier, dilation and antialiasing are used.
+    """
+    points = transform(gaussians.means, camera.viewmatrix)[:, :3]
+    cov3d = covariances(gaussians, options.scale_modifier)
+    sharp = project_covariances(camera, points, cov3d)
+    cov2d = sharp + options.dilation * sharp.new_tensor([1, 0, 1])
+    opacity = gaussians.opacities
+    if options.antialiasing:
+        opacity = opacity * compensation(sharp, cov2d)
+    return Footprints(
+        mean2d=project_means(camera, gaussians.means, hook),
+        conic=invert(cov2d),
+        depth=points[:, 2],
+        opacity=opacity,
+        color=colors_of(camera, gaussians),
+        radius=radii_of(cov2d.detach()),
+    )
+
+
+def colors_of(camera: Camera, gaussians: Gaussians) -> Tensor:
+    """(N, 3) RGB, given or from spherical harmonics."""
+    if gaussians.colors is not None:
+        return gaussians.colors
+    if gaussians.sh is None:
+        raise ValueError("Gaussians: neither sh nor colors are given")
+    return sh_colors(gaussians.means, camera.campos, gaussians.sh, gaussians.sh_degree)
+
+
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """Tiles across and down; the last ones may reach over the image's edge."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
+def tile_rects(camera: Camera, footprints: Footprints) -> Tensor:
+    """(K, 4) first and past-the-last tile x0, y0, x1, y1 of the 3-sigma square, in the grid.
+
+    Rounding is toward zero before clamping, as a C cast does (auxiliary.h, getRect).
+    """
+    mean2d, radius = footprints.mean2d.detach(), footprints.radius[:, None]
+    first = ((mean2d - radius) / TILE).trunc()
+    last = ((mean2d + radius + TILE - 1) / TILE).trunc()
+    grid = mean2d.new_tensor(tile_grid(camera))
+    return torch.cat([first.clamp(min=0).minimum(grid), last.clamp(min=0).minimum(grid)], dim=1)

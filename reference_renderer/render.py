@@ -1,0 +1,189 @@
+"""The pipeline, top to bottom: cull, project, cut into tiles, sort, blend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from reference_renderer.composite import alive, blend
+from reference_renderer.fragment import fragments
+from reference_renderer.project import (
+    TILE,
+    Footprints,
+    project,
+    rows_in_front,
+    tile_grid,
+    tile_rects,
+)
+from reference_renderer.scene import Camera, Gaussians, Options, Rendering
+
+
+@dataclass(frozen=True)
+class Block:
+    """A rectangle of the image with the footprints that may draw there.
+
+    Attributes:
+        x: its columns, pixels.
+        y: its rows, pixels.
+        rows: (K,) of the footprints, front to back.
+    """
+
+    x: range
+    y: range
+    rows: Tensor
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One block, drawn.
+
+    Attributes:
+        layers: (5, h, w) red, green, blue, inverse depth, final transmittance.
+        fragments: (h, w) drawn fragments of each pixel.
+        per_row: (K,) drawn fragments of each of the block's footprints.
+        gate: scalar, sum of the gates of fragments before their pixel's stop.
+    """
+
+    layers: Tensor
+    fragments: Tensor
+    per_row: Tensor
+    gate: Tensor
+
+
+def render(
+    camera: Camera,
+    gaussians: Gaussians,
+    thresholds: Tensor | None = None,
+    *,
+    means2d_hook: Tensor | None = None,
+    options: Options | None = None,
+) -> Rendering:
+    """Draw Gaussians, each truncated at its own threshold.
+
+    Args:
+        camera: the view.
+        gaussians: N of them.
+        thresholds: (N,) falloff in (0, 1) below which a fragment is not drawn, or None.
+        means2d_hook: (N, >= 2) or None; adds nothing and receives the gradient of the projected
+            means in NDC units, that of pixels times (W / 2, H / 2).
+        options: the dialect; vanilla when None.
+    """
+    options = options or Options()
+    front = rows_in_front(camera, gaussians.means, options.near)
+    hook = None if means2d_hook is None else means2d_hook[front]
+    footprints = project(camera, gaussians.take(front), hook, options)
+    tau = None if thresholds is None else thresholds[front]
+
+    rects = tile_rects(camera, footprints)
+    touching = (footprints.radius > 0) & ((rects[:, 2:] - rects[:, :2]) > 0).all(dim=1)
+    drawable = touching if options.tiles else footprints.radius > 0
+    blocks = list(cut(camera, footprints, rects, drawable, options))
+    drawings = [draw(footprints, tau, block, options) for block in blocks]
+
+    radii = torch.where(touching, footprints.radius, 0).to(torch.int32)
+    none = torch.zeros_like(gaussians.opacities, dtype=torch.int32)
+    return collect(camera, front, none.index_add(0, front, radii), blocks, drawings)
+
+
+def collect(
+    camera: Camera, front: Tensor, radii: Tensor, blocks: list[Block], drawings: list[Drawing]
+) -> Rendering:
+    """The whole image from its blocks.
+
+    Args:
+        camera: its size and background.
+        front: (K,) rows of the N Gaussians that the footprints stand for.
+        radii: (N,) int32 pixels.
+        blocks: row by row.
+        drawings: of each block.
+    """
+    per_gaussian = torch.zeros_like(radii)
+    for block, drawing in zip(blocks, drawings, strict=True):
+        per_gaussian = per_gaussian.index_add(0, front[block.rows], drawing.per_row)
+    layers = assemble(blocks, [drawing.layers for drawing in drawings])
+    gate = torch.stack([drawing.gate for drawing in drawings]).sum()
+    return Rendering(
+        image=layers[:3] + layers[4:] * camera.background[:, None, None],
+        radii=radii,
+        invdepth=layers[3:4],
+        alpha=1 - layers[4:],
+        fragments_per_pixel=gate / (camera.width * camera.height),
+        fragments=assemble(blocks, [drawing.fragments for drawing in drawings]),
+        fragments_per_gaussian=per_gaussian,
+        evaluated=sum(len(b.rows) * len(b.x) * len(b.y) for b in blocks),
+    )
+
+
+def cut(
+    camera: Camera, footprints: Footprints, rects: Tensor, drawable: Tensor, options: Options
+) -> Iterator[Block]:
+    """The image's tiles, row by row, or all of it as one block.
+
+    Args:
+        camera: its size.
+        footprints: K of them.
+        rects: (K, 4) tiles of each.
+        drawable: (K,) bool.
+        options: ``tiles`` decides.
+    """
+    order = footprints.depth.detach().argsort(stable=True)
+    order = order[drawable[order]]
+    if not options.tiles:
+        yield Block(range(camera.width), range(camera.height), order)
+        return
+    x0, y0, x1, y1 = rects[order].unbind(1)
+    across, down = tile_grid(camera)
+    for j in range(down):
+        for i in range(across):
+            covers = (x0 <= i) & (i < x1) & (y0 <= j) & (j < y1)
+            columns = range(i * TILE, min((i + 1) * TILE, camera.width))
+            rows = range(j * TILE, min((j + 1) * TILE, camera.height))
+            yield Block(columns, rows, order[covers])
+
+
+def draw(
+    footprints: Footprints,
+    thresholds: Tensor | None,
+    block: Block,
+    options: Options,
+) -> Drawing:
+    """Blend a block's footprints, front to back, at each of its pixels.
+
+    Args:
+        footprints: all K.
+        thresholds: (K,) or None.
+        block: where, and which of them.
+        options: the cuts.
+    """
+    here = footprints.take(block.rows)
+    tau = None if thresholds is None else thresholds[block.rows]
+    found = fragments(here, pixel_grid(block, here.mean2d), tau, options)
+    live = alive(found.alpha, options.transmittance_min)
+    features = torch.cat([here.color, 1 / here.depth[:, None]], dim=1)
+    sums, left = blend(found.alpha * live, features)
+    counted = (found.drawn & live).to(torch.int32)
+    shape = (len(block.y), len(block.x))
+    return Drawing(
+        layers=torch.cat([sums, left[None]]).reshape(-1, *shape),
+        fragments=counted.sum(dim=0, dtype=torch.int32).reshape(shape),
+        per_row=counted.sum(dim=1, dtype=torch.int32),
+        gate=(found.gate * live).sum(),
+    )
+
+
+def pixel_grid(block: Block, like: Tensor) -> Tensor:
+    """(P, 2) x, y of a block's pixels, row by row, in like's dtype and on its device."""
+    x = torch.arange(block.x.start, block.x.stop, dtype=like.dtype, device=like.device)
+    y = torch.arange(block.y.start, block.y.stop, dtype=like.dtype, device=like.device)
+    return torch.cartesian_prod(y, x).flip(1)
+
+
+def assemble(blocks: list[Block], parts: list[Tensor]) -> Tensor:
+    """(..., H, W) from the blocks' parts (..., h, w), which come row by row."""
+    rows: dict[int, list[Tensor]] = {}
+    for block, part in zip(blocks, parts, strict=True):
+        rows.setdefault(block.y.start, []).append(part)
+    return torch.cat([torch.cat(row, dim=-1) for row in rows.values()], dim=-2)

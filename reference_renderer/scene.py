@@ -1,0 +1,134 @@
+"""What the oracle takes and gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from torch import Tensor
+
+RIM_WIDTH: Final = 0.01
+"""Width w, in falloff, of the logistic surrogate at the rim."""
+
+RIM_REACH: Final = 4.6
+"""Fragments down to tau - RIM_REACH * RIM_WIDTH feel the surrogate: there s(1-s) is 0.01."""
+
+FALLOFF_MIN: Final = 1e-4
+"""Least falloff that reach may take: keeps -2 ln(.) finite."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera. Matrices act on row vectors: ``p_view = [p, 1] @ viewmatrix``.
+
+    Attributes:
+        width: pixels.
+        height: pixels.
+        tan_fov_x: tangent of half the horizontal field of view.
+        tan_fov_y: tangent of half the vertical field of view.
+        viewmatrix: (4, 4) world to camera, x right, y down, z forward.
+        projmatrix: (4, 4) world to clip.
+        campos: (3,) camera centre in the world.
+        background: (3,) RGB.
+    """
+
+    width: int
+    height: int
+    tan_fov_x: float
+    tan_fov_y: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    campos: Tensor
+    background: Tensor
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N activated Gaussians; either scales and rotations or cov3d, either sh or colors.
+
+    Attributes:
+        means: (N, 3) world.
+        opacities: (N,) in (0, 1).
+        scales: (N, 3) standard deviations, world units.
+        rotations: (N, 4) quaternions w, x, y, z, used as given.
+        cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
+        sh: (N, K, 3) with K = (sh_degree + 1)^2 or more.
+        colors: (N, 3) RGB, used as given.
+        sh_degree: 0 to 3.
+    """
+
+    means: Tensor
+    opacities: Tensor
+    scales: Tensor | None = None
+    rotations: Tensor | None = None
+    cov3d: Tensor | None = None
+    sh: Tensor | None = None
+    colors: Tensor | None = None
+    sh_degree: int = 0
+
+    def take(self, rows: Tensor) -> Gaussians:
+        """The Gaussians of these rows (K,), in their order; all others get zero gradient."""
+        return Gaussians(
+            means=self.means[rows],
+            opacities=self.opacities[rows],
+            scales=None if self.scales is None else self.scales[rows],
+            rotations=None if self.rotations is None else self.rotations[rows],
+            cov3d=None if self.cov3d is None else self.cov3d[rows],
+            sh=None if self.sh is None else self.sh[rows],
+            colors=None if self.colors is None else self.colors[rows],
+            sh_degree=self.sh_degree,
+        )
+
+
+@dataclass(frozen=True)
+class Options:
+    """The dialect's numbers. Zeroing the three cuts makes the renderer differentiable everywhere.
+
+    Attributes:
+        scale_modifier: factor on the scales; cov3d is used as given.
+        dilation: pixels^2 added to the 2D covariance's diagonal.
+        antialiasing: opacity times sqrt(max(2.5e-5, det before / det after dilation)).
+        near: view depth at or below which a Gaussian is culled.
+        alpha_min: fainter fragments are skipped; 0 skips none.
+        alpha_max: alpha is capped here, its gradient is not.
+        transmittance_min: a pixel stops before a fragment that would leave less; 0 never stops.
+        tiles: draw a Gaussian only in the 16x16 tiles of its 3-sigma square; else everywhere.
+        truncation: "hard" cuts at the threshold, with the surrogate's gradient; "soft" multiplies
+            alpha by the surrogate itself, everywhere, and so has true derivatives.
+    """
+
+    scale_modifier: float = 1.0
+    dilation: float = 0.3
+    antialiasing: bool = False
+    near: float = 0.2
+    alpha_min: float = 1.0 / 255.0
+    alpha_max: float = 0.99
+    transmittance_min: float = 1e-4
+    tiles: bool = True
+    truncation: Literal["hard", "soft"] = "hard"
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What ``render`` returns.
+
+    Attributes:
+        image: (3, H, W) RGB with background, not clamped.
+        radii: (N,) int32 pixels, ceil(3 sigma); 0 when culled. Thresholds never change it.
+        invdepth: (1, H, W) sum of alpha T / z, without background.
+        alpha: (1, H, W) 1 - final transmittance.
+        fragments_per_pixel: scalar, drawn fragments over pixels; its gradient in the thresholds is
+            the surrogate's.
+        fragments: (H, W) int32 drawn fragments of each pixel.
+        fragments_per_gaussian: (N,) int32 drawn fragments of each Gaussian.
+        evaluated: (Gaussian, pixel) pairs tested.
+    """
+
+    image: Tensor
+    radii: Tensor
+    invdepth: Tensor
+    alpha: Tensor
+    fragments_per_pixel: Tensor
+    fragments: Tensor
+    fragments_per_gaussian: Tensor
+    evaluated: int
