@@ -9,7 +9,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fragprune_plugins.api import activate, deactivate, paused
     from fragprune_plugins.engines import rasterize
+    from fragprune_plugins.finetune import finetune
+    from fragprune_plugins.schedule import Settings
+    from fragprune_plugins.thresholds import ThresholdStore
     from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 
 __version__ = "0.1.0"
@@ -17,12 +21,31 @@ __version__ = "0.1.0"
 _HOME = {
     "RasterInputs": "types",
     "RasterOutputs": "types",
+    "Settings": "schedule",
     "Splats": "types",
+    "ThresholdStore": "thresholds",
     "View": "types",
+    "activate": "api",
+    "deactivate": "api",
+    "finetune": "finetune",
+    "paused": "api",
     "rasterize": "engines",
 }
 
-__all__ = ["RasterInputs", "RasterOutputs", "Splats", "View", "__version__", "rasterize"]
+__all__ = [
+    "RasterInputs",
+    "RasterOutputs",
+    "Settings",
+    "Splats",
+    "ThresholdStore",
+    "View",
+    "__version__",
+    "activate",
+    "deactivate",
+    "finetune",
+    "paused",
+    "rasterize",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,197 @@
+"""What an adapter is: a description of one host. Patching and un-patching are the session's."""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.detect import Finding, HostRepo, Match, check_seams
+from fragprune_plugins.seams import Seam
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+
+@dataclass(frozen=True)
+class HostInfo:
+    """Who the host is, for people.
+
+    Attributes:
+        title: the method's name.
+        repo: owner/name of its public repository.
+        states: the revisions this adapter was written for.
+    """
+
+    title: str
+    repo: str
+    states: str = ""
+
+
+@dataclass(frozen=True)
+class HostCall:
+    """The host's call of its rasterizer as data: positional or keyword, no matter."""
+
+    settings: Any
+    arguments: Mapping[str, Any]
+
+    @classmethod
+    def bind(
+        cls,
+        function: Callable[..., Any],
+        settings: Any,
+        args: Sequence[Any],
+        kwargs: dict[str, Any],
+    ) -> HostCall:
+        """Name every argument by the function's signature."""
+        bound = inspect.signature(function).bind(*args, **kwargs)
+        return cls(settings, bound.arguments)
+
+    def get(self, name: str) -> Tensor | None:
+        """A tensor argument; None when it is absent, None or empty (hosts pass all three)."""
+        value: Tensor | None = self.arguments.get(name)
+        return None if value is None or value.numel() == 0 else value
+
+    def __getitem__(self, name: str) -> Tensor:
+        value: Tensor = self.arguments[name]
+        return value
+
+
+class Dialect(ABC):
+    """A host's rasterizer call contract, for one revision of the host."""
+
+    @abstractmethod
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """The host's call as core values."""
+
+    @abstractmethod
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
+        """What the host expects back, arity and all."""
+
+    @abstractmethod
+    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
+        """Stand-ins for the host's compiled packages, by import name.
+
+        Args:
+            draw: rasterizes a host call without thresholds and returns what ``pack`` returned.
+        """
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """How a host's training script is told what we need to tell it.
+
+    Attributes:
+        scripts: file names of training scripts; others (render.py) only get thresholds applied.
+        iterations: flag of the total number of iterations.
+        output: flags of the output folder.
+        source: flags of the data folder.
+        save_checkpoints: flag listing iterations to checkpoint at.
+        resume: flag naming the checkpoint to resume from.
+        default_iterations: of the host, read from its source.
+    """
+
+    scripts: tuple[str, ...]
+    iterations: str
+    output: tuple[str, ...]
+    source: tuple[str, ...]
+    save_checkpoints: str
+    resume: str
+    default_iterations: int
+
+
+class HostAdapter(ABC):
+    """Describes one host: what identifies it, where to wrap, how its tensors are named.
+
+    Subclasses are stateless; what depends on the revision comes from a ``HostRepo``.
+    """
+
+    name: str
+    info: HostInfo
+    seams: tuple[Seam, ...]
+
+    def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
+        """The seams of this revision; all of ``seams`` unless a host says otherwise."""
+        return self.seams
+
+    @abstractmethod
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """What the source says about being this host; an error finding means it is not."""
+
+    def match(self, repo: HostRepo) -> Match:
+        """Fingerprint and seams together."""
+        findings = [*self.fingerprint(repo), *check_seams(repo, self.seams_for(repo))]
+        fits = not any(finding.level == "error" for finding in findings)
+        return Match(self.name, "known" if fits else "none", tuple(findings))
+
+    @abstractmethod
+    def dialect(self, repo: HostRepo) -> Dialect:
+        """The rasterizer's call contract in this revision."""
+
+    @abstractmethod
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """How to drive the host's training script."""
+
+    @abstractmethod
+    def rows(self, model: Any) -> int:
+        """How many Gaussians the model holds."""
+
+    @abstractmethod
+    def means(self, model: Any) -> Tensor:
+        """(N, 3) the tensor the host hands its rasterizer: identifies the model."""
+
+    @abstractmethod
+    def opacities(self, model: Any) -> Tensor:
+        """(N,) activated opacities."""
+
+    @abstractmethod
+    def optimizers(self, model: Any) -> list[Any]:
+        """The host's optimizers of this model, the main one first."""
+
+    @abstractmethod
+    def trained_groups(self, train: str) -> frozenset[str] | None:
+        """Names of param groups that stage 2 trains for ``--train``; None for all of them."""
+
+    @abstractmethod
+    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
+        """Rows that a densify method is about to copy, one per row it will append."""
+
+    @abstractmethod
+    def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
+        """Whether appended rows are copies of those parents; asked before they are appended."""
+
+    @abstractmethod
+    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
+        """The dict inside the host's checkpoint tuple that tolerates a key of ours."""
+
+    @abstractmethod
+    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
+        """Write a checkpoint the host can resume from, made from its PLY."""
+
+    def before_restore(self, model: Any, capture: Any) -> Any:
+        """A chance to complete a checkpoint that lacks something; returns it."""
+        return capture
+
+    def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
+        """A chance to bring back state that the host's own resume loses."""
+
+    def save_model(self, model: Any, output: Path, iteration: int) -> Path:
+        """Have the host save its model as it would at this iteration; returns the file."""
+        path = self.model_file(output, iteration)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        model.save_ply(str(path))
+        return path
+
+    @abstractmethod
+    def model_file(self, output: Path, iteration: int) -> Path:
+        """Where the host saves its model at an iteration."""
+
+    @abstractmethod
+    def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
+        """Resumable files in an output folder, (iteration, checkpoint or PLY), oldest first."""

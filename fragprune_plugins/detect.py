@@ -1,0 +1,216 @@
+"""Reads a host's source without importing it: which adapter fits, which seams hold."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from fragprune_plugins.errors import UnknownHostError
+from fragprune_plugins.seams import Seam
+
+if TYPE_CHECKING:
+    from fragprune_plugins.adapter import HostAdapter
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing noticed about a host or an undone patch, fit to print and to serialise."""
+
+    level: Literal["info", "warning", "error"]
+    code: str
+    where: str
+    found: str
+    expected: str = ""
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        parts = [f"[{self.code}] {self.where}: {self.found}"]
+        if self.expected:
+            parts.append(f"expected {self.expected}")
+        return "; ".join(parts) + (f". {self.remedy}" if self.remedy else "")
+
+    def as_dict(self) -> dict[str, str]:
+        """Plain values, for ``--json``."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Match:
+    """How well one adapter fits one folder, and why."""
+
+    adapter: str
+    confidence: Literal["known", "none"]
+    findings: tuple[Finding, ...] = ()
+    details: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def fits(self) -> bool:
+        """True when every seam holds and nothing speaks against it."""
+        return self.confidence != "none"
+
+
+class HostRepo:
+    """A host's checkout, read as text.
+
+    Args:
+        root: the folder its entry scripts lie in.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root).resolve()
+        self._trees: dict[str, ast.Module | None] = {}
+
+    def path(self, module: str) -> Path | None:
+        """The file a dotted module name would be imported from, or None."""
+        base = self.root.joinpath(*module.split("."))
+        for candidate in (base / "__init__.py", base.with_suffix(".py")):
+            if candidate.is_file():
+                return candidate
+        return None
+
+    def tree(self, module: str) -> ast.Module | None:
+        """The module's syntax tree, or None when it is absent or not Python."""
+        if module not in self._trees:
+            path = self.path(module)
+            try:
+                self._trees[module] = (
+                    ast.parse(path.read_text(encoding="utf-8", errors="replace")) if path else None
+                )
+            except SyntaxError:
+                self._trees[module] = None
+        return self._trees[module]
+
+    def function(self, module: str, attribute: str) -> Function | None:
+        """The definition at a dotted path inside a module, or None."""
+        node: ast.AST | None = self.tree(module)
+        for name in attribute.split("."):
+            body: Sequence[ast.stmt] = getattr(node, "body", ())
+            node = next(
+                (
+                    child
+                    for child in body
+                    if isinstance(child, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+                    and child.name == name
+                ),
+                None,
+            )
+        return node if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else None
+
+    def parameters(self, module: str, attribute: str) -> tuple[str, ...] | None:
+        """Parameter names of a function, ``self`` left out; None when it is not there."""
+        function = self.function(module, attribute)
+        if function is None:
+            return None
+        args = function.args
+        names = [a.arg for a in (*args.posonlyargs, *args.args, *args.kwonlyargs)]
+        return tuple(n for n in names if n != "self")
+
+    def calls(self, module: str, name: str) -> list[ast.Call]:
+        """Every call of a bare name in a module, in source order."""
+        tree = self.tree(module)
+        return [
+            node
+            for node in (ast.walk(tree) if tree else ())
+            if isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id == name
+        ]
+
+    def mentions(self, modules: Iterable[str], names: Iterable[str]) -> dict[str, str]:
+        """Which of the names occur as identifiers, attributes or parameters, and where."""
+        wanted = set(names)
+        seen: dict[str, str] = {}
+        for module in modules:
+            tree = self.tree(module)
+            for node in ast.walk(tree) if tree else ():
+                name = (
+                    getattr(node, "id", None)
+                    or getattr(node, "attr", None)
+                    or getattr(node, "name", None)
+                    or getattr(node, "arg", None)
+                )
+                if name in wanted:
+                    seen.setdefault(str(name), f"{module}:{getattr(node, 'lineno', 0)}")
+        return seen
+
+    @cached_property
+    def commit(self) -> str:
+        """The checkout's commit, read from .git without running git; "" when there is none."""
+        git = self.root / ".git"
+        try:
+            head = (git / "HEAD").read_text().strip()
+            if not head.startswith("ref: "):
+                return head
+            reference = head.removeprefix("ref: ")
+            loose = git / reference
+            if loose.is_file():
+                return loose.read_text().strip()
+            for line in (git / "packed-refs").read_text().splitlines():
+                if line.endswith(reference):
+                    return line.split()[0]
+        except OSError:
+            pass
+        return ""
+
+
+def check_seams(repo: HostRepo, seams: Iterable[Seam]) -> list[Finding]:
+    """Look each seam up in the source: an error per one that is missing or was changed."""
+    findings = []
+    for seam in seams:
+        if seam.external:
+            continue
+        have = repo.parameters(seam.module, seam.attribute)
+        if have is None:
+            findings.append(Finding("error", "seam-missing", str(seam), "no such function", "one"))
+        elif missing := [name for name in seam.needs if name not in have]:
+            findings.append(
+                Finding(
+                    "error",
+                    "seam-signature",
+                    str(seam),
+                    f"parameters ({', '.join(have)})",
+                    f"also {', '.join(missing)}",
+                )
+            )
+    return findings
+
+
+def choose(repo: HostRepo, adapters: Sequence[HostAdapter], name: str | None = None) -> HostAdapter:
+    """The adapter for a checkout: the one asked for, or the only one that fits.
+
+    Raises:
+        UnknownHostError: none fits, the one asked for does not, or several do.
+    """
+    by_name = {adapter.name: adapter for adapter in adapters}
+    if name is not None and name.replace("_", "-") not in by_name:
+        raise UnknownHostError(
+            "--adapter", repr(name), f"one of {', '.join(sorted(by_name)) or 'none'}", "Choose one."
+        )
+    wanted = [by_name[name.replace("_", "-")]] if name else list(adapters)
+    matches = [(adapter, adapter.match(repo)) for adapter in wanted]
+    fitting = [adapter for adapter, match in matches if match.fits]
+    if len(fitting) == 1:
+        return fitting[0]
+    if not fitting:
+        reasons = "; ".join(
+            f"{adapter.name}: {next((str(f) for f in match.findings if f.level == 'error'), '')}"
+            for adapter, match in matches
+        )
+        raise UnknownHostError(
+            str(repo.root),
+            f"no adapter fits ({reasons or 'none is installed'})",
+            "a codebase that an installed adapter knows",
+            "Run fragprune check on the folder to see every seam, or write an adapter.",
+        )
+    raise UnknownHostError(
+        str(repo.root),
+        f"several adapters fit: {', '.join(a.name for a in fitting)}",
+        "one",
+        "Name it with --adapter.",
+    )

@@ -1,0 +1,113 @@
+"""``--device cpu``: lets a host that hard-codes CUDA run on a machine without a GPU.
+
+Device strings are rewritten by a torch function mode, CUDA calls by plain substitutes, for the
+duration of a block. Small scenes, debugging, CI; nothing of it stays afterwards.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import re
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+from unittest import mock
+
+import torch
+from torch.overrides import TorchFunctionMode
+
+_CUDA = re.compile(r"cuda(:\d+)?$")
+
+
+def _redirected(value: Any) -> Any:
+    """Replace "cuda", "cuda:0" and their torch.device by the CPU; the rest stays."""
+    if isinstance(value, str) and _CUDA.match(value):
+        return "cpu"
+    if isinstance(value, torch.device) and value.type == "cuda":
+        return torch.device("cpu")
+    return value
+
+
+class _Redirect(TorchFunctionMode):
+    """Every torch call inside has its CUDA devices replaced; ``.cuda()`` returns its tensor."""
+
+    def __torch_function__(
+        self,
+        func: Any,
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func is torch.Tensor.cuda:
+            return args[0]
+        if "device" in kwargs or len(args) > 1:
+            args = tuple(_redirected(a) for a in args)
+            kwargs = {k: _redirected(v) for k, v in kwargs.items()}
+        return func(*args, **kwargs)
+
+
+class _Event:
+    """A CUDA event that reads the wall clock."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self._time = 0.0
+
+    def record(self, *_: Any) -> None:
+        """Now."""
+        self._time = time.perf_counter()
+
+    def synchronize(self) -> None:
+        """Nothing to wait for."""
+
+    def query(self) -> bool:
+        """Always over."""
+        return True
+
+    def elapsed_time(self, end: _Event) -> float:
+        """Milliseconds until another event."""
+        return (end._time - self._time) * 1e3
+
+
+def _nothing(*_: Any, **__: Any) -> None:
+    """Stands for a CUDA call without a meaning on the CPU."""
+
+
+def _zero(*_: Any, **__: Any) -> int:
+    return 0
+
+
+_SUBSTITUTES: dict[str, Any] = {
+    "Event": _Event,
+    "set_device": _nothing,
+    "synchronize": _nothing,
+    "empty_cache": _nothing,
+    "reset_peak_memory_stats": _nothing,
+    "reset_max_memory_allocated": _nothing,
+    "current_device": _zero,
+    "memory_allocated": _zero,
+    "max_memory_allocated": _zero,
+    "memory_reserved": _zero,
+}
+
+
+@contextlib.contextmanager
+def cpu_only() -> Iterator[None]:
+    """Inside, torch calls that name CUDA run on the CPU; checkpoints load to the CPU."""
+    load = torch.load
+
+    @functools.wraps(load)
+    def load_to_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
+        return load(f, _redirected(map_location or "cpu"), *args, **kwargs)
+
+    patches: list[Callable[[], Any]] = [
+        functools.partial(mock.patch.object, torch.cuda, name, substitute)
+        for name, substitute in _SUBSTITUTES.items()
+    ]
+    with contextlib.ExitStack() as stack:
+        for patch in patches:
+            stack.enter_context(patch())
+        stack.enter_context(mock.patch.object(torch, "load", load_to_cpu))
+        stack.enter_context(_Redirect())
+        yield

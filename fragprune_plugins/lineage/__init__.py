@@ -1,0 +1,5 @@
+"""What all descendants of the 2023 3DGS training code share."""
+
+from fragprune_plugins.lineage.graphdeco import GraphdecoAdapter, GraphdecoDialect
+
+__all__ = ["GraphdecoAdapter", "GraphdecoDialect"]

@@ -1,0 +1,51 @@
+"""Seams: the places of a host where we wrap, as data.
+
+A table can be printed, checked against source without importing it, tested in every order and
+undone; a procedure cannot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Role(Enum):
+    """What the session does at a seam. A closed set; the session owns each one's meaning."""
+
+    SCENE = "learn where the host writes its output"
+    ATTACH = "give the model its threshold store"
+    STEP = "count one training step"
+    VIEW = "remember which model is being rendered"
+    RASTERIZE = "draw with thresholds"
+    PARENTS = "work out the parents of the rows about to be appended"
+    KEEP = "keep the surviving rows"
+    APPEND = "append rows"
+    STILL = "stand still in stage 2: what would change frozen parameters or rows"
+    SAVE = "write the sidecar beside the model's file"
+    LOAD = "read the sidecar beside the model's file"
+    CAPTURE = "put thresholds into the host's checkpoint"
+    RESTORE = "take thresholds out of the host's checkpoint"
+
+
+@dataclass(frozen=True)
+class Seam:
+    """One (module, attribute) of a host.
+
+    Attributes:
+        role: what the session does there.
+        module: dotted import name.
+        attribute: dotted path inside it, such as "GaussianModel.training_setup".
+        needs: parameter names the function must have; the session reads its arguments by them.
+        external: the module is not part of the host's folder (a compiled package), so only the
+            import can check it.
+    """
+
+    role: Role
+    module: str
+    attribute: str
+    needs: tuple[str, ...] = ()
+    external: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.module}:{self.attribute}"

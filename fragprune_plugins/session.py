@@ -1,0 +1,630 @@
+"""The session: what happens at each seam of a running host.
+
+Host first: in every role but RASTERIZE the host's function runs unchanged and we follow. Count
+steps ourselves: hosts pass offset iterations. One store per model object.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import weakref
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from inspect import signature
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins import sidecar
+from fragprune_plugins.adapter import HostAdapter, HostCall
+from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import AlignmentError, LateImportError, SessionError
+from fragprune_plugins.patching import PatchLedger
+from fragprune_plugins.plugins import Plugins
+from fragprune_plugins.pressure import FixedPressure, Pressure
+from fragprune_plugins.schedule import Schedule, Settings, StepPlan
+from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.thresholds import ThresholdStore
+
+
+@dataclass(frozen=True)
+class PopulationChange:
+    """Rows of a model changed; the store followed."""
+
+    operation: str
+    before: int
+    after: int
+
+
+@dataclass(frozen=True)
+class StepStats:
+    """One training step that learned.
+
+    Attributes:
+        step: of the learning, from 1.
+        fragments_per_pixel: drawn in this step's view.
+        pressure: lambda used.
+        threshold_median: over all Gaussians, in falloff.
+    """
+
+    step: int
+    fragments_per_pixel: float
+    pressure: float
+    threshold_median: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a session gained, over the training views it drew.
+
+    Attributes:
+        adapter: its name.
+        engine: that drew.
+        steps: learned.
+        gaussians: in the trained model.
+        fragments_before: per pixel, untruncated with the opacities at each view's first visit.
+        fragments_after: per pixel, as drawn at each view's last visit.
+        settings: of the fine-tuning.
+    """
+
+    adapter: str
+    engine: str
+    steps: int
+    gaussians: int
+    fragments_before: float | None
+    fragments_after: float | None
+    settings: dict[str, Any]
+
+
+@dataclass
+class _ModelState:
+    """A model's store and everything counted for it."""
+
+    store: ThresholdStore
+    steps: int = 0
+    iteration: int = 0
+    plan: StepPlan | None = None
+    pending_parents: Tensor | None = None
+    prepared: bool = False
+    base_rates: dict[str, float] = field(default_factory=dict)
+    baseline: dict[int, float] = field(default_factory=dict)  # view -> untruncated fragments/px
+    drawn: dict[int, float] = field(default_factory=dict)  # view -> fragments/px, last visit
+    stats: StepStats | None = None
+    hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
+    hooks: list[Any] = field(default_factory=list)
+    stepped: int = -1
+
+
+class _AddToLoss(torch.autograd.Function):
+    """Passes the image on; in the backward pass the term counts as if added to the loss."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, term: Tensor) -> Tensor:
+        ctx.term_shape = term.shape
+        return image.view_as(image)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
+        (grad,) = grads
+        return grad, torch.ones(ctx.term_shape, dtype=grad.dtype, device=grad.device)
+
+
+_active: Session | None = None
+
+
+def active_session() -> Session | None:
+    """The session of this process, if any."""
+    return _active
+
+
+class Session:
+    """Thresholds injected into one host in this process; a context manager.
+
+    Args:
+        adapter: describes the host.
+        repo: its checkout.
+        plugins: loaded plugins.
+        settings: of the fine-tuning.
+        learn: False only observes and applies thresholds that sidecars bring (``--stage off``,
+            render scripts, the host's own stage 1).
+        schedule: replaces the one the plugins create.
+        from_step: steps of the host to let pass before learning and freezing begin.
+        freeze: in learning, everything but what ``settings.train`` names stands still.
+        engine: name, see ``fragprune_create_engine``.
+        drop_in: put our stand-ins in place of the host's compiled packages: True, False, or None
+            for those that cannot be imported.
+        output: the host's output folder, when known.
+    """
+
+    def __init__(
+        self,
+        adapter: HostAdapter,
+        repo: HostRepo,
+        plugins: Plugins,
+        settings: Settings | None = None,
+        *,
+        learn: bool = True,
+        schedule: Schedule | None = None,
+        from_step: int = 0,
+        freeze: bool = True,
+        engine: str = "auto",
+        drop_in: bool | None = None,
+        output: Path | None = None,
+    ) -> None:
+        self.adapter, self.repo, self.plugins = adapter, repo, plugins
+        self.settings = settings or Settings()
+        self.hook = plugins.manager.hook
+        self.learn, self.from_step, self.freeze = learn, from_step, freeze
+        self.schedule = schedule or self.hook.fragprune_create_schedule(settings=self.settings)
+        self.pressure: Pressure = self.settings.make_pressure() if learn else FixedPressure(0.0)
+        self.output = output
+        self.curves: list[dict[str, float]] = []
+        self._engine_name = engine
+        self._engine: Engine | None = None
+        self._drop_in = drop_in
+        self._dialect = adapter.dialect(repo)
+        self._ledger: PatchLedger | None = None
+        self._stand_ins: dict[str, ModuleType] = {}
+        self._models: weakref.WeakKeyDictionary[Any, _ModelState] = weakref.WeakKeyDictionary()
+        self._last: weakref.ReferenceType[Any] | None = None
+        self._last_state: _ModelState | None = None  # outlives the host's model
+        self._rendering: ContextVar[tuple[Any, int] | None] = ContextVar("rendering", default=None)
+        self._paused: ContextVar[bool] = ContextVar("paused", default=False)
+
+    # -- life ------------------------------------------------------------------------------------
+
+    def activate(self) -> Session:
+        """Wrap every seam; before the host is imported.
+
+        Raises:
+            SessionError: another session is active.
+            LateImportError, SeamError: the host is imported already, or is not what it should be.
+                Nothing stays patched.
+        """
+        global _active
+        if _active is not None:
+            raise SessionError("activate()", "a session is active", "none", "Deactivate it first.")
+        self._ledger = PatchLedger()
+        try:
+            self._install_stand_ins()
+            for seam in self.adapter.seams_for(self.repo):
+                self._ledger.wrap(seam, partial(_HANDLERS[seam.role], self, seam))
+        except BaseException:
+            self._take_back()
+            raise
+        _active = self
+        return self
+
+    def deactivate(self) -> list[Finding]:
+        """Restore every original; returns what could not be restored. Harmless when inactive."""
+        global _active
+        if _active is self:
+            _active = None
+        return self._take_back()
+
+    def _take_back(self) -> list[Finding]:
+        for state in self._models.values():
+            while state.hooks:
+                state.hooks.pop().remove()
+            state.hooked.clear()
+        findings = self._ledger.undo() if self._ledger else []
+        self._ledger = None
+        for name, module in self._stand_ins.items():
+            if sys.modules.get(name) is module:
+                del sys.modules[name]
+        self._stand_ins.clear()
+        return findings
+
+    def __enter__(self) -> Session:
+        return self.activate()
+
+    def __exit__(self, *exc: object) -> None:
+        self.deactivate()
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Inside, the host draws as if we were not here; rows are still followed."""
+        token = self._paused.set(True)
+        try:
+            yield
+        finally:
+            self._paused.reset(token)
+
+    def store(self, model: Any) -> ThresholdStore | None:
+        """The thresholds of a model object, if it has some."""
+        state = self._models.get(model)
+        return state.store if state else None
+
+    def engine(self, device: torch.device) -> Engine:
+        """The engine, created at its first use."""
+        if self._engine is None:
+            self._engine = self.hook.fragprune_create_engine(name=self._engine_name, device=device)
+        assert self._engine is not None  # the built-in plugin always answers
+        return self._engine
+
+    def finish(self) -> Summary:
+        """What was gained; observers are told."""
+        state = self._last_state
+        if state is not None:
+            self._report(state)
+        before, after = state and state.baseline, state and state.drawn
+        summary = Summary(
+            adapter=self.adapter.name,
+            engine=self._engine.name if self._engine else "",
+            steps=self._learned(state) if state else 0,
+            gaussians=len(state.store) if state else 0,
+            fragments_before=sum(before.values()) / len(before) if before else None,
+            fragments_after=sum(after.values()) / len(after) if after else None,
+            settings=self.settings.as_dict(),
+        )
+        self.hook.fragprune_finished(summary=summary)
+        return summary
+
+    def save_interrupted(self) -> Path | None:
+        """After Ctrl-C: have the host save its model, with what was learned beside it."""
+        model = self._last() if self._last else None
+        if model is None or self.output is None:
+            return None
+        state = self._models[model]
+        if state.store.neutral:
+            return None
+        return self.adapter.save_model(model, self.output, state.iteration)
+
+    # -- stand-ins -------------------------------------------------------------------------------
+
+    def _install_stand_ins(self) -> None:
+        from importlib.util import find_spec
+
+        for name, module in self._dialect.modules(self._draw).items():
+            package = name.split(".")[0]
+            if self._drop_in is None and package not in self._stand_ins:
+                try:
+                    wanted = find_spec(package) is None
+                except ValueError:  # a module without a spec is a stand-in somebody else put there
+                    wanted = False
+            else:
+                wanted = package in self._stand_ins if self._drop_in is None else self._drop_in
+            if not wanted:
+                continue
+            if name in sys.modules:
+                raise LateImportError(
+                    name,
+                    "already imported",
+                    "activation before the host imports its rasterizer",
+                    "Start the host with fragprune run, or call activate() above those imports.",
+                )
+            sys.modules[name] = self._stand_ins[name] = module
+
+    def _draw(self, call: HostCall) -> Any:
+        """The host's picture without thresholds, from our engine."""
+        inputs = self._dialect.unpack(call)
+        outputs = self.engine(inputs.splats.means.device).rasterize(inputs, None)
+        return self._dialect.pack(outputs, call)
+
+    # -- roles -----------------------------------------------------------------------------------
+
+    def _learned(self, state: _ModelState) -> int:
+        return max(0, state.steps - self.from_step) if self.learn else 0
+
+    def _standing_still(self, model: Any) -> bool:
+        """Whether the model is frozen now: stage 2 has begun."""
+        state = self._models.get(model)
+        return bool(
+            self.learn and self.freeze and state is not None and state.steps > self.from_step
+        ) or (self.learn and self.freeze and self.from_step == 0)
+
+    def _on_scene(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        if getattr(instance, "model_path", None):
+            self.output = Path(instance.model_path)
+        return result
+
+    def _on_attach(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        if not self.learn:
+            return result
+        rows = self.adapter.rows(model)
+        state = self._models.get(model)
+        if state is None:
+            store = ThresholdStore(
+                rows, self.adapter.means(model).device, self.settings.threshold_lr
+            )
+            state = self._models[model] = _ModelState(store)
+        else:
+            before = len(state.store)
+            state.store.replace(rows)
+            self._changed(state.store, "training_setup", before)
+        self._follow(model, state)
+        state.base_rates = {
+            group["name"]: group["lr"]
+            for group in self.adapter.optimizers(model)[0].param_groups
+            if "name" in group
+        }
+        self._hook_optimizers(model, state)
+        self.hook.fragprune_attached(model=model, store=state.store)
+        return result
+
+    def _follow(self, model: Any, state: _ModelState) -> None:
+        self._last, self._last_state = weakref.ref(model), state
+
+    def _hook_optimizers(self, model: Any, state: _ModelState) -> None:
+        reference = weakref.ref(model)
+        for index, optimizer in enumerate(self.adapter.optimizers(model)):
+            if optimizer in state.hooked:
+                continue
+            state.hooked.add(optimizer)
+            pre = partial(self._before_step, reference, index == 0)
+            state.hooks.append(optimizer.register_step_pre_hook(pre))
+            if index == 0:
+                post = partial(self._after_step, reference)
+                state.hooks.append(optimizer.register_step_post_hook(post))
+
+    def _before_step(self, reference: Any, main: bool, optimizer: Any, *_: Any) -> None:
+        """Stage 2: parameters that do not train get no gradient, so no optimizer touches them."""
+        model = reference()
+        if model is None or not self._standing_still(model):
+            return
+        trained = self.adapter.trained_groups(self.settings.train)
+        if trained is None and not main:
+            return
+        plan = self._models[model].plan
+        rates = self._models[model].base_rates
+        decay = 0.1**plan.progress if plan else 1.0
+        for group in optimizer.param_groups:
+            name = group.get("name")
+            if trained is not None and (not main or name not in trained):
+                for parameter in group["params"]:
+                    parameter.grad = None
+            elif name == "opacity" and plan and plan.opacity_lr is not None:
+                group["lr"] = plan.opacity_lr
+            elif name in rates and name != "xyz":  # the host sets xyz's rate every iteration
+                group["lr"] = rates[name] * decay
+
+    def _after_step(self, reference: Any, *_: Any) -> None:
+        """The store steps once per counted step, however often the host's hook fires."""
+        model = reference()
+        state = self._models.get(model) if model is not None else None
+        if state is None or state.plan is None or state.stepped == state.steps:
+            return
+        state.stepped = state.steps
+        if state.plan.learn and self.settings.truncate:
+            state.store.step(state.plan.threshold_lr)
+
+    def _on_step(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        state = self._models.get(model)
+        if state is None or not self.learn:
+            return result
+        self._report(state)
+        state.steps += 1
+        state.iteration = int(signature(wrapped).bind(*args, **kwargs).arguments["iteration"])
+        step = state.steps - self.from_step
+        state.plan = self.schedule.at(step) if step > 0 else None
+        if self._standing_still(model):
+            if not state.prepared:
+                self.adapter.prepare_stage2(model, self.output)
+                state.prepared = True
+            self._freeze(model)
+        if state.plan and state.plan.learn and self.settings.truncate:
+            state.store.open(self.adapter.opacities(model))
+        return result
+
+    def _freeze(self, model: Any) -> None:
+        """Frozen parameters ask for no gradient: the engine then skips their share of the work."""
+        trained = self.adapter.trained_groups(self.settings.train)
+        if trained is None:
+            return
+        for group in self.adapter.optimizers(model)[0].param_groups:
+            for parameter in group["params"]:
+                parameter.requires_grad_(group.get("name") in trained)
+
+    def _report(self, state: _ModelState) -> None:
+        if state.stats is not None:
+            self.curves.append(asdict(state.stats))
+            self.hook.fragprune_step(stats=state.stats)
+            state.stats = None
+
+    def _on_view(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
+        arguments = signature(wrapped).bind(*args, **kwargs).arguments
+        camera, model = (arguments[name] for name in seam.needs[:2])
+        token = self._rendering.set((model, id(camera)))
+        try:
+            return wrapped(*args, **kwargs)
+        finally:
+            self._rendering.reset(token)
+
+    def _on_rasterize(
+        self, seam: Seam, wrapped: Any, rasterizer: Any, args: Any, kwargs: Any
+    ) -> Any:
+        rendering = self._rendering.get()
+        state = self._models.get(rendering[0]) if rendering else None
+        if rendering is None or state is None or self._paused.get():
+            return wrapped(*args, **kwargs)
+        view = rendering[1]
+        call = HostCall.bind(wrapped, rasterizer.raster_settings, args, kwargs)
+        means = call["means3D"]
+        if len(means) != len(state.store):
+            raise AlignmentError(
+                f"{self.adapter.name}: rasterizer call",
+                f"{len(means)} Gaussians",
+                f"{len(state.store)}, one per threshold, or a row map",
+                "Report this with the host's commit.",
+            )
+        if state.store.neutral:
+            return wrapped(*args, **kwargs)
+        inputs = self._dialect.unpack(call)
+        thresholds = self.hook.fragprune_truncate(inputs=inputs, store=state.store)
+        if thresholds is None:
+            return wrapped(*args, **kwargs)
+        engine = self.engine(means.device)
+        outputs = engine.rasterize(inputs, thresholds)
+        if torch.is_grad_enabled() and state.plan is not None and state.plan.learn:
+            if view not in state.baseline:
+                with torch.no_grad():
+                    untruncated = engine.rasterize(inputs, None)
+                state.baseline[view] = float(untruncated.fragments_per_pixel)
+            outputs = self._press(state, view, outputs)
+        return self._dialect.pack(outputs, call)
+
+    def _press(self, state: _ModelState, view: int, outputs: Any) -> Any:
+        """Put the fragment pressure into the host's loss and keep this step's figures."""
+        from dataclasses import replace
+
+        plan = state.plan
+        assert plan is not None
+        fragments = float(outputs.fragments_per_pixel.detach())
+        state.drawn[view] = fragments
+        self.pressure.observe(plan.progress, fragments / max(state.baseline[view], 1e-9))
+        state.stats = StepStats(
+            step=state.steps - self.from_step,
+            fragments_per_pixel=fragments,
+            pressure=self.pressure.value,
+            threshold_median=float(state.store.values.detach().median()),
+        )
+        if self.pressure.value == 0 or not outputs.image.requires_grad:
+            return outputs
+        term = outputs.fragments_per_pixel * self.pressure.value
+        return replace(outputs, image=_AddToLoss.apply(outputs.image, term))  # type: ignore[no-untyped-call]
+
+    def _on_parents(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        state = self._models.get(model)
+        if state is None:
+            return wrapped(*args, **kwargs)
+        bound = signature(wrapped).bind(*args, **kwargs)
+        bound.apply_defaults()
+        method = seam.attribute.split(".")[-1]
+        state.pending_parents = self.adapter.parents(model, method, bound.arguments)
+        try:
+            return wrapped(*args, **kwargs)
+        finally:
+            state.pending_parents = None
+
+    def _on_append(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        state = self._models.get(model)
+        if state is None:
+            return wrapped(*args, **kwargs)
+        tensors = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
+        parents, state.pending_parents = state.pending_parents, None
+        count = len(next(iter(tensors.values())))
+        copies = parents is None or (
+            len(parents) == count and self.adapter.check_children(model, tensors, parents)
+        )
+        if not copies:
+            raise AlignmentError(
+                str(seam),
+                f"{count} new rows that are not copies of the {0 if parents is None else len(parents)} selected parents",
+                "one child per selected parent and repeat, in the host's order",
+                "Report this with the host's commit: its densification differs.",
+            )
+        result = wrapped(*args, **kwargs)
+        before = len(state.store)
+        state.store.append(count, parents)
+        self._changed(state.store, "append", before)
+        return result
+
+    def _on_keep(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        state = self._models.get(model)
+        if state is not None:
+            mask = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
+            before = len(state.store)
+            state.store.keep(mask)
+            self._changed(state.store, "keep", before)
+        return result
+
+    def _changed(self, store: ThresholdStore, operation: str, before: int) -> None:
+        change = PopulationChange(operation, before, len(store))
+        self.hook.fragprune_population_changed(store=store, change=change)
+
+    def _on_still(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        return None if self._standing_still(model) else wrapped(*args, **kwargs)
+
+    def _on_save(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        state = self._models.get(model)
+        if state is not None:
+            path = Path(signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]])
+            self._expect_rows(model, state, str(seam))
+            if state.store.neutral:
+                # A sidecar of an earlier model under this name would now be refused as stale.
+                sidecar.path_beside(path).unlink(missing_ok=True)
+            else:
+                written = sidecar.save(
+                    path,
+                    state.store,
+                    adapter=self.adapter.name,
+                    host_commit=self.repo.commit,
+                    settings=self.settings.as_dict(),
+                )
+                self.hook.fragprune_saved(path=written)
+        return result
+
+    def _on_load(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        path = Path(signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]])
+        if sidecar.path_beside(path).exists():
+            store = ThresholdStore(self.adapter.rows(model), self.adapter.means(model).device)
+            sidecar.load(path, store)
+            self._models[model] = _ModelState(store)
+            self._follow(model, self._models[model])
+            self.hook.fragprune_attached(model=model, store=store)
+        else:
+            self._models.pop(model, None)  # another population: what we knew is not about it
+        return result
+
+    def _on_capture(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        state = self._models.get(model)
+        if state is not None and not state.store.neutral:
+            self._expect_rows(model, state, str(seam))
+            self.adapter.checkpoint_state(result)["fragprune"] = state.store.state_dict()
+        return result
+
+    def _on_restore(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        bound = signature(wrapped).bind(*args, **kwargs)
+        capture = self.adapter.before_restore(model, bound.arguments[seam.needs[0]])
+        bound.arguments[seam.needs[0]] = capture
+        saved = self.adapter.checkpoint_state(capture).pop("fragprune", None)
+        result = wrapped(*bound.args, **bound.kwargs)
+        state = self._models.get(model)
+        if saved is not None:
+            if state is None:
+                device = self.adapter.means(model).device
+                state = self._models[model] = _ModelState(ThresholdStore(0, device))
+            state.store.load_state_dict(saved)
+            self._expect_rows(model, state, str(seam))
+        return result
+
+    def _expect_rows(self, model: Any, state: _ModelState, where: str) -> None:
+        rows = self.adapter.rows(model)
+        if rows != len(state.store):
+            raise AlignmentError(
+                where,
+                f"{rows} Gaussians",
+                f"{len(state.store)}, one per threshold",
+                "Report this with the host's commit: its rows changed without the store seeing it.",
+            )
+
+
+_HANDLERS: dict[Role, Callable[..., Any]] = {
+    Role.SCENE: Session._on_scene,
+    Role.ATTACH: Session._on_attach,
+    Role.STEP: Session._on_step,
+    Role.VIEW: Session._on_view,
+    Role.RASTERIZE: Session._on_rasterize,
+    Role.PARENTS: Session._on_parents,
+    Role.KEEP: Session._on_keep,
+    Role.APPEND: Session._on_append,
+    Role.STILL: Session._on_still,
+    Role.SAVE: Session._on_save,
+    Role.LOAD: Session._on_load,
+    Role.CAPTURE: Session._on_capture,
+    Role.RESTORE: Session._on_restore,
+}
