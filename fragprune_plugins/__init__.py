@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fragprune_plugins.api import activate, deactivate, paused
     from fragprune_plugins.engines import rasterize
-    from fragprune_plugins.finetune import finetune
+    from fragprune_plugins.finetuning import finetune
     from fragprune_plugins.schedule import Settings
     from fragprune_plugins.thresholds import ThresholdStore
     from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
@@ -27,7 +27,7 @@ _HOME = {
     "View": "types",
     "activate": "api",
     "deactivate": "api",
-    "finetune": "finetune",
+    "finetune": "finetuning",
     "paused": "api",
     "rasterize": "engines",
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -95,6 +96,8 @@ _SUBSTITUTES: dict[str, Any] = {
 @contextlib.contextmanager
 def cpu_only() -> Iterator[None]:
     """Inside, torch calls that name CUDA run on the CPU; checkpoints load to the CPU."""
+    # Optimizers import it later, and it would then take our substitutes for torch's functions.
+    importlib.import_module("torch._dynamo")
     load = torch.load
 
     @functools.wraps(load)

@@ -519,7 +519,7 @@ class Session:
         if not copies:
             raise AlignmentError(
                 str(seam),
-                f"{count} new rows that are not copies of the {0 if parents is None else len(parents)} selected parents",
+                f"{count} new rows that are not copies of the selected parents",
                 "one child per selected parent and repeat, in the host's order",
                 "Report this with the host's commit: its densification differs.",
             )
