@@ -8,8 +8,12 @@ starts from the known curve, waits before it trusts an error, and never integrat
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from fragprune_plugins.thresholds import ThresholdStore
 
 DEFAULT_PRESSURE = 1e-4
 TARGET_TOLERANCE = 0.05
@@ -84,3 +88,48 @@ class PressureController:
         self.value = math.exp(max(low, min(high, math.log(self.value) + step)))
         self._next = progress + self.period
         self._sum, self._count = 0.0, 0
+
+
+def calibrate(
+    store: ThresholdStore,
+    speedup: Callable[[], float],
+    target: float,
+    *,
+    tolerance: float = 0.01,
+    reach: float = 8.0,
+    rounds: int = 16,
+) -> float:
+    """Shift all threshold logits by one number so that ``speedup()`` meets ``target``.
+
+    Speed-up grows with the shift, so bisection finds it. Where the target lies out of reach the
+    nearest end is kept. Call it late in the run and let opacities adapt afterwards.
+
+    Args:
+        store: the thresholds; changed in place.
+        speedup: measures fragments before over after with the store as it stands.
+        target: fragments before over after.
+        tolerance: relative distance at which to stop.
+        reach: largest shift either way, in logits.
+        rounds: most measurements.
+
+    Returns:
+        The speed-up measured last.
+    """
+    import torch
+
+    logits = store.logits
+    start = logits.detach().clone()
+    low, high = -reach, reach
+    shift, reached = 0.0, speedup()
+    for _ in range(rounds):
+        if abs(reached / target - 1) <= tolerance:
+            break
+        if reached < target:
+            low = shift
+        else:
+            high = shift
+        shift = (low + high) / 2
+        with torch.no_grad():
+            logits.copy_(start + shift)
+        reached = speedup()
+    return reached

@@ -1,0 +1,59 @@
+"""The command line: one module a command, imported when asked for; none imports torch early."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+
+import click
+
+_COMMANDS = {
+    "demo": "demo",
+    "run": "run",
+    "finetune": "finetune",
+    "render": "render",
+    "profile": "profile",
+    "compare": "compare",
+    "export": "export",
+    "adapters": "adapters",
+    "check": "check",
+    "doctor": "doctor",
+}
+"""Command name to module in this package, which defines ``command``; in the order of --help."""
+
+
+class _LazyGroup(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return [name for name in _COMMANDS if _present(name)]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS or not _present(cmd_name):
+            return None
+        command: click.Command = import_module(f"{__name__}.{_COMMANDS[cmd_name]}").command
+        return command
+
+
+def _present(name: str) -> bool:
+    return find_spec(f"{__name__}.{_COMMANDS[name]}") is not None
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="fragprune-plugins", prog_name="fragprune")
+def cli() -> None:
+    """Learned fragment pruning for Gaussian splatting: the same picture from fewer fragments.
+
+    Every Gaussian learns how far it reaches; fragments beyond are neither sorted nor blended.
+
+    \b
+    I have a training repository     fragprune run -- python train.py -s scene -m out
+    I have a trained .ply            fragprune finetune point_cloud.ply --data scene --out small.ply
+    What did I gain?                 fragprune compare point_cloud.ply small.ply --data scene
+    Show me, no GPU needed           fragprune demo
+
+    Every command takes --json (one object on stdout, progress on stderr) and --help.
+    """
+
+
+def main() -> None:
+    """Entry point of the ``fragprune`` script."""
+    cli(prog_name="fragprune")

@@ -1,0 +1,243 @@
+"""What all commands share: --json, errors and exit codes, the options for scenes and engines."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.finetune.dataset import Shot
+    from fragprune_plugins.ply import SplatFile
+    from fragprune_plugins.thresholds import ThresholdStore
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+FILE = click.Path(path_type=Path)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a command has to say.
+
+    Attributes:
+        data: for --json.
+        text: for a person.
+        exit_code: 0, or 1 when what was asked for was not reached, or 130.
+    """
+
+    data: dict[str, Any]
+    text: str
+    exit_code: int = 0
+
+
+class Command(click.Command):
+    """A command that returns a ``Report``: prints it, as JSON if asked; turns errors into codes.
+
+    1 for a stated failure, 2 for usage, 130 for Ctrl-C. Anything unforeseen keeps its traceback.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.params.append(
+            click.Option(
+                ["--json", "as_json"], is_flag=True, help="Print one JSON object on stdout."
+            )
+        )
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run, print, and leave with the right exit code."""
+        as_json = bool(ctx.params.pop("as_json"))
+        try:
+            report: Report = super().invoke(ctx)
+        except FragpruneError as error:
+            if as_json:
+                click.echo(json.dumps({"error": error.as_dict()}))
+            else:
+                click.echo(str(error), err=True)
+            codes: dict[type[FragpruneError], int] = {UsageError: 2, Interrupted: 130}
+            ctx.exit(codes.get(type(error), 1))
+        except KeyboardInterrupt:
+            click.echo("Interrupted; nothing was written.", err=True)
+            ctx.exit(130)
+        click.echo(json.dumps(_strict(report.data)) if as_json else report.text)
+        ctx.exit(report.exit_code)
+
+
+def _together(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:
+    """Several options as one decorator, shown in this order."""
+
+    def decorate(function: Function) -> Function:
+        return functools.reduce(lambda f, option: option(f), reversed(options), function)
+
+    return decorate
+
+
+image_options = _together(
+    click.option(
+        "--resolution",
+        type=click.IntRange(1, 16),
+        default=1,
+        show_default=True,
+        help="Divide the images' sides by this.",
+    ),
+    click.option(
+        "--white-background",
+        is_flag=True,
+        help="Composite transparent images over white, as the model was trained.",
+    ),
+)
+
+data_options = _together(
+    click.option(
+        "--data",
+        type=FILE,
+        required=True,
+        help="Scene folder: COLMAP (sparse/, images/) or Blender (transforms_*.json).",
+    ),
+    image_options,
+)
+
+engine_options = _together(
+    click.option(
+        "--engine",
+        type=click.Choice(["auto", "reference", "cpu"]),
+        default="auto",
+        show_default=True,
+        help="What rasterizes; auto takes the fastest that runs here.",
+    ),
+    click.option(
+        "--threads", type=click.IntRange(min=1), help="CPU threads; all cores when left out."
+    ),
+)
+
+truncation_option = click.option(
+    "--no-truncation", is_flag=True, help="Ignore the thresholds stored with the model."
+)
+
+views_option = click.option(
+    "--views",
+    type=click.Choice(["test", "train", "all"]),
+    default="test",
+    show_default=True,
+    help="Which views to use; test are those held out (COLMAP: every 8th).",
+)
+
+
+def set_threads(threads: int | None) -> None:
+    """Bound the CPU threads of torch and of the engines, which follow torch."""
+    if threads is not None:
+        import torch
+
+        torch.set_num_threads(threads)
+
+
+def load_model(path: Path, *, truncation: bool = True) -> tuple[SplatFile, Tensor | None]:
+    """A model and its thresholds (N,): the sidecar's, else the file's own column, else None.
+
+    Raises:
+        ModelFileError: the model cannot be read.
+        SidecarError: the sidecar beside it is broken or belongs to another model.
+    """
+    from fragprune_plugins import sidecar
+    from fragprune_plugins.ply import read_ply
+
+    model = read_ply(path)
+    if not truncation:
+        return model, None
+    if sidecar.path_beside(path).exists():
+        store = load_store(path, model)
+        return model, None if store.neutral else store.values.detach()
+    return model, model.thresholds
+
+
+def load_store(path: Path, model: SplatFile) -> ThresholdStore:
+    """The thresholds of a model to go on learning from: as ``load_model``, neutral when none."""
+    import torch
+
+    from fragprune_plugins import sidecar
+    from fragprune_plugins.thresholds import ThresholdStore
+
+    store = ThresholdStore(len(model))
+    if sidecar.path_beside(path).exists():
+        sidecar.load(path, store)
+    elif model.thresholds is not None:
+        with torch.no_grad():
+            store.logits.copy_(torch.logit(model.thresholds))
+    return store
+
+
+def load_shots(
+    folder: Path, views: str, *, resolution: int, white_background: bool
+) -> Sequence[Shot]:
+    """The views of a scene folder that were asked for.
+
+    Raises:
+        DatasetError: the folder cannot be read as a scene.
+    """
+    from fragprune_plugins.finetune.dataset import load_dataset
+
+    dataset = load_dataset(folder, resolution=resolution, white_background=white_background)
+    return {
+        "test": dataset.test,
+        "train": dataset.train,
+        "all": [*dataset.train, *dataset.test],
+    }[views]
+
+
+def describe(columns: dict[str, dict[str, Any]]) -> str:
+    """A table of measurements, one column each, and how the last differs from the one before."""
+    reports = list(columns.values())
+    head = " " * 20 + "".join(f"{name:>16}" for name in columns)
+    lines = [head + f"{'change':>12}" if len(columns) > 1 else head]
+    for label, key, digits in _ROWS:
+        cells = [f"{report[key]:.{digits}f}" for report in reports]
+        if key == "frame_ms":
+            cells = [
+                f"{cell} ± {report['frame_ms_se']:.{digits}f}"
+                for cell, report in zip(cells, reports, strict=True)
+            ]
+        line = f"{label:<20}" + "".join(f"{cell:>16}" for cell in cells)
+        if len(reports) > 1:
+            first, last = reports[-2][key], reports[-1][key]
+            change = (
+                f"{last - first:+.{digits}f}"
+                if key in ("psnr", "ssim")
+                else f"/ {first / max(last, 1e-9):.2f}"
+            )
+            line += f"{change:>12}"
+        lines.append(line)
+    report = reports[-1]
+    lines.append(f"{report['views']} views, {report['engine']} engine on {report['device']}")
+    return "\n".join(lines)
+
+
+_ROWS = (
+    ("PSNR, dB", "psnr", 2),
+    ("SSIM", "ssim", 4),
+    ("fragments/pixel", "fragments_per_pixel", 2),
+    ("evaluated/pixel", "evaluated_per_pixel", 2),
+    ("frame, ms", "frame_ms", 2),
+    ("Gaussians", "gaussians", 0),
+)
+
+
+def _strict(value: Any) -> Any:
+    """JSON knows neither NaN nor infinity: null."""
+    if isinstance(value, dict):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,47 @@
+"""``fragprune export``: one PLY that carries the thresholds, for other tools."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fragprune_plugins.cli.common import FILE, Command, Report, load_model
+from fragprune_plugins.errors import SidecarError
+
+
+@click.command("export", cls=Command)
+@click.argument("model", type=FILE)
+@click.option("--out", type=FILE, required=True, help="The PLY to write.")
+def command(model: Path, out: Path) -> Report:
+    """Write MODEL with its thresholds as one more column.
+
+    The column, trunc_threshold, holds the threshold itself, a falloff in (0, 1): a renderer that draws a fragment
+    only where exp(-q/2) >= trunc_threshold (q the squared Mahalanobis distance) draws what we draw.
+    Tools that do not know the column ignore it.
+
+    \b
+    Example:
+      fragprune export small.ply --out small_with_thresholds.ply
+    """
+    from fragprune_plugins import sidecar
+    from fragprune_plugins.ply import THRESHOLD_COLUMN, write_ply
+
+    splat, thresholds = load_model(model)
+    if thresholds is None:
+        raise SidecarError(
+            str(sidecar.path_beside(model)),
+            "no thresholds for this model",
+            "a sidecar beside it, written by fragprune",
+            "Run fragprune finetune first.",
+        )
+    write_ply(out, splat, thresholds)
+    return Report(
+        {
+            "model": str(model),
+            "out": str(out),
+            "gaussians": len(splat),
+            "column": THRESHOLD_COLUMN,
+        },
+        f"Wrote {out}: {len(splat)} Gaussians with {THRESHOLD_COLUMN}.",
+    )

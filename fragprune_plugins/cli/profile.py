@@ -1,0 +1,132 @@
+"""``fragprune profile``: what a splat costs and how good it looks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fragprune_plugins.cli.common import (
+    FILE,
+    Command,
+    Report,
+    data_options,
+    describe,
+    engine_options,
+    load_model,
+    load_shots,
+    set_threads,
+    truncation_option,
+    views_option,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fragprune_plugins.engines import Engine
+    from fragprune_plugins.finetune.dataset import Shot
+    from fragprune_plugins.measure import Candidate
+
+PANELS = 4
+
+
+@click.command("profile", cls=Command)
+@click.argument("model", type=FILE)
+@data_options
+@click.option("--out", type=FILE, help="Folder for pictures: photograph, render, fragment density.")
+@views_option
+@truncation_option
+@engine_options
+def command(
+    model: Path,
+    data: Path,
+    resolution: int,
+    white_background: bool,
+    out: Path | None,
+    views: str,
+    no_truncation: bool,
+    engine: str,
+    threads: int | None,
+) -> Report:
+    """Measure MODEL: quality, fragments per pixel, time per frame.
+
+    A model with thresholds is measured with and without them, on the same frames in turns.
+
+    \b
+    Example:
+      fragprune profile small.ply --data scene --out pictures
+    """
+    import torch
+
+    from fragprune_plugins.engines import create_engine
+    from fragprune_plugins.files import writable_folder
+    from fragprune_plugins.measure import Candidate, measure
+
+    set_threads(threads)
+    if out is not None:
+        writable_folder(out)
+    splat, thresholds = load_model(model, truncation=not no_truncation)
+    shots = load_shots(data, views, resolution=resolution, white_background=white_background)
+    rasterizer = create_engine(engine, splat.xyz.device)
+    columns = {"untruncated": Candidate(splat)}
+    if thresholds is not None:
+        columns["truncated"] = Candidate(splat, thresholds)
+    measured = dict(
+        zip(columns, measure(list(columns.values()), shots, engine=rasterizer), strict=True)
+    )
+    last = list(measured)[-1]
+    report: dict[str, Any] = {"model": str(model), "truncated": thresholds is not None}
+    report |= measured[last] | {"columns": measured}
+    lines = [describe(measured)]
+    if thresholds is not None:
+        points = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
+        step = max(1, len(thresholds) // 100_000)
+        quantiles = torch.quantile(thresholds[::step], points).tolist()
+        report["threshold_quantiles"] = quantiles
+        lines.append(
+            "thresholds (5, 25, 50, 75, 95 %): " + ", ".join(f"{value:.3f}" for value in quantiles)
+        )
+    if out is not None:
+        files = draw_panels(out, columns, shots, rasterizer)
+        report["files"] = [str(file) for file in files]
+        lines.append(f"Wrote {len(files)} pictures to {out}.")
+    return Report(report, "\n".join(lines))
+
+
+def draw_panels(
+    out: Path, columns: dict[str, Candidate], shots: Sequence[Shot], engine: Engine
+) -> list[Path]:
+    """One picture for some of the views: photograph, renders, fragment densities on one scale."""
+    import torch
+
+    from fragprune_plugins.measure.pictures import save_panel
+    from fragprune_plugins.types import RasterInputs
+
+    files = []
+    drawn = {name: candidate.model.splats() for name, candidate in columns.items()}
+    for shot in shots[:: -(-len(shots) // PANELS)]:
+        with torch.no_grad():
+            outputs = {
+                name: engine.rasterize(
+                    RasterInputs(shot.view, drawn[name], counts=True), candidate.thresholds
+                )
+                for name, candidate in columns.items()
+            }
+        heat = {
+            name: output.fragments
+            for name, output in outputs.items()
+            if output.fragments is not None
+        }
+        file = out / f"{Path(shot.name.replace('/', '_')).stem}_panel.png"
+        save_panel(
+            file,
+            [
+                ("photograph", shot.image),
+                *((name, output.image) for name, output in outputs.items()),
+                *((f"{name}: {c.float().mean():.1f}/px", c) for name, c in heat.items()),
+            ],
+            max(float(fragments.max()) for fragments in heat.values()),
+        )
+        files.append(file)
+    return files

@@ -1,0 +1,106 @@
+"""``fragprune render``: pictures of a splat, truncated as its sidecar says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fragprune_plugins.cli.common import (
+    FILE,
+    Command,
+    Report,
+    engine_options,
+    image_options,
+    load_model,
+    load_shots,
+    set_threads,
+    truncation_option,
+    views_option,
+)
+from fragprune_plugins.errors import UsageError
+
+
+@click.command("render", cls=Command)
+@click.argument("model", type=FILE)
+@click.option("--cameras", type=FILE, help="cameras.json of a 3DGS model, or transforms_*.json.")
+@click.option("--data", type=FILE, help="Scene folder whose cameras to use, instead of --cameras.")
+@click.option("--out", type=FILE, required=True, help="Folder for the PNG files.")
+@click.option("--heatmap", is_flag=True, help="Also draw fragments per pixel, on one shared scale.")
+@views_option
+@image_options
+@truncation_option
+@engine_options
+def command(
+    model: Path,
+    cameras: Path | None,
+    data: Path | None,
+    out: Path,
+    heatmap: bool,
+    views: str,
+    resolution: int,
+    white_background: bool,
+    no_truncation: bool,
+    engine: str,
+    threads: int | None,
+) -> Report:
+    """Render MODEL from many cameras, one PNG each.
+
+    The thresholds beside MODEL are applied when there are any; --no-truncation draws without.
+
+    \b
+    Examples:
+      fragprune render small.ply --data scene --out renders --heatmap
+      fragprune render small.ply --cameras out/cameras.json --out renders
+    """
+    if (cameras is None) == (data is None):
+        found = "neither" if data is None else "both"
+        raise UsageError("options", f"{found} of --cameras and --data", "one of them", "Pass one.")
+
+    import torch
+
+    from fragprune_plugins.engines import create_engine
+    from fragprune_plugins.files import writable_folder
+    from fragprune_plugins.finetune.cameras import load_cameras
+    from fragprune_plugins.measure.pictures import save_heatmap, save_image
+    from fragprune_plugins.types import RasterInputs
+
+    set_threads(threads)
+    writable_folder(out)
+    splat, thresholds = load_model(model, truncation=not no_truncation)
+    if data is not None:
+        shots = load_shots(data, views, resolution=resolution, white_background=white_background)
+        named = [(shot.name, shot.view) for shot in shots]
+    else:
+        assert cameras is not None
+        named = load_cameras(cameras, white_background=white_background)
+    rasterizer = create_engine(engine, splat.xyz.device)
+    splats = splat.splats()
+    files, fragments, maps = [], [], []
+    with torch.no_grad():
+        for name, view in named:
+            outputs = rasterizer.rasterize(RasterInputs(view, splats, counts=heatmap), thresholds)
+            file = out / f"{Path(name.replace('/', '_')).stem}.png"
+            save_image(file, outputs.image)
+            files.append(file)
+            fragments.append(float(outputs.fragments_per_pixel))
+            if outputs.fragments is not None:
+                maps.append((file.with_name(file.stem + "_fragments.png"), outputs.fragments))
+    limit = max((float(counts.max()) for _, counts in maps), default=0.0)
+    for file, counts in maps:
+        save_heatmap(file, counts, limit)
+        files.append(file)
+    mean = sum(fragments) / len(fragments)
+    return Report(
+        {
+            "model": str(model),
+            "files": [str(file) for file in files],
+            "fragments_per_pixel": mean,
+            "gaussians": len(splat),
+            "truncated": thresholds is not None,
+            "engine": rasterizer.name,
+            "device": str(splat.xyz.device),
+        },
+        f"Wrote {len(files)} pictures to {out} ({mean:.1f} fragments per pixel, "
+        f"{'truncated' if thresholds is not None else 'not truncated'}).",
+    )

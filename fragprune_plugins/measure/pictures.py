@@ -1,0 +1,133 @@
+"""Pictures: renders, fragment-density maps, side-by-side panels, learning curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from fragprune_plugins.files import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fragprune_plugins.finetune.loop import Record
+
+COLOURS = "inferno"
+LABEL = "drawn fragments per pixel"
+
+
+def save_image(path: Path, image: Tensor) -> None:
+    """Write an image (3, H, W), clamped to [0, 1], as 8-bit PNG.
+
+    Raises:
+        OutputError: the place cannot be written; so for every function here.
+    """
+    from PIL import Image
+
+    with replacing(path) as temporary:
+        Image.fromarray(_bytes(image)).save(temporary, format="PNG")
+
+
+def save_heatmap(path: Path, fragments: Tensor, limit: float) -> None:
+    """Write fragments per pixel (H, W) as colours with their scale.
+
+    Args:
+        path: the PNG.
+        fragments: (H, W) counts.
+        limit: the count at the top of the scale; pass the same for pictures to compare.
+    """
+    save_panel(path, [("", fragments)], limit)
+
+
+def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float) -> None:
+    """Write pictures side by side under their titles: (3, H, W) as they are, (H, W) as colours.
+
+    Args:
+        path: the PNG.
+        pictures: titles and pictures, all of one size.
+        limit: the count at the top of the colour scale that all (H, W) share.
+    """
+    from matplotlib.figure import Figure
+    from mpl_toolkits.axes_grid1 import ImageGrid  # type: ignore[import-untyped]
+
+    height, width = pictures[0][1].shape[-2:]
+    tall = min(4.5, max(2.2, 3.6 * height / width))
+    wide = tall * width / height
+    maps = any(picture.ndim == 2 for _, picture in pictures)
+    figure = Figure(figsize=((wide + 0.08) * len(pictures) + 0.9 * maps + 0.3, tall + 0.55))
+    grid: Any = ImageGrid(
+        figure,
+        111,
+        nrows_ncols=(1, len(pictures)),
+        axes_pad=0.08,
+        cbar_mode="single" if maps else None,
+        cbar_size=0.12,
+        cbar_pad=0.1,
+    )
+    for axes, (title, picture) in zip(grid, pictures, strict=True):
+        axes.set_axis_off()
+        axes.set_title(title, fontsize=9)
+        if picture.ndim == 3:
+            axes.imshow(_bytes(picture), interpolation="nearest")
+        else:
+            shown = axes.imshow(
+                picture.detach().cpu().numpy(),
+                vmin=0,
+                vmax=max(limit, 1.0),
+                cmap=COLOURS,
+                interpolation="nearest",
+            )
+            grid.cbar_axes[0].colorbar(shown, label=LABEL)
+    _save(path, figure)
+
+
+def save_curves(path: Path, records: Sequence[Record]) -> None:
+    """Write loss, fragments and threshold quantiles over the steps of a fine-tuning."""
+    from matplotlib.figure import Figure
+
+    from fragprune_plugins.finetune.loop import QUANTILES
+
+    steps = [record.step for record in records]
+    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    loss, fragments, thresholds = figure.subplots(1, 3)
+    loss.plot(steps, [record.loss for record in records], color="tab:blue")
+    loss.set_ylabel("0.8 L1 + 0.2 (1 - SSIM)")
+    fragments.plot(steps, [r.fragments_per_pixel for r in records], color="tab:red")
+    fragments.set_ylabel(LABEL)
+    fragments.set_ylim(bottom=0)
+    rows = np.array([record.thresholds for record in records]).T
+    middle = len(QUANTILES) // 2
+    for low, shade in zip(range(middle), (0.2, 0.35), strict=True):
+        thresholds.fill_between(
+            steps,
+            rows[low],
+            rows[-1 - low],
+            color="tab:green",
+            alpha=shade,
+            linewidth=0,
+            label=f"{QUANTILES[low]:.0%} to {QUANTILES[-1 - low]:.0%}",
+        )
+    thresholds.plot(steps, rows[middle], color="tab:green", label="median")
+    thresholds.set_ylabel("truncation threshold (falloff)")
+    thresholds.legend(fontsize=8)
+    for axes in (loss, fragments, thresholds):
+        axes.set_xlabel("step")
+        axes.grid(alpha=0.25)
+    _save(path, figure)
+
+
+def _bytes(image: Tensor) -> np.ndarray[Any, Any]:
+    values: np.ndarray[Any, Any] = image.detach().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+    return np.round(255 * values).astype(np.uint8)
+
+
+def _save(path: Path, figure: Figure) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130, bbox_inches="tight")
