@@ -1,4 +1,4 @@
-"""Textures of the demo room: photographs that scikit-image carries in its wheel, or seeded noise."""
+"""Textures of the demo room: photographs from scikit-image's wheel, or seeded noise."""
 
 from __future__ import annotations
 
