@@ -1,0 +1,240 @@
+"""The compiled CPU rasterizer as an engine: tensors in, tensors out, every gradient."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.native import loader
+from fragprune_plugins.types import RasterOutputs
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs
+
+# The differentiable inputs, in the order in which the autograd function takes them.
+_NAMES = (
+    "means",
+    "means2d",
+    "opacities",
+    "scales",
+    "rotations",
+    "cov3d",
+    "sh",
+    "colors",
+    "thresholds",
+    "background",
+)
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    """The values as the C side wants them: contiguous float32 in ordinary memory."""
+    return tensor.detach().to("cpu", torch.float32).contiguous()
+
+
+def _address(tensor: Tensor | None) -> int | None:
+    return None if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
+
+
+def _stop(status: int, error: loader.Error) -> NoReturn:
+    text = error.message.decode(errors="replace")
+    if status == loader.OUT_OF_MEMORY:
+        raise MemoryError(f"fragprune's cpu engine: {text}")
+    raise EngineError(
+        "engine 'cpu'", text, "inputs it can draw", "Check the camera and the Gaussians."
+    )
+
+
+@dataclass
+class _Drawing:
+    """One forward pass: what goes in beside the differentiable inputs, and what stays behind.
+
+    Attributes:
+        inputs: as the engine got them.
+        library: the build that draws.
+        arrays: what the C side reads, kept alive as long as its state.
+        state: what backward needs; None when nothing wants gradients.
+        evaluated: lanes spent.
+        fragments: (H, W) int32, when asked for.
+        fragments_per_gaussian: (N,) int32, when asked for.
+    """
+
+    inputs: RasterInputs
+    library: loader.Library
+    arrays: dict[str, Tensor]
+    state: loader.State | None = None
+    evaluated: int = 0
+    fragments: Tensor | None = None
+    fragments_per_gaussian: Tensor | None = None
+
+    def fill(self, widen: bool) -> loader.Inputs:
+        """The C struct; it points into ``arrays``."""
+        view, splats = self.inputs.view, self.inputs.splats
+        return loader.Inputs(
+            threads=torch.get_num_threads(),
+            width=view.width,
+            height=view.height,
+            tan_fov_x=view.tan_fov_x,
+            tan_fov_y=view.tan_fov_y,
+            scale_modifier=self.inputs.scale_modifier,
+            dilation=self.inputs.dilation,
+            antialiasing=self.inputs.antialiasing,
+            sh_degree=splats.sh_degree,
+            sh_coefficients=0 if splats.sh is None else splats.sh.shape[1],
+            widen=widen,
+            count=len(splats),
+            **{name: _address(array) for name, array in self.arrays.items()},
+        )
+
+    def draw(self, wants: dict[str, bool]) -> tuple[Tensor, ...]:
+        """Run the forward pass; image, invdepth, alpha, radii, fragments per pixel."""
+        view, n = self.inputs.view, len(self.inputs.splats)
+        size = (view.height, view.width)
+        image, invdepth, alpha = torch.empty(3, *size), torch.empty(size), torch.empty(size)
+        radii = torch.empty(n, dtype=torch.int32)
+        if self.inputs.counts:
+            self.fragments = torch.empty(size, dtype=torch.int32)
+            self.fragments_per_gaussian = torch.empty(n, dtype=torch.int32)
+        outputs = loader.Outputs(
+            image=_address(image),
+            invdepth=_address(invdepth),
+            alpha=_address(alpha),
+            radii=_address(radii),
+            fragments=_address(self.fragments),
+            fragments_per_gaussian=_address(self.fragments_per_gaussian),
+        )
+        error = loader.Error()
+        handle = ctypes.c_void_p()
+        keep = any(wants.values())
+        status = self.library.calls.fragprune_forward(
+            ctypes.byref(self.fill(wants["thresholds"])),
+            ctypes.byref(outputs),
+            ctypes.byref(handle) if keep else None,
+            ctypes.byref(error),
+        )
+        if status != loader.OK:
+            _stop(status, error)
+        if keep:
+            self.state = loader.State(self.library)
+            self.state.handle = handle.value
+        else:
+            self.arrays = {}
+        self.evaluated = outputs.evaluated
+        drawn = torch.tensor(outputs.drawn / (view.width * view.height), dtype=torch.float32)
+        return image, invdepth[None], alpha[None], radii, drawn
+
+    def undraw(self, upstream: tuple[Tensor | None, ...], wants: dict[str, bool]) -> dict[str, Any]:
+        """Run the backward pass; gradients by name, float32 on the CPU."""
+        assert self.state is not None
+        plain = [None if g is None else _plain(g) for g in upstream]
+        image, invdepth, alpha, per_pixel = plain
+        output_grads = loader.OutputGrads(
+            fragments_per_pixel=0.0 if per_pixel is None else per_pixel.item(),
+            image=_address(image),
+            invdepth=_address(invdepth),
+            alpha=_address(alpha),
+        )
+        n = len(self.inputs.splats)
+        shapes = {name: array.shape for name, array in self.arrays.items()}
+        shapes["means2d"] = torch.Size((n, 3))
+        grads = {name: torch.empty(shapes[name]) for name, wanted in wants.items() if wanted}
+        error = loader.Error()
+        status = self.library.calls.fragprune_backward(
+            self.state.handle,
+            ctypes.byref(output_grads),
+            ctypes.byref(loader.InputGrads(**{k: _address(g) for k, g in grads.items()})),
+            torch.get_num_threads(),
+            ctypes.byref(error),
+        )
+        if status != loader.OK:
+            _stop(status, error)
+        return grads
+
+
+class _Rasterize(torch.autograd.Function):
+    """The engine's seam to autograd."""
+
+    @staticmethod
+    def forward(ctx: Any, drawing: _Drawing, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+        wants = dict(zip(_NAMES, ctx.needs_input_grad[1:], strict=True))
+        outputs = drawing.draw(wants)
+        ctx.mark_non_differentiable(outputs[3])
+        ctx.set_materialize_grads(False)
+        ctx.drawing, ctx.wants = drawing, wants
+        # Saved for the sake of autograd's check against changes in place: the state reads these.
+        ctx.save_for_backward(*tensors)
+        return outputs
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        tensors = ctx.saved_tensors
+        image, invdepth, alpha, _, per_pixel = upstream
+        grads = ctx.drawing.undraw((image, invdepth, alpha, per_pixel), ctx.wants)
+        given: list[Tensor | None] = [None]
+        for name, tensor in zip(_NAMES, tensors, strict=True):
+            if name not in grads:
+                given.append(None)
+                continue
+            grad = grads[name]
+            if name == "means2d" and tensor.shape[1] != 3:  # a hook with absolute gradients too
+                grad = torch.nn.functional.pad(grad[:, :2], (0, tensor.shape[1] - 2))
+            given.append(grad.to(tensor.device, tensor.dtype))
+        return tuple(given)
+
+
+class CpuEngine:
+    """Rasterizes with the compiled library: any number of threads, the same result to the bit.
+
+    Args:
+        library: the build to use; the best for this machine when None.
+    """
+
+    name = "cpu"
+
+    def __init__(self, library: loader.Library | None = None) -> None:
+        self._library = loader.library() if library is None else library
+
+    def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
+        """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+        view, splats = inputs.view, inputs.splats
+        tensors: dict[str, Tensor | None] = {
+            "means": splats.means,
+            "means2d": inputs.means2d_hook,
+            "opacities": splats.opacities,
+            "scales": splats.scales,
+            "rotations": splats.rotations,
+            "cov3d": splats.cov3d,
+            "sh": splats.sh,
+            "colors": splats.colors,
+            "thresholds": thresholds,
+            "background": view.background,
+        }
+        read = {k: t for k, t in tensors.items() if t is not None and k != "means2d"}
+        cameras = {k: getattr(view, k) for k in ("viewmatrix", "projmatrix", "campos")}
+        arrays = {name: _plain(tensor) for name, tensor in {**read, **cameras}.items()}
+        drawing = _Drawing(inputs, self._library, arrays)
+        image, invdepth, alpha, radii, per_pixel = _Rasterize.apply(
+            drawing, *(tensors[name] for name in _NAMES)
+        )
+        device = splats.means.device
+        return RasterOutputs(
+            image=image.to(device),
+            radii=radii.to(device),
+            invdepth=invdepth.to(device),
+            alpha=alpha.to(device),
+            fragments_per_pixel=per_pixel.to(device),
+            evaluated_per_pixel=drawing.evaluated / (view.width * view.height),
+            fragments=_on(device, drawing.fragments),
+            fragments_per_gaussian=_on(device, drawing.fragments_per_gaussian),
+        )
+
+
+def _on(device: torch.device, tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.to(device)

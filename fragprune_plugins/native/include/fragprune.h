@@ -1,0 +1,142 @@
+/* The C interface of fragprune's rasterizers: plain pointers, no Python, no torch.
+ *
+ * All arrays are contiguous float32 (or the integer type named) in row-major order, N Gaussians.
+ * Matrices act on row vectors, as the hosts keep them: p_view = [p, 1] * viewmatrix.
+ * Functions keep no state of their own and may be called from several threads at once. Every struct
+ * begins with its own size, so that a caller built against another version is refused, not misread.
+ */
+#ifndef FRAGPRUNE_H
+#define FRAGPRUNE_H
+
+#include <stdint.h>
+
+#define FRAGPRUNE_API_VERSION 1
+
+/* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
+#define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
+#define FRAGPRUNE_ALPHA_MAX 0.99
+#define FRAGPRUNE_TRANSMITTANCE_MIN 1e-4
+#define FRAGPRUNE_NEAR 0.2
+#define FRAGPRUNE_TILE 16
+#define FRAGPRUNE_DILATION 0.3
+#define FRAGPRUNE_FRUSTUM_MARGIN 1.3
+#define FRAGPRUNE_ANTIALIASING_FLOOR 2.5e-5
+#define FRAGPRUNE_RIM_WIDTH 0.01
+#define FRAGPRUNE_RIM_REACH 4.6
+#define FRAGPRUNE_FALLOFF_MIN 1e-4
+#define FRAGPRUNE_NEUTRAL_LOGIT -30.0
+
+#if defined(__GNUC__)
+#define FRAGPRUNE_EXPORT __attribute__((visibility("default")))
+#else
+#define FRAGPRUNE_EXPORT
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+enum fragprune_status {
+  FRAGPRUNE_OK = 0,
+  FRAGPRUNE_BAD_INPUT = 1,
+  FRAGPRUNE_OUT_OF_MEMORY = 2,
+  FRAGPRUNE_TOO_LARGE = 3,
+  FRAGPRUNE_FAILED = 4
+};
+
+/* Bits of fragprune_cpu_features: what the machine runs, not what this build uses. */
+enum fragprune_cpu_feature { FRAGPRUNE_CPU_AVX2 = 1, FRAGPRUNE_CPU_AVX512 = 2 };
+
+typedef struct fragprune_error {
+  char message[256]; /* empty unless the status is not FRAGPRUNE_OK */
+} fragprune_error;
+
+typedef struct fragprune_inputs {
+  uint32_t size;           /* sizeof(fragprune_inputs) */
+  int32_t threads;         /* results do not depend on it */
+  int32_t width;           /* pixels */
+  int32_t height;          /* pixels */
+  float tan_fov_x;         /* tangent of half the field of view */
+  float tan_fov_y;
+  float scale_modifier;    /* factor on scales; does not apply to cov3d */
+  float dilation;          /* pixels^2 added to the 2D covariance's diagonal */
+  int32_t antialiasing;    /* multiply opacity by sqrt(max(2.5e-5, det before / det after)) */
+  int32_t sh_degree;       /* 0 to 3 */
+  int32_t sh_coefficients; /* K, the second dimension of sh */
+  int32_t widen;           /* keep rim fragments: thresholds will want a gradient */
+  int64_t count;           /* N */
+  const float *viewmatrix; /* (4, 4) */
+  const float *projmatrix; /* (4, 4) */
+  const float *campos;     /* (3) */
+  const float *background; /* (3) */
+  const float *means;      /* (N, 3) */
+  const float *opacities;  /* (N) */
+  const float *scales;     /* (N, 3), with rotations; or NULL */
+  const float *rotations;  /* (N, 4) w x y z, used as given; or NULL */
+  const float *cov3d;      /* (N, 6) xx xy xz yy yz zz; or NULL */
+  const float *sh;         /* (N, K, 3); or NULL */
+  const float *colors;     /* (N, 3); or NULL */
+  const float *thresholds; /* (N) falloff in (0, 1); or NULL: no truncation */
+} fragprune_inputs;
+
+/* NULL pointers: not wanted. */
+typedef struct fragprune_outputs {
+  uint32_t size;
+  float *image;                    /* (3, H, W) with background */
+  float *invdepth;                 /* (H, W) sum of alpha T / z */
+  float *alpha;                    /* (H, W) 1 - final transmittance */
+  int32_t *radii;                  /* (N) the host's rule; thresholds never change it */
+  int32_t *fragments;              /* (H, W) drawn fragments */
+  int32_t *fragments_per_gaussian; /* (N) drawn fragments */
+  int64_t drawn;                   /* filled in: fragments drawn */
+  int64_t evaluated;               /* filled in: lanes spent on (Gaussian, pixel) pairs */
+} fragprune_outputs;
+
+/* Gradients of a loss with respect to the outputs; NULL stands for zero. */
+typedef struct fragprune_output_grads {
+  uint32_t size;
+  float fragments_per_pixel; /* of drawn / (width * height) */
+  const float *image;        /* (3, H, W) */
+  const float *invdepth;     /* (H, W) */
+  const float *alpha;        /* (H, W) */
+} fragprune_output_grads;
+
+/* Where to put gradients; NULL: not wanted, and not computed. Every element is written. */
+typedef struct fragprune_input_grads {
+  uint32_t size;
+  float *means;      /* (N, 3) */
+  float *means2d;    /* (N, 3) screen gradient times (W/2, H/2), then 0 */
+  float *opacities;  /* (N) */
+  float *scales;     /* (N, 3) */
+  float *rotations;  /* (N, 4) */
+  float *cov3d;      /* (N, 6) */
+  float *sh;         /* (N, K, 3) */
+  float *colors;     /* (N, 3) */
+  float *thresholds; /* (N) */
+  float *background; /* (3) */
+} fragprune_input_grads;
+
+/* What backward needs to know of one forward. Immutable: backward may run any number of times. */
+typedef struct fragprune_state fragprune_state;
+
+/* Draws. With state not NULL, *state receives what backward needs; it refers to the arrays of
+ * `inputs`, which must stay as they are until fragprune_free. */
+FRAGPRUNE_EXPORT int fragprune_forward(const fragprune_inputs *inputs, fragprune_outputs *outputs,
+                                       fragprune_state **state, fragprune_error *error);
+
+FRAGPRUNE_EXPORT int fragprune_backward(const fragprune_state *state,
+                                        const fragprune_output_grads *output_grads,
+                                        const fragprune_input_grads *input_grads, int32_t threads,
+                                        fragprune_error *error);
+
+FRAGPRUNE_EXPORT void fragprune_free(fragprune_state *state); /* NULL is fine */
+
+FRAGPRUNE_EXPORT int fragprune_version(void); /* FRAGPRUNE_API_VERSION of this build */
+FRAGPRUNE_EXPORT int fragprune_lanes(void);   /* pixels handled by one instruction */
+FRAGPRUNE_EXPORT int fragprune_cpu_features(void);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,289 @@
+"""Finds and opens the compiled rasterizer that suits this machine, and says why when it cannot."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import os
+import threading
+from dataclasses import dataclass
+from typing import Any, Final
+
+API_VERSION: Final = 1
+"""FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
+
+ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
+"""Set to off, baseline, avx2 or avx512 to override the choice."""
+
+BUILDS: Final = {"avx512": 2, "avx2": 1, "baseline": 0}
+"""Best first, each with the bit of fragprune_cpu_features that it needs."""
+
+OK: Final = 0
+OUT_OF_MEMORY: Final = 2
+
+_POINTER = ctypes.c_void_p
+
+
+class Error(ctypes.Structure):
+    """fragprune_error."""
+
+    _fields_ = (("message", ctypes.c_char * 256),)
+
+
+class _Sized(ctypes.Structure):
+    """A struct that begins with its own size; built with every other field zero."""
+
+    def __init__(self, **fields: Any) -> None:
+        super().__init__(size=ctypes.sizeof(type(self)), **fields)
+
+
+def _pointers(names: str) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, _POINTER) for name in names.split())
+
+
+class Inputs(_Sized):
+    """fragprune_inputs."""
+
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        ("threads", ctypes.c_int32),
+        ("width", ctypes.c_int32),
+        ("height", ctypes.c_int32),
+        ("tan_fov_x", ctypes.c_float),
+        ("tan_fov_y", ctypes.c_float),
+        ("scale_modifier", ctypes.c_float),
+        ("dilation", ctypes.c_float),
+        ("antialiasing", ctypes.c_int32),
+        ("sh_degree", ctypes.c_int32),
+        ("sh_coefficients", ctypes.c_int32),
+        ("widen", ctypes.c_int32),
+        ("count", ctypes.c_int64),
+        *_pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
+        *_pointers("cov3d sh colors thresholds"),
+    )
+
+
+class Outputs(_Sized):
+    """fragprune_outputs."""
+
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        *_pointers("image invdepth alpha radii fragments fragments_per_gaussian"),
+        ("drawn", ctypes.c_int64),
+        ("evaluated", ctypes.c_int64),
+    )
+
+
+class OutputGrads(_Sized):
+    """fragprune_output_grads."""
+
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        ("fragments_per_pixel", ctypes.c_float),
+        *_pointers("image invdepth alpha"),
+    )
+
+
+class InputGrads(_Sized):
+    """fragprune_input_grads."""
+
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        *_pointers("means means2d opacities scales rotations cov3d sh colors thresholds"),
+        *_pointers("background"),
+    )
+
+
+@dataclass(frozen=True)
+class Library:
+    """An opened build.
+
+    Attributes:
+        build: baseline, avx2 or avx512.
+        path: the shared library's file.
+        lanes: pixels that it handles with one instruction.
+        calls: its functions, by ctypes.
+    """
+
+    build: str
+    path: str
+    lanes: int
+    calls: ctypes.CDLL
+
+
+class Unavailable(Exception):  # noqa: N818 - a state of this machine, reported by describe()
+    """No build can be used here; the message says why."""
+
+
+def _path_of(build: str) -> str:
+    """The build's file, found without importing it: it is no Python module."""
+    spec = importlib.util.find_spec(f"fragprune_plugins.native._cpu_{build}")
+    if spec is None or spec.origin is None:
+        raise Unavailable(f"the {build} build is not installed (was there a C++17 compiler?)")
+    return spec.origin
+
+
+def _open(build: str) -> Library:
+    """Open one build and check that it speaks our version.
+
+    Raises:
+        Unavailable: it is absent, broken, or of another version.
+    """
+    path = _path_of(build)
+    try:
+        calls = ctypes.CDLL(path)
+        version = int(calls.fragprune_version())
+    except (OSError, AttributeError) as error:
+        raise Unavailable(f"{path} cannot be opened: {error}") from error
+    if version != API_VERSION:
+        raise Unavailable(f"{path} speaks version {version}, this package {API_VERSION}; reinstall")
+    calls.fragprune_forward.argtypes = [
+        ctypes.POINTER(Inputs),
+        ctypes.POINTER(Outputs),
+        ctypes.POINTER(_POINTER),
+        ctypes.POINTER(Error),
+    ]
+    calls.fragprune_backward.argtypes = [
+        _POINTER,
+        ctypes.POINTER(OutputGrads),
+        ctypes.POINTER(InputGrads),
+        ctypes.c_int32,
+        ctypes.POINTER(Error),
+    ]
+    calls.fragprune_free.argtypes = [_POINTER]
+    calls.fragprune_free.restype = None
+    return Library(build, path, int(calls.fragprune_lanes()), calls)
+
+
+def cpu_features() -> int:
+    """Bits of fragprune_cpu_features of this machine; 0 when no build can tell."""
+    try:
+        return int(_open("baseline").calls.fragprune_cpu_features())
+    except Unavailable:
+        return 0
+
+
+def usable_builds() -> list[str]:
+    """The builds that are installed and run on this machine, best first."""
+    features = cpu_features()
+    found = []
+    for build, needs in BUILDS.items():
+        if needs & ~features == 0:
+            try:
+                _open(build)
+            except Unavailable:
+                continue
+            found.append(build)
+    return found
+
+
+def choose() -> Library:
+    """Open the best build, or the one that the environment names.
+
+    Raises:
+        Unavailable: switched off, or no build can be used.
+    """
+    wanted = os.environ.get(ENVIRONMENT, "").strip().lower()
+    if wanted in ("off", "0"):
+        raise Unavailable(f"switched off by {ENVIRONMENT}={wanted}")
+    if wanted and wanted not in BUILDS:
+        names = ", ".join(["off", *BUILDS])
+        raise Unavailable(f"{ENVIRONMENT}={wanted} is none of {names}")
+    baseline = _open("baseline")  # it alone may run anywhere, so it is the one to ask
+    features = int(baseline.calls.fragprune_cpu_features())
+    if wanted:
+        if BUILDS[wanted] & ~features:
+            raise Unavailable(f"{ENVIRONMENT}={wanted}, which this processor lacks")
+        return _open(wanted)
+    for build, needs in BUILDS.items():
+        if needs & ~features == 0:
+            try:
+                return _open(build)
+            except Unavailable:
+                continue
+    return baseline
+
+
+_lock = threading.Lock()
+_answers: dict[str, Library | str] = {}
+
+
+def _answer() -> Library | str:
+    """The library, or why there is none; decided once for each value of the environment."""
+    key = os.environ.get(ENVIRONMENT, "")
+    with _lock:
+        if key not in _answers:
+            try:
+                _answers[key] = choose()
+            except Unavailable as why:
+                _answers[key] = str(why)
+        return _answers[key]
+
+
+def forget() -> None:
+    """Decide anew at the next call; for tests and after a repair of the installation."""
+    with _lock:
+        _answers.clear()
+
+
+def available() -> bool:
+    """Whether a compiled rasterizer can be used here."""
+    return isinstance(_answer(), Library)
+
+
+def library() -> Library:
+    """The opened build.
+
+    Raises:
+        EngineError: there is none; the message says why.
+    """
+    from fragprune_plugins.errors import EngineError
+
+    answer = _answer()
+    if isinstance(answer, Library):
+        return answer
+    raise EngineError(
+        "engine 'cpu'",
+        answer,
+        "a compiled rasterizer",
+        "Reinstall where a C++17 compiler is found, or use the engine 'reference'.",
+    )
+
+
+def describe() -> dict[str, Any]:
+    """For ``fragprune doctor``: the build in use or the reason why there is none."""
+    answer = _answer()
+    if isinstance(answer, Library):
+        return {
+            "available": True,
+            "build": answer.build,
+            "lanes": answer.lanes,
+            "path": answer.path,
+            "usable": usable_builds(),
+            "reason": None,
+        }
+    return {
+        "available": False,
+        "build": None,
+        "lanes": None,
+        "path": None,
+        "usable": [],
+        "reason": answer,
+    }
+
+
+class State:
+    """Owns a fragprune_state: what backward needs, freed with the last reference.
+
+    Attributes:
+        handle: the C pointer; None until forward has filled it.
+    """
+
+    def __init__(self, opened: Library) -> None:
+        self._free = opened.calls.fragprune_free
+        self.handle: int | None = None
+
+    def __del__(self) -> None:
+        if self.handle is not None:
+            self._free(self.handle)
+            self.handle = None
