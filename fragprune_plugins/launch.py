@@ -77,6 +77,8 @@ class RunSummary:
         model_before: the host's PLY of stage 1, when there is one.
         model_after: the host's PLY after stage 2; its sidecar lies beside it.
         train_seconds: wall time of both stages.
+        target_reached: whether a target speed-up was met within 5% on training views; None
+            without a target.
         curves: a dict per learned step: step, fragments_per_pixel, pressure, threshold_median.
         settings: of the fine-tuning.
     """
@@ -92,6 +94,7 @@ class RunSummary:
     model_before: Path | None
     model_after: Path | None
     train_seconds: float
+    target_reached: bool | None
     curves: list[dict[str, float]]
     settings: dict[str, Any]
 
@@ -311,6 +314,7 @@ class _Runner:
             model_before=self.before,
             model_after=self.after,
             train_seconds=seconds,
+            target_reached=learned.target_reached if learned else None,
             curves=self.curves,
             settings=self.options.settings.as_dict(),
         )

@@ -19,6 +19,12 @@ DEFAULT_PRESSURE = 1e-4
 TARGET_TOLERANCE = 0.05
 """Relative distance from the target, in fragments per pixel, that counts as reached."""
 
+CALIBRATE_AT = 0.85
+"""Share of the run after which a target is met by a uniform shift; then opacities alone adapt."""
+
+CALIBRATION_VIEWS = 24
+"""Most training views that a calibration measures."""
+
 _CURVE_SPEEDUP = 1.62  # fragments before / after that DEFAULT_PRESSURE gives
 _CURVE_SLOPE = 0.22  # d ln(speedup) / d ln(lambda), measured between 1.45x and 2.6x
 

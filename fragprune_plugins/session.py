@@ -28,7 +28,14 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, LateImportError, SessionError
 from fragprune_plugins.patching import PatchLedger
 from fragprune_plugins.plugins import Plugins
-from fragprune_plugins.pressure import FixedPressure, Pressure
+from fragprune_plugins.pressure import (
+    CALIBRATE_AT,
+    CALIBRATION_VIEWS,
+    TARGET_TOLERANCE,
+    FixedPressure,
+    Pressure,
+    calibrate,
+)
 from fragprune_plugins.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.seams import Role, Seam
 from fragprune_plugins.thresholds import ThresholdStore
@@ -71,6 +78,7 @@ class Summary:
         gaussians: in the trained model.
         fragments_before: per pixel, untruncated with the opacities at each view's first visit.
         fragments_after: per pixel, as drawn at each view's last visit.
+        target_reached: within 5% of the target speed-up; None without one.
         settings: of the fine-tuning.
     """
 
@@ -80,6 +88,7 @@ class Summary:
     gaussians: int
     fragments_before: float | None
     fragments_after: float | None
+    target_reached: bool | None
     settings: dict[str, Any]
 
 
@@ -96,6 +105,9 @@ class _ModelState:
     base_rates: dict[str, float] = field(default_factory=dict)
     baseline: dict[int, float] = field(default_factory=dict)  # view -> untruncated fragments/px
     drawn: dict[int, float] = field(default_factory=dict)  # view -> fragments/px, last visit
+    views: dict[int, Callable[[], Any]] = field(default_factory=dict)  # view -> its last render
+    last_drawn: float = 0.0
+    held: bool = False  # thresholds met their target and stay
     stats: StepStats | None = None
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
@@ -114,6 +126,10 @@ class _AddToLoss(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
         (grad,) = grads
         return grad, torch.ones(ctx.term_shape, dtype=grad.dtype, device=grad.device)
+
+
+def _mean(figures: dict[int, float]) -> float | None:
+    return sum(figures.values()) / len(figures) if figures else None
 
 
 _active: Session | None = None
@@ -254,14 +270,19 @@ class Session:
         state = self._last_state
         if state is not None:
             self._report(state)
-        before, after = state and state.baseline, state and state.drawn
+        before = _mean(state.baseline) if state else None
+        after = _mean(state.drawn) if state else None
+        target, reached = self.settings.target_speedup, None
+        if target is not None and before and after:
+            reached = abs(after * target / before - 1) <= TARGET_TOLERANCE
         summary = Summary(
             adapter=self.adapter.name,
             engine=self._engine.name if self._engine else "",
             steps=self._learned(state) if state else 0,
             gaussians=len(state.store) if state else 0,
-            fragments_before=sum(before.values()) / len(before) if before else None,
-            fragments_after=sum(after.values()) / len(after) if after else None,
+            fragments_before=before,
+            fragments_after=after,
+            target_reached=reached,
             settings=self.settings.as_dict(),
         )
         self.hook.fragprune_finished(summary=summary)
@@ -394,7 +415,7 @@ class Session:
         if state is None or state.plan is None or state.stepped == state.steps:
             return
         state.stepped = state.steps
-        if state.plan.learn and self.settings.truncate:
+        if state.plan.learn and self.settings.truncate and not state.held:
             state.store.step(state.plan.threshold_lr)
 
     def _on_step(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
@@ -414,7 +435,29 @@ class Session:
             self._freeze(model)
         if state.plan and state.plan.learn and self.settings.truncate:
             state.store.open(self.adapter.opacities(model))
+            self._meet_target(state)
         return result
+
+    def _meet_target(self, state: _ModelState) -> None:
+        """Late in the run, and once more at its end, shift all thresholds onto the target."""
+        target, progress = self.settings.target_speedup, state.plan.progress if state.plan else 0.0
+        due = progress >= 1.0 or (progress >= CALIBRATE_AT and not state.held)
+        if target is None or not due or not state.baseline:
+            return
+        views = sorted(state.baseline.keys() & state.views.keys())
+        views = views[:: -(-len(views) // CALIBRATION_VIEWS)]
+        before = sum(state.baseline[view] for view in views)
+
+        @torch.no_grad()
+        def speedup() -> float:
+            drawn = 0.0
+            for view in views:
+                state.views[view]()
+                drawn += state.last_drawn
+            return before / max(drawn, 1e-9)
+
+        calibrate(state.store, speedup, target)
+        state.held = True
 
     def _freeze(self, model: Any) -> None:
         """Frozen parameters ask for no gradient: the engine then skips their share of the work."""
@@ -434,9 +477,16 @@ class Session:
     def _on_view(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         arguments = signature(wrapped).bind(*args, **kwargs).arguments
         camera, model = (arguments[name] for name in seam.needs[:2])
-        token = self._rendering.set((model, id(camera)))
+        state = self._models.get(model)
+        again = partial(self._render, wrapped, model, id(camera), args, kwargs)
+        if state is not None and state.plan is not None and torch.is_grad_enabled():
+            state.views[id(camera)] = again
+        return again()
+
+    def _render(self, render: Any, model: Any, view: int, args: Any, kwargs: Any) -> Any:
+        token = self._rendering.set((model, view))
         try:
-            return wrapped(*args, **kwargs)
+            return render(*args, **kwargs)
         finally:
             self._rendering.reset(token)
 
@@ -465,6 +515,7 @@ class Session:
             return wrapped(*args, **kwargs)
         engine = self.engine(means.device)
         outputs = engine.rasterize(inputs, thresholds)
+        state.last_drawn = float(outputs.fragments_per_pixel.detach())
         if torch.is_grad_enabled() and state.plan is not None and state.plan.learn:
             if view not in state.baseline:
                 with torch.no_grad():
@@ -479,8 +530,7 @@ class Session:
 
         plan = state.plan
         assert plan is not None
-        fragments = float(outputs.fragments_per_pixel.detach())
-        state.drawn[view] = fragments
+        fragments = state.drawn[view] = state.last_drawn
         self.pressure.observe(plan.progress, fragments / max(state.baseline[view], 1e-9))
         state.stats = StepStats(
             step=state.steps - self.from_step,
@@ -488,7 +538,7 @@ class Session:
             pressure=self.pressure.value,
             threshold_median=float(state.store.values.detach().median()),
         )
-        if self.pressure.value == 0 or not outputs.image.requires_grad:
+        if self.pressure.value == 0 or state.held or not outputs.image.requires_grad:
             return outputs
         term = outputs.fragments_per_pixel * self.pressure.value
         return replace(outputs, image=_AddToLoss.apply(outputs.image, term))  # type: ignore[no-untyped-call]

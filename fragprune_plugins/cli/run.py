@@ -1,0 +1,232 @@
+"""``fragprune run``: a host's own training command, with learned truncation."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fragprune_plugins.cli.common import JSON, Command, Report, describe
+from fragprune_plugins.errors import FragpruneError, UsageError
+from fragprune_plugins.pressure import DEFAULT_PRESSURE
+from fragprune_plugins.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
+
+
+@click.command(
+    "run",
+    cls=Command,
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+)
+@click.argument("host_command", nargs=-1, type=click.UNPROCESSED, metavar="-- python train.py ...")
+@click.option("--adapter", help="Name of the host's adapter; detected from its source by default.")
+@click.option(
+    "--stage",
+    type=click.Choice(["auto", "finetune", "joint", "off"]),
+    default="auto",
+    show_default=True,
+    help="auto: train, then fine-tune. finetune: only that, from what the output folder holds. "
+    "joint: learn inside the training. off: only apply thresholds that are there.",
+)
+@click.option(
+    "--from-iter", type=click.IntRange(min=0), help="finetune, joint: learn from this iteration on."
+)
+@click.option(
+    "--alternate", type=click.IntRange(min=1), help="joint: learn N iterations, hold N, and so on."
+)
+@click.option("--iters", type=int, help=f"Stage 2's iterations; default {FINETUNE_ITERATIONS}.")
+@click.option("--quick", is_flag=True, help=f"{QUICK_ITERATIONS} iterations: most of the gain.")
+@click.option(
+    "--train",
+    type=click.Choice(["opacity", "appearance", "all"]),
+    default="opacity",
+    show_default=True,
+    help="What learns beside the thresholds; appearance adds SH, all adds shapes and positions.",
+)
+@click.option(
+    "--pressure",
+    type=float,
+    help=f"Weight of drawn fragments per pixel in the loss; default {DEFAULT_PRESSURE:g}.",
+)
+@click.option("--target-speedup", type=float, help="Steer for this many times fewer fragments.")
+@click.option("--control", is_flag=True, help="Same iterations without truncation: honest zero.")
+@click.option(
+    "--engine",
+    type=click.Choice(["auto", "reference", "cpu"]),
+    default="auto",
+    show_default=True,
+    help="What rasterizes where thresholds apply or the host's own rasterizer is missing.",
+)
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="cpu runs a CUDA-only host without a GPU.",
+)
+@click.option(
+    "--evaluate/--no-evaluate",
+    default=True,
+    show_default=True,
+    help="Compare before and after on the views the host held out (--eval).",
+)
+@click.pass_context
+def command(
+    ctx: click.Context,
+    host_command: tuple[str, ...],
+    adapter: str | None,
+    stage: Any,
+    from_iter: int | None,
+    alternate: int | None,
+    iters: int | None,
+    quick: bool,
+    train: Any,
+    pressure: float | None,
+    target_speedup: float | None,
+    control: bool,
+    engine: str,
+    device: Any,
+    evaluate: bool,
+) -> Report:
+    """Train with a host's own command, then learn truncation thresholds.
+
+    Put the unmodified command after --. Stage 1 is the host's own training. Stage 2 resumes it for
+    a few thousand iterations in which only opacities and thresholds move (but see --train), and
+    the host saves its model as always; the thresholds go beside it as a sidecar.
+
+    \b
+    Examples:
+      fragprune run -- python train.py -s scene -m out --eval
+      fragprune run --quick --device cpu -- train.py -s scene -m out --iterations 3000
+      fragprune run --stage finetune -- train.py -s scene -m out     (already trained)
+      fragprune run -- python render.py -m out                       (renders with thresholds)
+    """
+    if alternate is not None and stage != "joint":
+        raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Add or drop it.")
+    if quick and iters is not None:
+        raise UsageError("options", "--quick with --iters", "one of the two", "Drop one.")
+    if pressure is not None and target_speedup is not None:
+        raise UsageError("options", "--pressure with --target-speedup", "one", "Drop one.")
+    settings = Settings(
+        iterations=iters or (QUICK_ITERATIONS if quick else FINETUNE_ITERATIONS),
+        train=train,
+        pressure=DEFAULT_PRESSURE if pressure is None else pressure,
+        target_speedup=target_speedup,
+        truncate=not control,
+    )
+
+    from fragprune_plugins.launch import RunOptions, run
+
+    logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
+    options = RunOptions(
+        adapter=adapter,
+        stage=stage,
+        settings=settings,
+        from_iter=from_iter,
+        alternate=alternate,
+        engine=engine,
+        device=device,
+    )
+    # A host prints as it likes; with --json stdout is kept for the one object.
+    to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None
+    with to_stderr or contextlib.nullcontext():
+        summary = run(list(host_command), options)
+        measured = _measure(list(host_command), summary) if evaluate else None
+    data = {
+        "adapter": summary.adapter,
+        "engine": summary.engine,
+        "device": summary.device,
+        "stage": summary.stage,
+        "iterations": summary.iterations,
+        "gaussians": summary.gaussians,
+        "training_views": {
+            "fragments_per_pixel_before": summary.fragments_before,
+            "fragments_per_pixel_after": summary.fragments_after,
+        },
+        "before": measured[0] if measured else None,
+        "after": measured[1] if measured else None,
+        "model_before": _text(summary.model_before),
+        "model_after": _text(summary.model_after),
+        "train_seconds": summary.train_seconds,
+        "target_reached": summary.target_reached,
+        "seed": settings.seed,
+        "settings": summary.settings,
+    }
+    return Report(data, _describe(summary, measured))
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _measure(host_command: list[str], summary: Any) -> list[dict[str, Any]] | None:
+    """Before and after on held-out views, where our own readers draw what the host would."""
+    source = _flag(host_command, "-s", "--source_path")
+    foreign = {"--antialiasing", "--train_test_exp"} & set(host_command)
+    if not (summary.model_before and summary.model_after and source) or foreign:
+        return None
+    if "--eval" not in host_command:
+        return None
+    from fragprune_plugins.cli.common import load_model
+    from fragprune_plugins.finetuning import load_dataset
+    from fragprune_plugins.measure import Candidate, measure
+
+    resolution = _flag(host_command, "-r", "--resolution") or "1"
+    try:
+        dataset = load_dataset(
+            Path(source),
+            resolution=int(resolution) if resolution in ("1", "2", "4", "8") else 1,
+            white_background=bool({"-w", "--white_background"} & set(host_command)),
+        )
+        models = [load_model(path) for path in (summary.model_before, summary.model_after)]
+    except FragpruneError as error:
+        logging.getLogger("fragprune").warning("not compared on held-out views: %s", error)
+        return None
+    return measure([Candidate(*model) for model in models], dataset.test)
+
+
+def _flag(words: list[str], *names: str) -> str | None:
+    """The value of a host's flag, as ``--flag value`` or ``--flag=value``."""
+    for index, word in enumerate(words):
+        head, equals, tail = word.partition("=")
+        if head in names:
+            return tail if equals else (words[index + 1] if index + 1 < len(words) else None)
+    return None
+
+
+def _describe(summary: Any, measured: list[dict[str, Any]] | None) -> str:
+    if not summary.iterations:
+        return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
+    lines = []
+    if measured:
+        before, after = measured
+        fewer = before["fragments_per_pixel"] / max(after["fragments_per_pixel"], 1e-9)
+        lines += [
+            describe({"before": before, "after": after}),
+            "",
+            f"{fewer:.2f}x fewer fragments ({before['fragments_per_pixel']:.1f} -> "
+            f"{after['fragments_per_pixel']:.1f} per pixel), "
+            f"{after['psnr'] - before['psnr']:+.2f} dB PSNR on {after['views']} held-out views.",
+        ]
+    elif summary.fragments_before:
+        lines.append(
+            f"{summary.fragments_before / max(summary.fragments_after, 1e-9):.2f}x fewer fragments "
+            f"({summary.fragments_before:.1f} -> {summary.fragments_after:.1f} per pixel, "
+            "training views)."
+        )
+        if summary.model_before and summary.model_after:
+            lines.append(
+                f"Compare: fragprune compare {summary.model_before} {summary.model_after} "
+                "--data SCENE"
+            )
+    if summary.target_reached is False:
+        lines.append("The target speed-up was missed by more than 5%; see --help of finetune.")
+    lines.append(
+        f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
+        f"{summary.iterations} iterations of stage 2, {summary.train_seconds:.0f} s in all. "
+        f"Model: {summary.model_after or 'not saved by the host'}."
+    )
+    return "\n".join(lines)
