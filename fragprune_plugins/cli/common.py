@@ -17,13 +17,16 @@ from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.finetune.dataset import Shot
+    from fragprune_plugins.finetuning.dataset import Shot
     from fragprune_plugins.ply import SplatFile
     from fragprune_plugins.thresholds import ThresholdStore
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 FILE = click.Path(path_type=Path)
+
+JSON = "fragprune.json"
+"""Key in the context's meta: whether stdout is kept for one JSON object."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class Command(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run, print, and leave with the right exit code."""
-        as_json = bool(ctx.params.pop("as_json"))
+        as_json = ctx.meta[JSON] = bool(ctx.params.pop("as_json"))
         try:
             report: Report = super().invoke(ctx)
         except FragpruneError as error:
@@ -185,7 +188,7 @@ def load_shots(
     Raises:
         DatasetError: the folder cannot be read as a scene.
     """
-    from fragprune_plugins.finetune.dataset import load_dataset
+    from fragprune_plugins.finetuning.dataset import load_dataset
 
     dataset = load_dataset(folder, resolution=resolution, white_background=white_background)
     return {

@@ -16,9 +16,9 @@ from fragprune_plugins.errors import SidecarError
 def command(model: Path, out: Path) -> Report:
     """Write MODEL with its thresholds as one more column.
 
-    The column, trunc_threshold, holds the threshold itself, a falloff in (0, 1): a renderer that draws a fragment
-    only where exp(-q/2) >= trunc_threshold (q the squared Mahalanobis distance) draws what we draw.
-    Tools that do not know the column ignore it.
+    The column, trunc_threshold, holds the threshold itself, a falloff in (0, 1): a renderer that
+    draws a fragment only where exp(-q/2) >= trunc_threshold (q the squared Mahalanobis distance)
+    draws what we draw. Tools that do not know the column ignore it.
 
     \b
     Example:

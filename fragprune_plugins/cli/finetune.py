@@ -67,9 +67,10 @@ def command(
 ) -> Report:
     """Learn how far each Gaussian of MODEL must reach.
 
-    Thresholds and opacities adapt to each other on the photographs in --data. Positions, shapes and colours stay bit for bit (but see --train). OUT has the same columns as
-    MODEL; the thresholds go beside it, into OUT.fragprune.safetensors. The table compares both on
-    views that were not learned from. Ctrl-C saves what was learned so far.
+    Thresholds and opacities adapt to each other on the photographs in --data; positions, shapes
+    and colours stay bit for bit (but see --train). OUT has the columns of MODEL; the thresholds go
+    beside it, into OUT.fragprune.safetensors. The table compares both on views that were not
+    learned from. Ctrl-C saves what was learned so far.
 
     \b
     Examples:
@@ -85,7 +86,7 @@ def command(
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.errors import OutputError
     from fragprune_plugins.files import writable_folder
-    from fragprune_plugins.finetune import finetune, load_dataset, save
+    from fragprune_plugins.finetuning import finetune, load_dataset, save
     from fragprune_plugins.measure import Candidate, measure
 
     set_threads(threads)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from fragprune_plugins.engines import Engine
-    from fragprune_plugins.finetune.dataset import Shot
+    from fragprune_plugins.finetuning.dataset import Shot
     from fragprune_plugins.measure import Candidate
 
 PANELS = 4

@@ -61,7 +61,7 @@ def command(
 
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.files import writable_folder
-    from fragprune_plugins.finetune.cameras import load_cameras
+    from fragprune_plugins.finetuning.cameras import load_cameras
     from fragprune_plugins.measure.pictures import save_heatmap, save_image
     from fragprune_plugins.types import RasterInputs
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine, create_engine
-from fragprune_plugins.finetune.dataset import Shot
+from fragprune_plugins.finetuning.dataset import Shot
 from fragprune_plugins.measure.metrics import psnr, ssim
 from fragprune_plugins.ply import SplatFile
 from fragprune_plugins.types import RasterInputs

@@ -14,7 +14,7 @@ from fragprune_plugins.files import replacing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fragprune_plugins.finetune.loop import Record
+    from fragprune_plugins.finetuning.loop import Record
 
 COLOURS = "inferno"
 LABEL = "drawn fragments per pixel"
@@ -89,7 +89,7 @@ def save_curves(path: Path, records: Sequence[Record]) -> None:
     """Write loss, fragments and threshold quantiles over the steps of a fine-tuning."""
     from matplotlib.figure import Figure
 
-    from fragprune_plugins.finetune.loop import QUANTILES
+    from fragprune_plugins.finetuning.loop import QUANTILES
 
     steps = [record.step for record in records]
     figure = Figure(figsize=(12, 3.4), layout="constrained")

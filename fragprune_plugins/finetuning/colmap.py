@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.finetune.dataset import Camera
+from fragprune_plugins.finetuning.dataset import Camera
 
 HOLD_OUT = 8
 """Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.finetune.dataset import Camera, image_size
+from fragprune_plugins.finetuning.dataset import Camera, image_size
 
 Row = tuple[str, Camera, Path]
 """name, camera, image file"""

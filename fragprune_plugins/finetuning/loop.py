@@ -16,8 +16,8 @@ from torch import Tensor
 from fragprune_plugins import sidecar
 from fragprune_plugins.engines import Engine, create_engine
 from fragprune_plugins.files import replacing, writable_folder
-from fragprune_plugins.finetune.dataset import Dataset, Shot
-from fragprune_plugins.finetune.losses import photometric_loss
+from fragprune_plugins.finetuning.dataset import Dataset, Shot
+from fragprune_plugins.finetuning.losses import photometric_loss
 from fragprune_plugins.ply import SplatFile, write_ply
 from fragprune_plugins.pressure import TARGET_TOLERANCE, calibrate
 from fragprune_plugins.schedule import Schedule, Settings
@@ -28,7 +28,6 @@ CALIBRATE_AT = 0.85
 """Share of the run after which a target is met by a uniform shift; then opacities alone adapt."""
 
 CALIBRATION_VIEWS = 24
-RECORDS = 200
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 # Learning rates at the start of stage 2; all decay with the opacity's. SH rates are the hosts';
@@ -240,7 +239,7 @@ class _Run:
         from tqdm import tqdm
 
         total = self.settings.iterations
-        every = max(1, total // RECORDS)
+        every = min(len(self.dataset.train), max(1, total // 20))  # one pass: views differ
         with tqdm(total=total, disable=not progress, desc="fine-tuning", unit="it") as bar:
             for shot in self._order():
                 if self.calibration is not None and self.step >= self.calibration:

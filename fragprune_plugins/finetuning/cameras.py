@@ -13,8 +13,8 @@ from typing import Any
 import torch
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.finetune.blender import load_json, read_transforms
-from fragprune_plugins.finetune.dataset import Camera
+from fragprune_plugins.finetuning.blender import load_json, read_transforms
+from fragprune_plugins.finetuning.dataset import Camera
 from fragprune_plugins.types import View
 
 

@@ -32,7 +32,8 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
     top = (2 * mu_x * mu_y + _C1) * (2 * cov + _C2)
     bottom = (mu_x * mu_x + mu_y * mu_y + _C1) * (var_x + var_y + _C2)
-    return (top / bottom).mean()
+    similarity: Tensor = top / bottom
+    return similarity.mean()
 
 
 def photometric_loss(image: Tensor, target: Tensor) -> Tensor:
@@ -43,9 +44,7 @@ def photometric_loss(image: Tensor, target: Tensor) -> Tensor:
 @cache
 def _window() -> Tensor:
     offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    weights: Tensor = torch.exp(-(offsets**2) / (2 * SIGMA**2))
-    total: Tensor = weights.sum()
-    return weights / total
+    return torch.softmax(-offsets.square() / (2 * SIGMA**2), dim=0)
 
 
 def _blur(maps: Tensor) -> Tensor:

@@ -151,7 +151,7 @@ def load_dataset(folder: Path, *, resolution: int = 1, white_background: bool = 
         DatasetError: neither or both layouts, missing images, an unknown camera model, sizes that
             do not match.
     """
-    from fragprune_plugins.finetune import blender, colmap
+    from fragprune_plugins.finetuning import blender, colmap
 
     folder = Path(folder)
     if not folder.is_dir():
