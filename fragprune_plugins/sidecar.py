@@ -113,13 +113,13 @@ def load(model: Path, store: ThresholdStore | None = None) -> tuple[ThresholdSto
         raise SidecarError(
             str(path), f"unreadable ({error})", f"a file of format {FORMAT}", remedy
         ) from error
-    if digest(model) != info.model_sha256 or len(tensors["logits"]) != info.rows:
+    if digest(model) != info.model_sha256 or tuple(tensors["logits"].shape) != (info.rows,):
         raise SidecarError(
             str(path),
             f"thresholds of another model (sha256 {info.model_sha256[:12]}, {info.rows} rows)",
             f"those of {Path(model).name} (sha256 {digest(model)[:12]})",
             remedy,
         )
-    store = store or ThresholdStore(info.rows)
+    store = ThresholdStore(info.rows) if store is None else store  # an empty store is false
     store.load_state_dict(state)
     return store, info
