@@ -44,8 +44,9 @@ def activate(
     repo = HostRepo(Path(host) if host is not None else Path(sys.argv[0]).resolve().parent)
     plugins = load_plugins()
     joint = stage == "joint"
+    tie = plugins.manager.hook.fragprune_select_adapter
     return Session(
-        choose(repo, plugins.adapters, adapter),
+        choose(repo, plugins.adapters, adapter, select=tie),
         repo,
         plugins,
         settings,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -79,9 +80,13 @@ class HostRepo:
         if module not in self._trees:
             path = self.path(module)
             try:
-                self._trees[module] = (
-                    ast.parse(path.read_text(encoding="utf-8", errors="replace")) if path else None
-                )
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # a host's invalid escapes are its own affair
+                    self._trees[module] = (
+                        ast.parse(path.read_text(encoding="utf-8", errors="replace"))
+                        if path
+                        else None
+                    )
             except SyntaxError:
                 self._trees[module] = None
         return self._trees[module]
@@ -181,8 +186,19 @@ def check_seams(repo: HostRepo, seams: Iterable[Seam]) -> list[Finding]:
     return findings
 
 
-def choose(repo: HostRepo, adapters: Sequence[HostAdapter], name: str | None = None) -> HostAdapter:
+def choose(
+    repo: HostRepo,
+    adapters: Sequence[HostAdapter],
+    name: str | None = None,
+    select: Callable[..., str | None] | None = None,
+) -> HostAdapter:
     """The adapter for a checkout: the one asked for, or the only one that fits.
+
+    Args:
+        repo: the checkout.
+        adapters: to choose from.
+        name: of the one asked for.
+        select: breaks a tie; the hook ``fragprune_select_adapter``.
 
     Raises:
         UnknownHostError: none fits, the one asked for does not, or several do.
@@ -208,6 +224,11 @@ def choose(repo: HostRepo, adapters: Sequence[HostAdapter], name: str | None = N
             "a codebase that an installed adapter knows",
             "Run fragprune check on the folder to see every seam, or write an adapter.",
         )
+    tied = [match for _, match in matches if match.fits]
+    selected = select(repo=repo, matches=tied) if select else None
+    for adapter in fitting:
+        if adapter.name == selected:
+            return adapter
     raise UnknownHostError(
         str(repo.root),
         f"several adapters fit: {', '.join(a.name for a in fitting)}",

@@ -140,7 +140,8 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     for finding in plugins.findings:
         if finding.level != "info":
             log.warning("%s", finding)
-    adapter = choose(repo, plugins.adapters, options.adapter)
+    tie = plugins.manager.hook.fragprune_select_adapter
+    adapter = choose(repo, plugins.adapters, options.adapter, select=tie)
     host = _parse(script, arguments, adapter.command_line(repo))
     device = _device(options.device)
     runner = _Runner(host, repo, adapter, plugins, options, device)
