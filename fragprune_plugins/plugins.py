@@ -60,18 +60,24 @@ def load_plugins(found: Iterable[EntryPoint] | None = None) -> Plugins:
                 )
         else:
             _load(plugins, entry, where)
-    _register_adapters(plugins)
+    plugins.adapters.sort(key=lambda adapter: adapter.name)
     return plugins
 
 
 def _load(plugins: Plugins, entry: EntryPoint, where: str) -> None:
+    """Load one plugin and take its adapters, or none of it."""
+    manager = plugins.manager
+    offered: list[HostAdapter] = []
     try:
         plugin = entry.load()
-        plugins.manager.register(plugin, entry.name)
+        manager.register(plugin, entry.name)
         try:
-            plugins.manager.check_pending()
-        except pluggy.PluginValidationError:
-            plugins.manager.unregister(plugin)
+            manager.check_pending()
+            others = [other for other in manager.get_plugins() if other is not plugin]
+            hook = manager.subset_hook_caller("fragprune_register_adapters", others)
+            hook(register=offered.append)
+        except Exception:
+            manager.unregister(plugin)
             raise
     except Exception as error:  # whatever a plugin raises is its own; the others go on
         plugins.findings.append(
@@ -86,26 +92,24 @@ def _load(plugins: Plugins, entry: EntryPoint, where: str) -> None:
         )
     else:
         plugins.loaded[entry.name] = entry.value
+        for adapter in offered:
+            _take(plugins, adapter)
 
 
-def _register_adapters(plugins: Plugins) -> None:
-    def register(adapter: HostAdapter) -> None:
-        if any(other.name == adapter.name for other in plugins.adapters):
-            plugins.findings.append(
-                Finding(
-                    "warning",
-                    "adapter-shadowed",
-                    f"adapter {adapter.name}",
-                    "offered twice; the first one is used",
-                    "one adapter per name",
-                    "Block one of the plugins.",
-                )
+def _take(plugins: Plugins, adapter: HostAdapter) -> None:
+    if any(other.name == adapter.name for other in plugins.adapters):
+        plugins.findings.append(
+            Finding(
+                "warning",
+                "adapter-shadowed",
+                f"adapter {adapter.name}",
+                "offered twice; the first one is used",
+                "one adapter per name",
+                "Block one of the plugins.",
             )
-        else:
-            plugins.adapters.append(adapter)
-
-    plugins.manager.hook.fragprune_register_adapters(register=register)
-    plugins.adapters.sort(key=lambda adapter: adapter.name)
+        )
+    else:
+        plugins.adapters.append(adapter)
 
 
 def _names(variable: str) -> set[str]:
