@@ -225,6 +225,28 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def gain(first: dict[str, Any], second: dict[str, Any]) -> str:
+    """What the second measurement gains over the first, in a line one can quote.
+
+    Frame times are compared only where their standard errors allow it.
+    """
+    before, after = first["fragments_per_pixel"], second["fragments_per_pixel"]
+    times = [(report["frame_ms"], report["frame_ms_se"]) for report in (first, second)]
+    ratio = times[0][0] / max(times[1][0], 1e-9)
+    error = ratio * math.hypot(*(se / max(ms, 1e-9) for ms, se in times))
+    faster = (
+        f"{ratio:.2f} ± {error:.2f}x faster frames"
+        if error < _NOISE * ratio
+        else "frame times too noisy to compare"
+    )
+    return (
+        f"{before / max(after, 1e-9):.2f}x fewer fragments ({before:.1f} -> {after:.1f} per pixel),"
+        f" {second['psnr'] - first['psnr']:+.2f} dB PSNR, {faster} on {second['views']} views"
+    )
+
+
+_NOISE = 0.1  # relative standard error above which a ratio of frame times says nothing
+
 _ROWS = (
     ("PSNR, dB", "psnr", 2),
     ("SSIM", "ssim", 4),

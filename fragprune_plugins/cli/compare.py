@@ -13,6 +13,7 @@ from fragprune_plugins.cli.common import (
     data_options,
     describe,
     engine_options,
+    gain,
     load_model,
     load_shots,
     set_threads,
@@ -64,15 +65,11 @@ def command(
     shots = load_shots(data, views, resolution=resolution, white_background=white_background)
     rasterizer = create_engine(engine)
     first, second = measure(list(columns.values()), shots, engine=rasterizer)
-    fewer = first["fragments_per_pixel"] / max(second["fragments_per_pixel"], 1e-9)
-    faster = first["frame_ms"] / max(second["frame_ms"], 1e-9)
-    change = second["psnr"] - first["psnr"]
     report = {
         "a": {"model": str(a)} | first,
         "b": {"model": str(b)} | second,
-        "fragments_ratio": fewer,
-        "frame_ratio": faster,
-        "psnr_change": change,
+        "speedup": first["fragments_per_pixel"] / max(second["fragments_per_pixel"], 1e-9),
+        "psnr_change": second["psnr"] - first["psnr"],
         "ssim_change": second["ssim"] - first["ssim"],
         "engine": rasterizer.name,
         "device": first["device"],
@@ -80,8 +77,7 @@ def command(
     lines = [
         f"A: {a}\nB: {b}\n",
         describe({"A": first, "B": second}),
-        f"\nB against A: {fewer:.2f}x fewer fragments, {change:+.2f} dB PSNR, "
-        f"{faster:.2f}x faster frames on {first['views']} views.",
+        f"\nB against A: {gain(first, second)}.",
     ]
     if out is not None:
         files = draw_panels(out, columns, shots, rasterizer)

@@ -14,6 +14,7 @@ from fragprune_plugins.cli.common import (
     data_options,
     describe,
     engine_options,
+    gain,
     load_model,
     load_store,
     set_threads,
@@ -109,13 +110,8 @@ def command(
         dataset.test,
         engine=rasterizer,
     )
-    fewer = before["fragments_per_pixel"] / max(after["fragments_per_pixel"], 1e-9)
-    faster = before["frame_ms"] / max(after["frame_ms"], 1e-9)
     quote = (
-        f"{fewer:.2f}x fewer fragments ({before['fragments_per_pixel']:.1f} -> "
-        f"{after['fragments_per_pixel']:.1f} per pixel), "
-        f"{after['psnr'] - before['psnr']:+.2f} dB PSNR, {faster:.2f}x faster frames "
-        f"on {after['views']} held-out views ({after['engine']} engine, "
+        f"{gain(before, after)} that were held out ({after['engine']} engine, "
         f"{result.iterations} iterations in {result.train_seconds:.0f} s)."
     )
     lines = [describe({"before": before, "after": after}), "", quote]

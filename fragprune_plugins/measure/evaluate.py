@@ -17,7 +17,7 @@ from fragprune_plugins.measure.metrics import psnr, ssim
 from fragprune_plugins.ply import SplatFile
 from fragprune_plugins.types import RasterInputs
 
-REPEATS = 5
+REPEATS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +94,13 @@ def measure(
         )
 
     times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
+    turns = list(zip(candidates, drawn, times, strict=True))
     for _ in range(repeats):
         for rounds in times:
             rounds.append([])
         for shot in shots:
-            for candidate, splats, rounds in zip(candidates, drawn, times, strict=True):
+            turns.reverse()  # neither is always the one that finds a cold cache
+            for candidate, splats, rounds in turns:
                 inputs = RasterInputs(shot.view, splats)
                 started = time.perf_counter()
                 engine.rasterize(inputs, candidate.thresholds)

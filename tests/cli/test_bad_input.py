@@ -1,0 +1,136 @@
+"""Each bad input has one message, exit code 1, and touches nothing that was there."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from cli.commands import run
+from finetune import tiny
+
+from fragprune_plugins import sidecar
+
+
+@pytest.fixture
+def scene(tmp_path):
+    data, path, _ = tiny.scene(tmp_path)
+    out = tmp_path / "out.ply"
+    out.write_bytes(b"precious")
+    sidecar.path_beside(out).write_bytes(b"also precious")
+    return data, path, out
+
+
+def refused(arguments, code, words):
+    """Run twice: as text, as JSON; the same error, no traceback."""
+    result = run(*arguments)
+    assert result.exit_code == 1, result.output
+    assert result.stdout == ""
+    message = result.stderr.strip()
+    assert message.startswith(f"[{code}] ")
+    assert words in message
+    assert "\n" not in message
+    result = run(*arguments, "--json")
+    assert result.exit_code == 1
+    error = json.loads(result.stdout)["error"]
+    assert error["code"] == code
+    assert all(error[part] for part in ("where", "found", "expected", "remedy"))
+
+
+def untouched(out):
+    return (
+        out.read_bytes() == b"precious"
+        and sidecar.path_beside(out).read_bytes() == b"also precious"
+    )
+
+
+@pytest.mark.parametrize(
+    ("how", "code", "words"),
+    [
+        ("model missing", "model-file", "no such file"),
+        ("model cut off", "model-file", "not readable as PLY"),
+        ("data missing", "dataset", "no such folder"),
+        ("image missing", "dataset", "no such image"),
+        ("stale sidecar", "sidecar", "thresholds of another model"),
+        ("broken sidecar", "sidecar", "unreadable"),
+    ],
+)
+@pytest.mark.parametrize("command", ["finetune", "profile", "render", "compare"])
+def test_refused(scene, tmp_path, how, code, words, command):
+    data, path, out = scene
+    if how == "model missing":
+        path.unlink()
+    elif how == "model cut off":
+        path.write_bytes(path.read_bytes()[:-50])
+    elif how == "data missing":
+        data = tmp_path / "nowhere"
+    elif how == "image missing":
+        (data / "images" / "view04.png").unlink()
+    elif how == "stale sidecar":
+        from fragprune_plugins.thresholds import ThresholdStore
+
+        sidecar.save(path, ThresholdStore(60))
+        path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+    elif how == "broken sidecar":
+        sidecar.path_beside(path).write_bytes(b"no")
+    arguments = {
+        "finetune": ("finetune", path, "--data", data, "--out", out, "--iters", 3),
+        "profile": ("profile", path, "--data", data),
+        "render": ("render", path, "--data", data, "--out", tmp_path / "pictures"),
+        "compare": ("compare", path, path, "--data", data),
+    }[command]
+    refused(arguments, code, words)
+    assert untouched(out)
+
+
+def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypatch):
+    data, path, out = scene
+
+    def never(*args, **kwargs):
+        raise AssertionError("learned although nothing can be written")
+
+    monkeypatch.setattr("fragprune_plugins.finetuning.finetune", never)
+    inside = out / "below-a-file.ply"
+    refused(("finetune", path, "--data", data, "--out", inside), "output", "cannot be written")
+    folder = tmp_path / "folder.ply"
+    folder.mkdir()
+    refused(("finetune", path, "--data", data, "--out", folder), "output", "a folder")
+    assert untouched(out)
+
+
+def test_the_model_itself_is_no_output(scene):
+    data, path, _ = scene
+    before = path.read_bytes()
+    result = run("finetune", path, "--data", data, "--out", path)
+    assert result.exit_code == 2
+    assert path.read_bytes() == before
+
+
+def test_a_failed_write_touches_nothing(scene, monkeypatch):
+    data, path, out = scene
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("safetensors.torch.save_file", full)
+    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 2)
+    result = run(*arguments)
+    assert result.exit_code == 1
+    assert "No space left" in result.stderr
+    assert untouched(out)
+
+
+def test_missing_arguments_are_usage():
+    result = run("finetune")
+    assert result.exit_code == 2
+    assert result.stdout == ""
+
+
+def test_bugs_keep_their_traceback(scene, monkeypatch):
+    data, path, _ = scene
+
+    def bug(*args, **kwargs):
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr("fragprune_plugins.measure.measure", bug)
+    with pytest.raises(ZeroDivisionError):
+        run("profile", path, "--data", data)

@@ -1,0 +1,31 @@
+"""fragprune compare."""
+
+from __future__ import annotations
+
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins.ply import write_ply
+
+
+def test_two_models(tmp_path):
+    data, path, model = tiny.scene(tmp_path)
+    other = tmp_path / "other.ply"
+    write_ply(other, model, torch.full((len(model),), 0.3))
+    report = run_json("compare", path, other, "--data", data, "--out", tmp_path / "pictures")
+    assert report["speedup"] > 1.2
+    assert report["a"]["model"] == str(path)
+    assert report["b"]["psnr"] - report["a"]["psnr"] == report["psnr_change"]
+    assert len(report["files"]) == 2
+    text = run("compare", path, other, "--data", data).stdout
+    assert "B against A: " in text
+    assert "x fewer fragments" in text
+
+
+def test_equal_models_have_finite_json(tmp_path):
+    """A perfect render has infinite PSNR, which JSON cannot say."""
+    data, path, _ = tiny.scene(tmp_path)
+    report = run_json("compare", path, path, "--data", data)
+    assert report["psnr_change"] == 0
+    assert report["speedup"] == 1

@@ -1,0 +1,32 @@
+"""fragprune export."""
+
+from __future__ import annotations
+
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins import sidecar
+from fragprune_plugins.ply import read_ply
+
+
+def test_one_file_with_the_thresholds(tmp_path):
+    data, path, _ = tiny.scene(tmp_path)
+    tuned, out = tmp_path / "tuned.ply", tmp_path / "exported.ply"
+    run_json("finetune", path, "--data", data, "--out", tuned, "--iters", 10)
+    report = run_json("export", tuned, "--out", out)
+    assert report["column"] == "trunc_threshold"
+    exported = read_ply(out)
+    assert torch.equal(exported.thresholds, sidecar.load(tuned)[0].values.detach())
+    assert torch.equal(exported.opacity, read_ply(tuned).opacity)
+    both = run_json("compare", tuned, out, "--data", data)
+    assert both["speedup"] == 1
+    assert both["psnr_change"] == 0
+
+
+def test_nothing_to_export(tmp_path):
+    _, path, _ = tiny.scene(tmp_path)
+    result = run("export", path, "--out", tmp_path / "out.ply")
+    assert result.exit_code == 1
+    assert "no thresholds" in result.stderr
+    assert not (tmp_path / "out.ply").exists()

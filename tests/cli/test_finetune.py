@@ -1,0 +1,161 @@
+"""fragprune finetune, end to end on a tiny scene."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins import sidecar
+from fragprune_plugins.finetuning import loop
+from fragprune_plugins.ply import read_ply, write_ply
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return tiny.scene(tmp_path)
+
+
+def test_writes_a_pair_and_a_table(scene, tmp_path):
+    data, path, model = scene
+    before = path.read_bytes()
+    out = tmp_path / "out.ply"
+    result = run("finetune", path, "--data", data, "--out", out, "--iters", 40, "--pressure", 1e-3)
+    assert result.exit_code == 0, result.stderr
+    for words in ("PSNR, dB", "fragments/pixel", "before", "after", "x fewer fragments", str(out)):
+        assert words in result.stdout
+    assert "fine-tuning" in result.stderr
+    assert path.read_bytes() == before
+    learned = read_ply(out)
+    assert torch.equal(learned.xyz, model.xyz)
+    assert not torch.equal(learned.opacity, model.opacity)
+    assert not sidecar.load(out)[0].neutral
+
+
+def test_json_is_one_object_with_the_house_names(scene, tmp_path):
+    data, path, _ = scene
+    out = tmp_path / "out.ply"
+    report = run_json("finetune", path, "--data", data, "--out", out, "--iters", 5, "--seed", 3)
+    assert report["iterations"] == 5
+    assert report["seed"] == 3
+    assert report["adapter"] is None
+    assert report["settings"]["train"] == "opacity"
+    assert report["interrupted"] is False
+    for part in ("before", "after"):
+        assert report[part]["lpips"] is None
+        assert report[part]["psnr"] > 10
+    assert {"train_seconds", "engine", "device", "target_reached"} <= report.keys()
+
+
+def test_target_control_and_curves(scene, tmp_path):
+    data, path, _ = scene
+    out, curves = tmp_path / "out.ply", tmp_path / "curves.png"
+    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 40)
+    report = run_json(*arguments, "--target-speedup", 1.5, "--curves", curves)
+    assert report["target_reached"] == (abs(1.5 / report["speedup"] - 1) <= 0.05)
+    assert curves.exists()
+    report = run_json(*arguments, "--control")
+    assert report["speedup"] == 1
+    assert sidecar.load(out)[0].neutral
+
+
+def test_goes_on_from_thresholds_beside_the_model(scene, tmp_path):
+    data, path, _ = scene
+    first, second = tmp_path / "first.ply", tmp_path / "second.ply"
+    run_json("finetune", path, "--data", data, "--out", first, "--iters", 30, "--pressure", 2e-3)
+    report = run_json("finetune", first, "--data", data, "--out", second, "--iters", 2)
+    steps = sidecar.load(second)[0].steps
+    assert steps == 32
+    change = report["before"]["fragments_per_pixel"] / report["after"]["fragments_per_pixel"]
+    assert change == pytest.approx(1, abs=0.1)
+
+
+def test_goes_on_from_an_exported_column(scene, tmp_path):
+    data, path, model = scene
+    write_ply(path, model, torch.full((len(model),), 0.3))
+    out = tmp_path / "out.ply"
+    run_json("finetune", path, "--data", data, "--out", out, "--iters", 1)
+    values = sidecar.load(out)[0].values.detach()
+    assert float((values - 0.3).abs().max()) < 0.02
+
+
+def test_ctrl_c_saves_and_leaves_with_130(scene, tmp_path, monkeypatch):
+    data, path, _ = scene
+    out = tmp_path / "out.ply"
+    loss, calls = loop.photometric_loss, []
+
+    def photometric(*args):
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return loss(*args)
+
+    monkeypatch.setattr(loop, "photometric_loss", photometric)
+    result = run("finetune", path, "--data", data, "--out", out, "--iters", 50, "--json")
+    assert result.exit_code == 130
+    report = json.loads(result.stdout)
+    assert report["interrupted"] is True
+    assert report["iterations"] == 3
+    assert sidecar.load(out)[0].steps == 3
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--quick", "--iters", "5"),
+        ("--pressure", "1e-4", "--target-speedup", "2"),
+        ("--control", "--pressure", "1e-4"),
+        ("--iters", "0"),
+        ("--pressure", "-1"),
+        ("--target-speedup", "0.5"),
+        ("--train", "everything"),
+    ],
+)
+def test_contradictions_are_usage_errors(scene, tmp_path, options):
+    data, path, _ = scene
+    result = run("finetune", path, "--data", data, "--out", tmp_path / "out.ply", *options)
+    assert result.exit_code == 2
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_as_a_program(scene, tmp_path):
+    data, path, _ = scene
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [
+            *(sys.executable, "-c", "from fragprune_plugins.cli import main; main()"),
+            *("finetune", str(path), "--data", str(data), "--out", str(tmp_path / "out.ply")),
+            *("--iters", "3", "--threads", "1", "--json"),
+        ],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(root / "adapters")])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["iterations"] == 3
+
+
+def test_help_needs_no_torch():
+    program = (
+        "import sys; from click.testing import CliRunner; from fragprune_plugins.cli import cli;"
+        "out = CliRunner().invoke(cli, ['--help']).output;"
+        "assert 'finetune' in out and 'export' in out, out;"
+        "assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[2])
+
+
+@pytest.mark.parametrize("name", ["finetune", "render", "profile", "compare", "export"])
+def test_help_teaches_by_example(name):
+    result = run(name, "--help")
+    assert result.exit_code == 0
+    assert f"fragprune {name} " in result.stdout
+    assert "--json" in result.stdout

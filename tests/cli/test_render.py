@@ -1,0 +1,60 @@
+"""fragprune render."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+from PIL import Image
+
+from fragprune_plugins.ply import write_ply
+
+
+@pytest.fixture
+def scene(tmp_path):
+    data, path, model = tiny.scene(tmp_path)
+    write_ply(path, model, torch.full((len(model),), 0.3))
+    return data, path
+
+
+def test_held_out_views_with_maps(scene, tmp_path):
+    data, path = scene
+    out = tmp_path / "pictures"
+    report = run_json("render", path, "--data", data, "--out", out, "--heatmap")
+    names = sorted(file.name for file in out.iterdir())
+    assert names == [
+        *("view00.png", "view00_fragments.png", "view08.png", "view08_fragments.png"),
+    ]
+    assert len(report["files"]) == 4
+    with Image.open(out / "view00.png") as picture:
+        assert picture.size == (tiny.SIDE, tiny.SIDE)
+    plain = run_json("render", path, "--data", data, "--out", out, "--no-truncation")
+    assert plain["truncated"] is False
+    assert report["truncated"] is True
+    assert plain["fragments_per_pixel"] > report["fragments_per_pixel"]
+
+
+def test_cameras_file_and_views(scene, tmp_path):
+    data, path = scene
+    content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
+    cameras = tmp_path / "path.json"
+    cameras.write_text(json.dumps(content))
+    out = tmp_path / "pictures"
+    result = run("render", path, "--cameras", cameras, "--out", out)
+    assert result.exit_code == 0
+    assert "Wrote 2 pictures" in result.stdout
+    with Image.open(out / "b.png") as picture:
+        assert picture.size == (20, 12)
+    report = run_json("render", path, "--data", data, "--views", "all", "--out", out)
+    assert len(report["files"]) == 9
+
+
+def test_needs_exactly_one_source_of_cameras(scene, tmp_path):
+    data, path = scene
+    assert run("render", path, "--out", tmp_path / "x").exit_code == 2
+    both = run("render", path, "--out", tmp_path / "x", "--data", data, "--cameras", data)
+    assert both.exit_code == 2
+    assert not (tmp_path / "x").exists()

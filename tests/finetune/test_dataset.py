@@ -1,0 +1,242 @@
+"""Readers of photographs and cameras: COLMAP text and binary, Blender, cameras.json."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from finetune import tiny
+from PIL import Image
+
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.finetuning import load_dataset
+from fragprune_plugins.finetuning.cameras import load_cameras
+
+NAMES = [f"view{i:02d}" for i in range(9)]
+
+
+@pytest.fixture(scope="module")
+def images():
+    return tiny.photographs(tiny.random_model())
+
+
+def stems(shots):
+    return [Path(shot.name).stem for shot in shots]
+
+
+def check(dataset, images):
+    """Names, poses and pixels are those of the scene."""
+    assert stems(dataset.test) == ["view00", "view08"]
+    assert stems(dataset.train) == NAMES[1:8]
+    for shot in [*dataset.train, *dataset.test]:
+        index = NAMES.index(Path(shot.name).stem)
+        want = tiny.cameras()[index].view()
+        torch.testing.assert_close(shot.view.viewmatrix, want.viewmatrix)
+        torch.testing.assert_close(shot.view.projmatrix, want.projmatrix)
+        torch.testing.assert_close(shot.view.campos, want.campos)
+        assert shot.view.tan_fov_x == pytest.approx(want.tan_fov_x)
+        assert shot.image.shape == (3, tiny.SIDE, tiny.SIDE)
+        torch.testing.assert_close(shot.image, images[index], atol=0.5 / 255 + 1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE"])
+def test_colmap(tmp_path, images, binary, model):
+    check(load_dataset(tiny.write_colmap(tmp_path, images, binary=binary, model=model)), images)
+
+
+def test_colmap_without_the_zero(tmp_path, images):
+    tiny.write_colmap(tmp_path, images)
+    for file in (tmp_path / "sparse" / "0").iterdir():
+        file.rename(tmp_path / "sparse" / file.name)
+    check(load_dataset(tmp_path), images)
+
+
+def test_blender(tmp_path, images):
+    check(load_dataset(tiny.write_blender(tmp_path, images)), images)
+
+
+def test_alpha_is_composited_over_the_background(tmp_path, images):
+    tiny.write_blender(tmp_path, images)
+    picture = Image.new("RGBA", (tiny.SIDE, tiny.SIDE), (255, 0, 0, 51))
+    picture.save(tmp_path / "train" / "view01.png")
+    for white, want in ((False, (0.2, 0.0, 0.0)), (True, (1.0, 0.8, 0.8))):
+        shot = load_dataset(tmp_path, white_background=white).train[0]
+        torch.testing.assert_close(shot.image[:, 0, 0], torch.tensor(want))
+        assert torch.equal(shot.view.background, torch.full((3,), float(white)))
+
+
+def test_resolution_scales_images_and_intrinsics(tmp_path, images):
+    tiny.write_colmap(tmp_path, images)
+    full, half = load_dataset(tmp_path), load_dataset(tmp_path, resolution=2)
+    assert half.train[0].image.shape == (3, 16, 16)
+    torch.testing.assert_close(half.train[0].view.projmatrix, full.train[0].view.projmatrix)
+
+
+def test_images_smaller_than_their_camera_of_the_same_aspect(tmp_path, images):
+    tiny.write_colmap(tmp_path, images)
+    path = tmp_path / "images" / "view01.png"
+    with Image.open(path) as picture:
+        picture.resize((16, 16)).save(path)
+    shot = load_dataset(tmp_path).train[0]
+    assert (shot.view.width, shot.view.height) == (16, 16)
+    assert shot.view.tan_fov_x == pytest.approx(tiny.SIDE / (2 * tiny.FOCAL))
+
+
+def test_off_centre_principal_point(tmp_path, images):
+    tiny.write_colmap(tmp_path, images)
+    line = f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36 20 16\n"
+    (tmp_path / "sparse" / "0" / "cameras.txt").write_text(line)
+    view = load_dataset(tmp_path).train[0].view
+    point = torch.cat([view.campos + view.viewmatrix[:3, 2] * 2, torch.ones(1)])  # straight ahead
+    clip = point @ view.projmatrix
+    assert float(clip[0] / clip[3] + 1) * tiny.SIDE / 2 == pytest.approx(20, abs=1e-4)
+
+
+def test_extent_is_the_hosts(tmp_path, images):
+    dataset = load_dataset(tiny.write_colmap(tmp_path, images))
+    centres = torch.stack([shot.view.campos for shot in dataset.train])
+    farthest = max((c - centres.mean(0)).norm() for c in centres)
+    assert dataset.extent == pytest.approx(1.1 * float(farthest))
+
+
+def break_scene(folder: Path, images, how: str) -> None:
+    sparse = folder / "sparse" / "0"
+    if how == "no folder":
+        return
+    if how == "empty":
+        folder.mkdir()
+        return
+    if how in ("no test file", "no frames", "not json", "distorted transforms"):
+        tiny.write_blender(folder, images)
+        path = folder / "transforms_test.json"
+        content = json.loads(path.read_text())
+        if how == "no test file":
+            path.unlink()
+        elif how == "no frames":
+            del content["frames"]
+            path.write_text(json.dumps(content))
+        elif how == "not json":
+            path.write_text("{")
+        else:
+            path.write_text(json.dumps(content | {"k1": 0.1}))
+        return
+    binary = "binary" in how
+    tiny.write_colmap(
+        folder, images, binary=binary, model="OPENCV" if "distortion" in how else "PINHOLE"
+    )
+    if how == "both":
+        tiny.write_blender(folder, images)
+    elif how == "image missing":
+        (folder / "images" / "view03.png").unlink()
+    elif how == "image broken":
+        (folder / "images" / "view03.png").write_bytes(b"not a picture")
+    elif how == "image size":
+        Image.new("RGB", (32, 24)).save(folder / "images" / "view03.png")
+    elif how == "binary cut off":
+        path = sparse / "images.bin"
+        path.write_bytes(path.read_bytes()[:-30])
+    elif how == "text cut off":
+        path = sparse / "images.txt"
+        path.write_text(path.read_text()[:60])
+    elif how == "no cameras":
+        (sparse / "cameras.txt").unlink()
+    elif how == "other cameras":
+        (sparse / "cameras.txt").write_text("3 PINHOLE 32 32 36 36 16 16\n")
+    elif how == "one view":
+        path = sparse / "images.txt"
+        path.write_text("\n".join(path.read_text().splitlines()[:3]) + "\n")
+
+
+MESSAGES = {
+    "no folder": "no such folder",
+    "empty": "neither layout",
+    "both": "both a COLMAP and a Blender layout",
+    "distortion": "model OPENCV.*image_undistorter",
+    "distortion binary": "model OPENCV.*image_undistorter",
+    "image missing": "view03.png: no such image",
+    "image broken": "view03.png: not readable",
+    "image size": "32x24 pixels.*32x32",
+    "binary cut off": "images.bin: cut off",
+    "text cut off": "images.txt: cut off",
+    "no cameras": "cameras.txt: no such file",
+    "other cameras": "of camera 7",
+    "one view": "no training view",
+    "no test file": "transforms_test.json: no such file",
+    "no frames": "not a transforms file",
+    "not json": "not readable as JSON",
+    "distorted transforms": r"lens distortion \(k1\)",
+}
+
+
+@pytest.mark.parametrize("how", MESSAGES)
+def test_bad_scenes_are_refused_by_name(tmp_path, images, how):
+    folder = tmp_path / "scene"
+    break_scene(folder, images, how)
+    with pytest.raises(DatasetError, match=MESSAGES[how]):
+        load_dataset(folder)
+
+
+def host_cameras() -> list[dict[str, object]]:
+    """cameras.json as hosts write it."""
+    return [
+        {
+            "id": i,
+            "img_name": f"view{i:02d}",
+            "width": camera.width,
+            "height": camera.height,
+            "position": (-camera.rotation.T @ camera.translation).tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "fx": camera.fx,
+            "fy": camera.fy,
+        }
+        for i, camera in enumerate(tiny.cameras())
+    ]
+
+
+def test_cameras_files(tmp_path):
+    (tmp_path / "cameras.json").write_text(json.dumps(host_cameras()))
+    content = tiny.transforms(NAMES, tiny.cameras()) | {"w": tiny.SIDE, "h": tiny.SIDE}
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    for file in ("cameras.json", "path.json"):
+        read = load_cameras(tmp_path / file)
+        assert [name for name, _ in read] == NAMES
+        for (_, view), camera in zip(read, tiny.cameras(), strict=True):
+            torch.testing.assert_close(view.projmatrix, camera.view().projmatrix)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("[]", "0 cameras"), ('[{"id": 0}]', "not a cameras file"), ("[1]", "not a cameras file")],
+)
+def test_bad_cameras_files(tmp_path, content, message):
+    (tmp_path / "cameras.json").write_text(content)
+    with pytest.raises(DatasetError, match=message):
+        load_cameras(tmp_path / "cameras.json")
+
+
+def shared_data() -> Path | None:
+    named = os.environ.get("FRAGPRUNE_TEST_DATA")
+    beside = Path(__file__).parents[3] / "shared" / "data"
+    found = Path(named) if named else beside
+    return found if found.is_dir() else None
+
+
+@pytest.mark.skipif(
+    shared_data() is None, reason="real scenes absent: set FRAGPRUNE_TEST_DATA to their folder"
+)
+@pytest.mark.parametrize("scene", ["fox/{}160", "textured_room/{}"])
+def test_both_layouts_of_a_real_scene_agree(scene):
+    folder = shared_data()
+    colmap, blender = (
+        load_dataset(folder / scene.format(layout)) for layout in ("colmap", "blender")
+    )
+    for first, second in ((colmap.train, blender.train), (colmap.test, blender.test)):
+        second = sorted(second, key=lambda shot: shot.name)
+        assert stems(first) == [shot.name for shot in second]
+        for a, b in zip(first, second, strict=True):
+            torch.testing.assert_close(a.view.projmatrix, b.view.projmatrix, atol=1e-4, rtol=0)
+        assert torch.equal(first[0].image, second[0].image)

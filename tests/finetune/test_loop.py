@@ -1,0 +1,177 @@
+"""Stage 2 without a host: what moves, what stays, where it lands."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+import torch
+from finetune import tiny
+
+from fragprune_plugins import sidecar
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.finetuning import finetune, loop, save
+from fragprune_plugins.finetuning.loop import mean_fragments
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.pressure import calibrate
+from fragprune_plugins.schedule import Settings
+from fragprune_plugins.thresholds import ThresholdStore
+
+ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return tiny.random_model()
+
+
+@pytest.fixture(scope="module")
+def model(truth):
+    return tiny.perturbed(truth)
+
+
+@pytest.fixture(scope="module")
+def dataset(truth, tmp_path_factory):
+    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth)
+
+
+@pytest.fixture(scope="module")
+def default(model, dataset):
+    return finetune(model, dataset, Settings(iterations=60, pressure=1e-3))
+
+
+@pytest.mark.parametrize(
+    ("train", "moving"),
+    [
+        ("opacity", {"opacity"}),
+        ("appearance", {"opacity", "f_dc", "f_rest"}),
+        ("all", set(ALL)),
+    ],
+)
+def test_what_is_not_named_stays_to_the_bit(model, dataset, train, moving):
+    before = {name: getattr(model, name).clone() for name in ALL}
+    result = finetune(model, dataset, Settings(iterations=8, train=train))
+    for name in ALL:
+        assert torch.equal(getattr(model, name), before[name]), "the input model was changed"
+        moved = not torch.equal(getattr(result.model, name), before[name])
+        assert moved == (name in moving), name
+        assert not getattr(result.model, name).requires_grad
+
+
+def test_loss_falls_and_fragments_fall(default, model, dataset):
+    first, last = default.records[0], default.records[-1]
+    assert last.loss < first.loss
+    engine = create_engine("auto")
+    before = mean_fragments(model, None, dataset.test, engine)
+    after = mean_fragments(default.model, default.thresholds, dataset.test, engine)
+    assert after < 0.9 * before
+    assert default.speedup == pytest.approx(before / after)
+    assert default.iterations == 60
+    assert default.target_reached is None
+    assert last.step == 60
+
+
+def test_more_pressure_draws_less(default, model, dataset):
+    hard = finetune(model, dataset, Settings(iterations=60, pressure=5e-3))
+    assert hard.speedup > default.speedup
+
+
+def test_control_learns_opacities_alone(model, dataset):
+    result = finetune(model, dataset, Settings(iterations=20, truncate=False))
+    assert result.store.neutral
+    assert result.thresholds is None
+    assert result.speedup == 1
+    assert not torch.equal(result.model.opacity, model.opacity)
+    assert result.records[-1].loss < result.records[0].loss
+
+
+def test_same_seed_same_result_and_global_streams_untouched(default, model, dataset):
+    torch.manual_seed(7)
+    random.seed(7)
+    states = torch.random.get_rng_state(), random.getstate()
+    again = finetune(model, dataset, Settings(iterations=60, pressure=1e-3))
+    assert torch.equal(states[0], torch.random.get_rng_state())
+    assert states[1] == random.getstate()
+    assert torch.equal(again.model.opacity, default.model.opacity)
+    assert torch.equal(again.store.logits, default.store.logits)
+    other = finetune(model, dataset, Settings(iterations=60, pressure=1e-3, seed=1))
+    assert not torch.equal(other.model.opacity, default.model.opacity)
+
+
+@pytest.mark.parametrize("target", [1.4, 2.0])
+def test_target_is_met_on_training_views(model, dataset, target):
+    result = finetune(model, dataset, Settings(iterations=80, target_speedup=target))
+    engine = create_engine("auto")
+    before = mean_fragments(model, None, dataset.train, engine)
+    after = mean_fragments(result.model, result.thresholds, dataset.train, engine)
+    assert before / after == pytest.approx(target, rel=0.02)
+    assert result.target_reached == (abs(target / result.speedup - 1) <= 0.05)
+
+
+def test_interrupted(model, dataset, monkeypatch):
+    calls = 0
+
+    def photometric(*args):
+        nonlocal calls
+        calls += 1
+        if calls == 6:
+            raise KeyboardInterrupt
+        return loss(*args)
+
+    loss = loop.photometric_loss
+    monkeypatch.setattr(loop, "photometric_loss", photometric)
+    result = finetune(model, dataset, Settings(iterations=50))
+    assert result.interrupted
+    assert result.iterations == 5
+    assert not torch.equal(result.model.opacity, model.opacity)
+
+
+def test_going_on_from_a_store(default, model, dataset):
+    store = ThresholdStore(len(model))
+    store.load_state_dict(default.store.state_dict())
+    start = store.logits.detach().clone()
+    result = finetune(default.model, dataset, Settings(iterations=3), store=store)
+    assert result.store is store
+    assert store.steps == default.store.steps + 3
+    assert float((store.logits.detach() - start).abs().max()) < 0.5
+
+
+def test_save_writes_a_pair_that_reads_back(default, tmp_path):
+    path = tmp_path / "deep" / "out.ply"
+    beside = save(path, default)
+    assert beside == sidecar.path_beside(path)
+    assert torch.equal(read_ply(path).opacity, default.model.opacity)
+    store, info = sidecar.load(path)
+    assert torch.equal(store.logits, default.store.logits)
+    assert info.settings["iterations"] == 60
+    assert sorted(p.name for p in path.parent.iterdir()) == sorted([path.name, beside.name])
+
+
+def test_failed_save_leaves_both_files(default, tmp_path, monkeypatch):
+    path = tmp_path / "out.ply"
+    beside = save(path, default)
+    contents = path.read_bytes(), beside.read_bytes()
+    changed = replace(default, model=replace(default.model, opacity=default.model.opacity + 1))
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("safetensors.torch.save_file", full)
+    with pytest.raises(Exception, match="No space left"):
+        save(path, changed)
+    assert (path.read_bytes(), beside.read_bytes()) == contents
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_calibration_keeps_the_nearest_end_when_out_of_reach():
+    store = ThresholdStore(3)
+    calls = []
+
+    def speedup():
+        calls.append(float(store.logits.detach()[0]))
+        return 1.0
+
+    assert calibrate(store, speedup, 2.0, rounds=6) == 1.0
+    assert len(calls) == 7
+    assert calls[-1] > calls[0]

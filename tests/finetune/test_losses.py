@@ -1,0 +1,75 @@
+"""The training loss against scikit-image and against its own definition."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.nn.functional import conv2d
+
+from fragprune_plugins.finetuning.losses import l1, photometric_loss, ssim
+
+
+@pytest.fixture
+def pair():
+    stream = torch.Generator().manual_seed(0)
+    target = torch.rand(3, 48, 40, generator=stream)
+    noise = torch.randn(3, 48, 40, generator=stream)
+    return (target + 0.1 * noise).clamp(0, 1), target
+
+
+def plain_ssim(x, y):
+    """The 121 taps written out."""
+    offsets = torch.arange(11).double() - 5
+    line = torch.exp(-(offsets**2) / 4.5)
+    window = torch.outer(line, line)
+    window = (window / window.sum()).expand(3, 1, 11, 11)
+
+    def blur(z):
+        return conv2d(z[None], window, padding=5, groups=3)[0]
+
+    mx, my = blur(x), blur(y)
+    vx, vy, c = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    return (
+        (2 * mx * my + 1e-4) * (2 * c + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+    ).mean()
+
+
+def test_ssim_is_its_definition(pair):
+    x, y = (z.double() for z in pair)
+    torch.testing.assert_close(ssim(x, y), plain_ssim(x, y))
+    torch.testing.assert_close(ssim(*pair).double(), plain_ssim(x, y), rtol=1e-5, atol=1e-5)
+
+
+def test_ssim_agrees_with_scikit_image_inside(pair):
+    """Far from the border the paddings do not differ: a border of equal pixels adds none."""
+    from skimage.metrics import structural_similarity
+
+    _, full = structural_similarity(
+        *(z.permute(1, 2, 0).double().numpy() for z in pair),
+        channel_axis=-1,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    inside = full[10:-10, 10:-10].mean()
+    x, y = (z.double() for z in pair)
+    from fragprune_plugins.finetuning import losses
+
+    maps = torch.stack([x, y, x * x, y * y, x * y])
+    mx, my, xx, yy, xy = losses._blur(maps)
+    top = (2 * mx * my + 1e-4) * (2 * (xy - mx * my) + 9e-4)
+    bottom = (mx**2 + my**2 + 1e-4) * (xx - mx**2 + yy - my**2 + 9e-4)
+    assert float((top / bottom)[:, 10:-10, 10:-10].mean()) == pytest.approx(inside, abs=1e-9)
+
+
+def test_equal_images_lose_nothing(pair):
+    _, target = pair
+    assert float(photometric_loss(target, target)) == pytest.approx(0, abs=1e-6)
+    assert float(l1(target, target)) == 0
+
+
+def test_gradient(pair):
+    x, y = (z[:, :14, :13].double() for z in pair)
+    assert torch.autograd.gradcheck(lambda z: photometric_loss(z, y), x.requires_grad_())

@@ -1,0 +1,182 @@
+"""The PLY of a trained splat: round trips, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from finetune import tiny
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
+from fragprune_plugins.errors import InputError, ModelFileError
+from fragprune_plugins.ply import SplatFile, read_ply, write_ply
+
+
+def same(a: SplatFile, b: SplatFile) -> bool:
+    return all(
+        torch.equal(getattr(a, f.name), getattr(b, f.name))
+        for f in fields(a)
+        if f.name != "thresholds"
+    )
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    count=st.integers(1, 40),
+    degree=st.integers(0, 3),
+    seed=st.integers(0, 10**6),
+    exported=st.booleans(),
+)
+def test_round_trip_is_bit_exact(tmp_path, count, degree, seed, exported):
+    model = tiny.random_model(count, degree, seed)
+    thresholds = torch.rand(count) * 0.98 + 0.01 if exported else None
+    write_ply(tmp_path / "m.ply", model, thresholds)
+    read = read_ply(tmp_path / "m.ply")
+    assert same(model, read)
+    assert read.sh_degree == degree
+    if exported:
+        assert torch.equal(read.thresholds, thresholds)
+    else:
+        assert read.thresholds is None
+
+
+def test_columns_are_the_hosts(tmp_path):
+    model = tiny.random_model(3, degree=2)
+    write_ply(tmp_path / "m.ply", model, torch.full((3,), 0.25))
+    vertex = PlyData.read(tmp_path / "m.ply")["vertex"]
+    names = [p.name for p in vertex.properties]
+    rest = " ".join(f"f_rest_{i}" for i in range(24))
+    assert " ".join(names) == (
+        f"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 {rest} opacity scale_0 scale_1 scale_2 "
+        "rot_0 rot_1 rot_2 rot_3 trunc_threshold"
+    )
+    # Channel-major: the first eight are red's.
+    assert vertex["f_rest_1"][2] == model.f_rest[2, 1, 0]
+    assert vertex["f_rest_8"][2] == model.f_rest[2, 0, 1]
+
+
+def test_ascii_doubles_and_unknown_columns(tmp_path):
+    model = tiny.random_model(4, degree=1)
+    write_ply(tmp_path / "m.ply", model)
+    rows = PlyData.read(tmp_path / "m.ply")["vertex"].data
+    wide = np.zeros(4, dtype=[*((n, "f8") for n in reversed(rows.dtype.names)), ("mood", "u1")])
+    for name in rows.dtype.names:
+        wide[name] = rows[name]
+    faces = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))])
+    elements = [PlyElement.describe(wide, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements, text=True).write(tmp_path / "foreign.ply")
+    assert same(model, read_ply(tmp_path / "foreign.ply"))
+
+
+def test_activation(tmp_path):
+    model = tiny.random_model(5, degree=3)
+    splats = model.splats()
+    assert torch.equal(splats.opacities, torch.sigmoid(model.opacity[:, 0]))
+    assert torch.equal(splats.scales, torch.exp(model.scaling))
+    torch.testing.assert_close(splats.rotations.norm(dim=1), torch.ones(5))
+    assert splats.sh.shape == (5, 16, 3)
+    assert splats.sh_degree == 3
+
+
+def nan_in_two_rows(model: SplatFile) -> SplatFile:
+    scaling = model.scaling.clone()
+    scaling[1, 2] = torch.nan
+    scaling[3, 2] = torch.inf
+    return replace(model, scaling=scaling)
+
+
+def without(path: Path, *names: str) -> None:
+    rows = PlyData.read(path)["vertex"].data
+    kept = [n for n in rows.dtype.names if n not in names]
+    table = np.empty(len(rows), dtype=[(n, "f4") for n in kept])
+    for name in kept:
+        table[name] = rows[name]
+    PlyData([PlyElement.describe(table, "vertex")]).write(path)
+
+
+def spoil(path: Path, how: str) -> None:
+    """Make a broken model file."""
+    write_ply(path, tiny.random_model(8, degree=1))
+    content = path.read_bytes()
+    if how == "missing":
+        path.unlink()
+    elif how == "folder":
+        path.unlink()
+        path.mkdir()
+    elif how == "cut off":
+        path.write_bytes(content[:-100])
+    elif how == "cut in the header":
+        path.write_bytes(content[:90])
+    elif how == "nothing":
+        path.write_bytes(b"")
+    elif how == "a picture":
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
+    elif how == "points":
+        without(path, "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_3")
+    elif how == "odd sh":
+        without(path, "f_rest_8")
+    elif how == "faces only":
+        faces = np.array([(1,)], dtype=[("a", "i4")])
+        PlyData([PlyElement.describe(faces, "face")]).write(path)
+    elif how == "empty":
+        rows = PlyData.read(path)["vertex"].data[:0]
+        PlyData([PlyElement.describe(rows, "vertex")]).write(path)
+    elif how == "nan":
+        write_ply(path, nan_in_two_rows(tiny.random_model(8, degree=1)))
+    elif how == "thresholds":
+        write_ply(path, tiny.random_model(8, degree=1), torch.linspace(0.5, 1.2, 8))
+
+
+MESSAGES = {
+    "missing": "no such file",
+    "folder": "a folder",
+    "cut off": "not readable as PLY",
+    "cut in the header": "not readable as PLY",
+    "nothing": "not readable as PLY",
+    "a picture": "not readable as PLY",
+    "points": "without f_dc_0, f_dc_1, f_dc_2, opacity, rot_3",
+    "odd sh": "8 f_rest columns",
+    "faces only": "without a vertex element",
+    "empty": "0 Gaussians",
+    "nan": r"NaN or infinity in 2 of 8 rows \(scale_2\)",
+    "thresholds": "trunc_threshold outside",
+}
+
+
+@pytest.mark.parametrize("how", MESSAGES)
+def test_bad_files_are_refused_by_name(tmp_path, how):
+    path = tmp_path / "bad.ply"
+    spoil(path, how)
+    with pytest.raises(ModelFileError, match=MESSAGES[how]) as error:
+        read_ply(path)
+    assert error.value.where == str(path)
+
+
+def test_shapes_are_checked():
+    model = tiny.random_model(4)
+    with pytest.raises(InputError, match="opacity"):
+        replace(model, opacity=model.opacity[:, 0])
+    with pytest.raises(InputError, match="f_rest"):
+        replace(model, f_rest=torch.zeros(4, 5, 3))
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "m.ply"
+    write_ply(path, tiny.random_model(4))
+    before = path.read_bytes()
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(PlyData, "write", full)
+    with pytest.raises(Exception, match="No space left"):
+        write_ply(path, tiny.random_model(5))
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["m.ply"]

@@ -1,0 +1,169 @@
+"""A scene of a few Gaussians, drawn by our engine, written to disk by small writers of its own."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from fragprune_plugins import rasterize
+from fragprune_plugins.finetuning.dataset import Camera, Dataset, Shot
+from fragprune_plugins.ply import SplatFile, write_ply
+from fragprune_plugins.types import RasterInputs
+
+SIDE = 32
+FOCAL = 36.0
+
+
+def random_model(count: int = 60, degree: int = 1, seed: int = 0) -> SplatFile:
+    """Opaque, overlapping Gaussians around the origin."""
+    stream = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=stream)
+
+    return SplatFile(
+        xyz=0.5 * normal(count, 3),
+        f_dc=0.8 * normal(count, 1, 3),
+        f_rest=0.1 * normal(count, (degree + 1) ** 2 - 1, 3),
+        opacity=0.5 + 0.5 * normal(count, 1),
+        scaling=-1.6 + 0.2 * normal(count, 3),
+        rotation=normal(count, 4),
+    )
+
+
+def cameras(count: int = 9) -> list[Camera]:
+    """On a circle around the origin, looking at it; y is down."""
+    result = []
+    for i in range(count):
+        angle = 2 * math.pi * i / count
+        rotation = torch.tensor(
+            [
+                [math.cos(angle), 0.0, -math.sin(angle)],
+                [0.0, 1.0, 0.0],
+                [math.sin(angle), 0.0, math.cos(angle)],
+            ],
+            dtype=torch.float64,
+        )
+        translation = torch.tensor([0.0, 0.1, 3.0], dtype=torch.float64)
+        half = SIDE / 2
+        result.append(Camera(rotation, translation, SIDE, SIDE, FOCAL, FOCAL, half, half))
+    return result
+
+
+def photographs(model: SplatFile) -> list[torch.Tensor]:
+    """The model as the cameras see it, (3, H, W) each."""
+    with torch.no_grad():
+        return [
+            rasterize(RasterInputs(camera.view(), model.splats())).image.clamp(0, 1)
+            for camera in cameras()
+        ]
+
+
+def save_png(path: Path, image: torch.Tensor) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    array = np.round(255 * image.permute(1, 2, 0).numpy()).astype(np.uint8)
+    Image.fromarray(array).save(path)
+
+
+def quaternion(rotation: torch.Tensor) -> list[float]:
+    """w, x, y, z of a rotation about the y axis."""
+    angle = math.atan2(float(rotation[0, 2]), float(rotation[0, 0]))
+    return [math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0]
+
+
+def write_colmap(
+    folder: Path, images: list[torch.Tensor], *, binary: bool = False, model: str = "PINHOLE"
+) -> Path:
+    """images/ and sparse/0 in COLMAP's own format."""
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    half = SIDE / 2
+    parameters = {
+        "PINHOLE": [FOCAL, FOCAL, half, half],
+        "SIMPLE_PINHOLE": [FOCAL, half, half],
+        "OPENCV": [FOCAL, FOCAL, half, half, 0.1, 0.0, 0.0, 0.0],
+    }[model]
+    code = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "OPENCV": 4}[model]
+    poses = [
+        (f"view{i:02d}.png", quaternion(camera.rotation), camera.translation.tolist())
+        for i, camera in enumerate(cameras())
+    ]
+    for (name, _, _), image in zip(poses, images, strict=True):
+        save_png(folder / "images" / name, image)
+    poses.reverse()  # readers must sort
+    if binary:
+        with open(sparse / "cameras.bin", "wb") as file:
+            file.write(struct.pack("<QiiQQ", 1, 7, code, SIDE, SIDE))
+            file.write(struct.pack(f"<{len(parameters)}d", *parameters))
+        with open(sparse / "images.bin", "wb") as file:
+            file.write(struct.pack("<Q", len(poses)))
+            for i, (name, q, t) in enumerate(poses):
+                file.write(struct.pack("<i7di", i + 1, *q, *t, 7) + name.encode() + b"\0")
+                file.write(struct.pack("<Q", i % 3))
+                for _ in range(i % 3):
+                    file.write(struct.pack("<ddq", 1.0, 2.0, -1))
+    else:
+        numbers = " ".join(repr(p) for p in parameters)
+        (sparse / "cameras.txt").write_text(f"# cameras\n7 {model} {SIDE} {SIDE} {numbers}\n")
+        lines = ["# images"]
+        for i, (name, q, t) in enumerate(poses):
+            lines.append(" ".join(map(str, [i + 1, *q, *t, 7, name])))
+            lines.append("1.0 2.0 -1" if i % 2 else "")
+        (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def transforms(names: list[str], chosen: list[Camera]) -> dict[str, object]:
+    """The content of a transforms file."""
+    frames = []
+    for name, camera in zip(names, chosen, strict=True):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = camera.rotation.T @ torch.diag(torch.tensor([1.0, -1, -1]).double())
+        pose[:3, 3] = -camera.rotation.T @ camera.translation
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    return {"camera_angle_x": 2 * math.atan(SIDE / (2 * FOCAL)), "frames": frames}
+
+
+def write_blender(folder: Path, images: list[torch.Tensor]) -> Path:
+    """transforms_train.json and transforms_test.json, held-out views as COLMAP's reader takes."""
+    for part in ("train", "test"):
+        chosen = [i for i in range(len(images)) if (i % 8 == 0) == (part == "test")]
+        for i in chosen:
+            save_png(folder / part / f"view{i:02d}.png", images[i])
+        names = [f"./{part}/view{i:02d}" for i in chosen]
+        content = transforms(names, [cameras()[i] for i in chosen])
+        (folder / f"transforms_{part}.json").write_text(json.dumps(content))
+    return folder
+
+
+def scene(folder: Path) -> tuple[Path, Path, SplatFile]:
+    """A COLMAP folder and a model whose opacities are off: data, model file, the model."""
+    truth = random_model()
+    data = write_colmap(folder / "data", photographs(truth))
+    model = perturbed(truth)
+    path = folder / "model.ply"
+    write_ply(path, model)
+    return data, path, model
+
+
+def perturbed(truth: SplatFile) -> SplatFile:
+    stream = torch.Generator().manual_seed(1)
+    noise = 0.7 * torch.randn(truth.opacity.shape, generator=stream)
+    return replace(truth, opacity=truth.opacity + noise)
+
+
+def dataset_in_memory(folder: Path, truth: SplatFile) -> Dataset:
+    """The dataset without a reader in between."""
+    shots = []
+    for i, (camera, image) in enumerate(zip(cameras(), photographs(truth), strict=True)):
+        path = folder / f"{i}.png"
+        save_png(path, image)
+        shots.append(Shot(f"view{i:02d}", camera.view(), path))
+    return Dataset([s for i, s in enumerate(shots) if i % 8], shots[::8])

@@ -1,0 +1,84 @@
+"""Measuring splats on photographs, and the pictures of it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from finetune import tiny
+from PIL import Image
+
+from fragprune_plugins.errors import OutputError
+from fragprune_plugins.finetuning import Record
+from fragprune_plugins.measure import Candidate, evaluate, measure
+from fragprune_plugins.measure.pictures import save_curves, save_heatmap, save_image, save_panel
+
+NAMES = {
+    "psnr",
+    "ssim",
+    "lpips",
+    "fragments_per_pixel",
+    "evaluated_per_pixel",
+    "gaussians",
+    "frame_ms",
+    "frame_ms_se",
+    "engine",
+    "device",
+    "views",
+}
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return tiny.random_model()
+
+
+@pytest.fixture(scope="module")
+def shots(truth, tmp_path_factory):
+    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth).test
+
+
+def test_report_of_the_truth(truth, shots):
+    report = evaluate(truth, None, shots, repeats=2)
+    assert set(report) == NAMES
+    assert report["psnr"] > 50  # 8-bit photographs of itself
+    assert report["ssim"] > 0.999
+    assert report["lpips"] is None
+    assert report["gaussians"] == 60
+    assert report["views"] == 2
+    assert report["frame_ms"] > 0
+    assert report["evaluated_per_pixel"] >= report["fragments_per_pixel"] > 0
+
+
+def test_truncation_draws_less(truth, shots):
+    thresholds = torch.full((len(truth),), 0.2)
+    plain, cut = measure([Candidate(truth), Candidate(truth, thresholds)], shots, repeats=1)
+    assert cut["fragments_per_pixel"] < plain["fragments_per_pixel"]
+    assert cut["psnr"] < plain["psnr"]
+    assert plain["frame_ms_se"] == 0.0
+
+
+def test_images_are_written_as_seen(tmp_path):
+    image = torch.tensor([[[0.0, 2.0]], [[-1.0, 0.5]], [[1.0, 0.25]]])
+    save_image(tmp_path / "deep" / "x.png", image)
+    with Image.open(tmp_path / "deep" / "x.png") as picture:
+        assert picture.getpixel((0, 0)) == (0, 0, 255)
+        assert picture.getpixel((1, 0)) == (255, 128, 64)
+
+
+def test_maps_panels_and_curves(tmp_path):
+    counts = torch.arange(12 * 16).reshape(12, 16)
+    save_heatmap(tmp_path / "heat.png", counts, 191.0)
+    save_panel(tmp_path / "panel.png", [("photo", torch.rand(3, 12, 16)), ("map", counts)], 191.0)
+    records = [Record(i, 1 / i, 40 / i, 1e-4, (0.01, 0.02, 0.03, 0.04, 0.05)) for i in (1, 2, 3)]
+    save_curves(tmp_path / "curves.png", records)
+    for name in ("heat", "panel", "curves"):
+        with Image.open(tmp_path / f"{name}.png") as picture:
+            assert min(picture.size) > 100
+            assert len(picture.convert("RGB").getcolors(1 << 20)) > 20
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_unwritable_place(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError):
+        save_image(tmp_path / "file" / "x.png", torch.zeros(3, 2, 2))
