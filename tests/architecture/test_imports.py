@@ -1,0 +1,145 @@
+"""What may be imported by whom, and what importing costs."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+import fragprune_plugins
+from fragprune_plugins.plugins import load_plugins
+
+ROOT = Path(__file__).parents[2]
+ADAPTERS = sorted(p.name for p in (ROOT / "adapters").glob("fragprune_*") if p.is_dir())
+PACKAGES = ["fragprune_plugins", "reference_renderer", *ADAPTERS]
+HOST = ROOT / "fragprune_plugins" / "demo" / "host"  # a program of its own, not our package
+
+
+def modules(package: str) -> list[str]:
+    folder = Path(find_spec(package).origin).parent
+    return sorted(
+        ".".join(path.relative_to(folder.parent).with_suffix("").parts).removesuffix(".__init__")
+        for path in folder.rglob("*.py")
+        if not path.is_relative_to(HOST)
+    )
+
+
+MODULES = [module for package in PACKAGES for module in modules(package)]
+
+
+def test_the_outer_rooms_import_without_torch(python):
+    core = (
+        "adapter detect errors constants files hookspecs launch lineage patching plugins pressure "
+        "schedule seams types"
+    )
+    light = [
+        *(m for m in MODULES if m.startswith("fragprune_plugins.cli")),
+        *(f"fragprune_plugins.{name}" for name in core.split(" ")),
+        *ADAPTERS,
+    ]
+    loaded = python(
+        """
+import json, sys
+from importlib import import_module
+heavy = []
+for name in sys.argv[1:]:
+    import_module(name)
+    if "torch" in sys.modules:
+        heavy.append(name)
+        break
+print(json.dumps(heavy))
+""",
+        "fragprune_plugins",
+        *light,
+    )
+    assert loaded == []
+
+
+def test_loading_every_plugin_imports_no_torch(python):
+    assert python(
+        "import json, sys\n"
+        "from fragprune_plugins.plugins import load_plugins\n"
+        "plugins = load_plugins()\n"
+        "names = [(a.name, a.info.title, [str(s) for s in a.seams]) for a in plugins.adapters]\n"
+        "print(json.dumps([bool(names), 'torch' in sys.modules]))"
+    ) == [True, False]
+
+
+def test_no_module_warns_on_import(python):
+    """Our own modules only: torch and matplotlib are imported before warnings become errors."""
+    python(
+        """
+import sys, warnings
+from importlib import import_module
+import torch, scipy.spatial, safetensors.torch, PIL.Image, click, wrapt, pluggy, plyfile, tqdm
+import skimage.metrics, matplotlib.figure
+warnings.simplefilter("error")
+for name in sys.argv[1:]:
+    if not name.endswith("__main__"):
+        import_module(name)
+""",
+        *MODULES,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", MODULES)
+def test_every_module_imports_alone(python, module):
+    if module.endswith("__main__"):
+        pytest.skip("a program")
+    python(f"import {module}")
+
+
+def test_import_rules_hold():
+    program = shutil.which("lint-imports", path=str(Path(sys.executable).parent))
+    if program is None:
+        pytest.skip("import-linter is not installed")
+    done = subprocess.run([program], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("name", fragprune_plugins.__all__)
+def test_public_names_resolve(name):
+    value = getattr(fragprune_plugins, name)
+    assert value is not None
+    assert name in dir(fragprune_plugins)
+
+
+def test_an_unknown_public_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'prune'"):
+        fragprune_plugins.prune  # noqa: B018
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_package_is_typed(package):
+    assert (Path(find_spec(package).origin).parent / "py.typed").is_file()
+
+
+def test_modules_are_called_after_what_they_hold():
+    vague = {"utils", "util", "helpers", "helper", "common_utils", "misc", "manager"}
+    assert not [m for m in MODULES if vague & set(m.split("."))]
+    assert not [p for p in (ROOT / "tests").rglob("*.py") if p.stem in vague]
+
+
+def test_the_shelf_is_no_package_and_every_book_on_it_is_an_entry_point():
+    assert not (ROOT / "adapters" / "__init__.py").exists()
+    loaded = load_plugins().loaded.values()
+    assert set(ADAPTERS) <= set(loaded)
+
+
+def test_versions_agree():
+    assert version("fragprune-plugins") == fragprune_plugins.__version__
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_package_says_first_what_it_is(package):
+    first = (import_module(package).__doc__ or "").strip().splitlines()[0]
+    assert first.endswith(".") or first.endswith(":") or first.endswith(",")
+    if package in ADAPTERS:
+        assert "/" in first.split()[0]  # owner/name of the host's repository

@@ -1,0 +1,61 @@
+"""What every room of the suite shares: one torch thread, calm Hypothesis, fresh processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+settings.register_profile(
+    "fragprune",
+    deadline=None,  # a first call may build or import something
+    derandomize=True,
+    max_examples=50,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+settings.load_profile("fragprune")
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+for _variable in ("FRAGPRUNE_BLOCK", "FRAGPRUNE_ONLY"):
+    os.environ.pop(_variable, None)
+
+
+@pytest.fixture
+def single_thread():
+    """Torch on one thread: the same sums in the same order."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def python(tmp_path: Path) -> Callable[..., Any]:
+    """Run code in a fresh interpreter; what it prints last, as JSON."""
+
+    def run(code: str, *arguments: object, path: Path | None = None, options: tuple = ()) -> Any:
+        environment = dict(os.environ)
+        if path is not None:
+            environment["PYTHONPATH"] = str(path)
+        done = subprocess.run(
+            [sys.executable, *options, "-c", code, *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            env=environment,
+            timeout=240,
+        )
+        assert done.returncode == 0, done.stderr[-4000:]
+        lines = done.stdout.strip().splitlines()
+        return json.loads(lines[-1]) if lines else None
+
+    return run

@@ -1,0 +1,193 @@
+"""Detection reads source: every tree here is a skeleton written from the hosts' interfaces."""
+
+from __future__ import annotations
+
+import pytest
+
+from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.errors import UnknownHostError
+from fragprune_vanilla_3dgs import OTHER_HOSTS, Vanilla3DGS
+
+SETTINGS = [
+    *("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier"),
+    *("viewmatrix", "projmatrix", "sh_degree", "campos", "prefiltered", "debug"),
+]
+
+MODEL = {
+    "__init__": "sh_degree",
+    "capture": "",
+    "restore": "model_args, training_args",
+    "training_setup": "training_args",
+    "update_learning_rate": "iteration",
+    "save_ply": "path",
+    "load_ply": "path",
+    "reset_opacity": "",
+    "oneupSHdegree": "",
+    "_prune_optimizer": "mask",
+    "cat_tensors_to_optimizer": "tensors_dict",
+    "densify_and_clone": "grads, grad_threshold, scene_extent",
+    "densify_and_split": "grads, grad_threshold, scene_extent, N=2",
+    "densify_and_prune": "max_grad, min_opacity, extent, max_screen_size",
+}
+
+STATES = ("2023", "August 2024", "October 2024")
+
+
+def skeleton(root, state="2023", **methods):
+    """Signatures and the rasterizer call of one public state; ``methods`` override or (None) drop
+    those of the model."""
+    model = MODEL | {"load_ply": "path, use_train_test_exp=False"} if state != "2023" else MODEL
+    model = {name: args for name, args in (model | methods).items() if args is not None}
+    settings = SETTINGS + (["antialiasing"] if state != "2023" else [])
+    parameters = "viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0"
+    if state == "October 2024":
+        parameters += ", separate_sh=False"
+    outputs = "image, radii" if state == "2023" else "image, radii, depth"
+    files = {
+        "arguments/__init__.py": "class OptimizationParams:\n"
+        "    def __init__(self, parser):\n        self.iterations = 12_345\n",
+        "scene/__init__.py": "class Scene:\n    def __init__(self, args, gaussians): ...\n",
+        "scene/gaussian_model.py": "class GaussianModel:\n"
+        + "\n".join(
+            f"    def {name}({', '.join(filter(None, ['self', args]))}): ..."
+            for name, args in model.items()
+        ),
+        "gaussian_renderer/__init__.py": f"def render({parameters}, override_color=None):\n"
+        f"    s = GaussianRasterizationSettings({', '.join(f'{n}=0' for n in settings)})\n"
+        "    rasterizer = GaussianRasterizer(raster_settings=s)\n"
+        f"    {outputs} = rasterizer(means3D=1)\n",
+        "train.py": "from gaussian_renderer import render\n"
+        + ("SparseGaussianAdam\n" if state == "October 2024" else ""),
+    }
+    for name, text in files.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return HostRepo(root)
+
+
+def errors(repo):
+    return [f for f in Vanilla3DGS().match(repo).findings if f.level == "error"]
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_each_public_state_is_recognised_and_its_dialect_read(tmp_path, state):
+    repo = skeleton(tmp_path, state)
+    adapter = Vanilla3DGS()
+    assert adapter.match(repo).fits, errors(repo)
+    assert adapter.revision(repo) == state
+    dialect = adapter.dialect(repo)
+    assert dialect.outputs == (2 if state == "2023" else 3)
+    assert dialect.settings[:12] == tuple(SETTINGS)
+    assert ("antialiasing" in dialect.settings) == (state != "2023")
+    assert dialect.sparse_adam == (state == "October 2024")
+    assert adapter.command_line(repo).default_iterations == 12_345
+    assert choose(repo, [adapter]) is adapter
+
+
+@pytest.mark.parametrize("marker", OTHER_HOSTS)
+def test_a_descendant_is_refused_by_name(tmp_path, marker):
+    repo = skeleton(tmp_path, **{marker: ""})
+    found = errors(repo)
+    assert [f.code for f in found] == ["other-host"]
+    assert OTHER_HOSTS[marker] in found[0].found
+    assert "scene.gaussian_model" in found[0].where
+    with pytest.raises(UnknownHostError, match=OTHER_HOSTS[marker]):
+        choose(repo, [Vanilla3DGS()], "vanilla-3dgs")
+
+
+@pytest.mark.parametrize("seam", [s for s in Vanilla3DGS.seams if not s.external], ids=str)
+def test_every_seam_that_is_gone_or_changed_is_named(tmp_path, seam):
+    repo = skeleton(tmp_path)
+    path = repo.path(seam.module)
+    head = f"def {seam.attribute.split('.')[-1]}("
+    whole = path.read_text()
+    path.write_text(whole.replace(head, "def renamed("))
+    assert [(f.code, f.where) for f in errors(HostRepo(tmp_path))] == [("seam-missing", str(seam))]
+    for name in seam.needs:
+        changed = [
+            line.replace(name, "other", 1) if head in line else line for line in whole.splitlines()
+        ]
+        path.write_text("\n".join(changed))
+        found = errors(HostRepo(tmp_path))
+        assert [(f.code, f.where) for f in found] == [("seam-signature", str(seam))]
+        assert name in found[0].expected
+
+
+def test_a_folder_that_is_no_host_is_refused_with_a_reason_and_a_remedy(tmp_path):
+    (tmp_path / "train.py").write_text("print('another project')")
+    with pytest.raises(UnknownHostError) as caught:
+        choose(HostRepo(tmp_path), [Vanilla3DGS()])
+    assert "no adapter fits" in caught.value.found
+    assert "GaussianRasterizationSettings" in caught.value.found
+    assert "fragprune check" in caught.value.remedy
+
+
+def test_source_that_is_not_python_is_absent_not_a_crash(tmp_path):
+    skeleton(tmp_path)
+    (tmp_path / "scene" / "gaussian_model.py").write_text("class GaussianModel(:\n")
+    (tmp_path / "train.py").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "utils.py").write_text(r'pattern = "\d"')  # hosts have such strings: no warning
+    repo = HostRepo(tmp_path)
+    assert {f.code for f in errors(repo)} == {"seam-missing"}
+    assert repo.tree("utils") is not None
+
+
+def test_names_of_adapters_are_checked_and_either_spelling_is_taken(tmp_path):
+    repo, adapter = skeleton(tmp_path), Vanilla3DGS()
+    assert choose(repo, [adapter], "vanilla_3dgs") is adapter
+    with pytest.raises(UnknownHostError, match="vanilla-3dgs"):
+        choose(repo, [adapter], "mip-splatting")
+    with pytest.raises(UnknownHostError, match="none is installed"):
+        choose(repo, [])
+
+
+def test_a_tie_is_not_guessed_but_a_plugin_may_break_it(tmp_path):
+    class Twin(Vanilla3DGS):
+        name = "twin"
+
+    repo, adapters = skeleton(tmp_path), [Vanilla3DGS(), Twin()]
+    with pytest.raises(UnknownHostError, match="several adapters fit: vanilla-3dgs, twin"):
+        choose(repo, adapters)
+    seen = []
+
+    def select(repo, matches):
+        seen.extend(match.adapter for match in matches)
+        return "twin"
+
+    assert choose(repo, adapters, select=select) is adapters[1]
+    assert seen == ["vanilla-3dgs", "twin"]
+    with pytest.raises(UnknownHostError, match="several"):
+        choose(repo, adapters, select=lambda repo, matches: "unheard of")
+
+
+def test_the_commit_is_read_without_git(tmp_path):
+    assert HostRepo(tmp_path).commit == ""
+    git = tmp_path / ".git"
+    (git / "refs" / "heads").mkdir(parents=True)
+    (git / "HEAD").write_text("0123abcd\n")
+    assert HostRepo(tmp_path).commit == "0123abcd"
+    (git / "HEAD").write_text("ref: refs/heads/main\n")
+    assert HostRepo(tmp_path).commit == ""
+    (git / "packed-refs").write_text("# pack\ncafe refs/heads/main\n")
+    assert HostRepo(tmp_path).commit == "cafe"
+    (git / "refs" / "heads" / "main").write_text("beef\n")
+    assert HostRepo(tmp_path).commit == "beef"
+
+
+def test_detection_imports_neither_the_host_nor_torch(tmp_path, python):
+    skeleton(tmp_path)
+    with (tmp_path / "train.py").open("a") as file:
+        file.write("raise SystemExit('imported')\n")
+    found = python(
+        """
+import json, sys
+from pathlib import Path
+from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.plugins import load_plugins
+adapter = choose(HostRepo(Path(sys.argv[1])), load_plugins().adapters)
+print(json.dumps([adapter.name, "torch" in sys.modules, "scene" in sys.modules]))
+""",
+        tmp_path,
+    )
+    assert found == ["vanilla-3dgs", False, False]

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.pressure import FixedPressure, PressureController
+from fragprune_plugins.schedule import JointSchedule, Schedule, Settings
+
+
+@given(st.integers(2, 10_000))
+def test_stage_two_learns_throughout_and_its_rates_fall_tenfold(iterations):
+    schedule = Schedule(Settings(iterations=iterations, threshold_lr=0.05, opacity_lr=0.01))
+    first, last = schedule.at(1), schedule.at(iterations)
+    assert first.learn
+    assert last.learn
+    assert (first.threshold_lr, first.opacity_lr, first.progress) == (0.05, 0.01, 0.0)
+    assert last.threshold_lr == pytest.approx(0.005)
+    assert last.opacity_lr == pytest.approx(0.001)
+    assert last.progress == 1.0
+    middle = schedule.at(iterations // 2)
+    assert last.threshold_lr <= middle.threshold_lr <= first.threshold_lr
+
+
+def test_a_run_of_one_iteration_and_steps_past_the_end_have_a_plan():
+    assert Schedule(Settings(iterations=1)).at(1).learn
+    assert Schedule(Settings(iterations=10)).at(99).progress == 1.0
+
+
+@given(st.integers(1, 200), st.integers(0, 200))
+def test_joint_learning_begins_at_its_step_and_leaves_the_opacity_rate_alone(step, start):
+    plan = JointSchedule(Settings(iterations=200), start).at(step)
+    assert plan.learn == (step >= start)
+    assert plan.opacity_lr is None
+    assert 0 <= plan.progress <= 1
+
+
+def test_alternating_learning_is_on_and_off_in_equal_turns():
+    schedule = JointSchedule(Settings(iterations=100), 10, every=3)
+    on = [step for step in range(1, 25) if schedule.at(step).learn]
+    assert on == [10, 11, 12, 16, 17, 18, 22, 23, 24]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"iterations": 0},
+        {"pressure": -1e-9},
+        {"pressure": 1.0},
+        {"pressure": float("nan")},
+        {"target_speedup": 1.0},
+        {"target_speedup": 21.0},
+        {"target_speedup": float("nan")},
+    ],
+)
+def test_settings_out_of_range_are_usage_errors(wrong):
+    with pytest.raises(UsageError):
+        Settings(**wrong)
+
+
+def test_settings_choose_their_pressure():
+    assert Settings(pressure=3e-4).make_pressure() == FixedPressure(3e-4)
+    assert isinstance(Settings(target_speedup=1.8).make_pressure(), PressureController)
+    assert Settings(truncate=False, target_speedup=1.8).make_pressure() == FixedPressure(0.0)
+
+
+def test_a_fixed_pressure_stays():
+    pressure = FixedPressure(2e-4)
+    for step in range(10):
+        pressure.observe(step / 10, 0.5)
+    assert pressure.value == 2e-4
+
+
+@pytest.mark.parametrize(("ratio", "direction"), [(1.0, 1), (0.1, -1)])
+def test_a_controller_waits_then_moves_the_right_way_and_within_its_reach(ratio, direction):
+    pressure = PressureController(1.8)
+    start = pressure.value
+    for step in range(15):
+        pressure.observe(step / 100, ratio)
+    assert pressure.value == start  # warm-up
+    for step in range(15, 100):
+        pressure.observe(step / 100, ratio)
+    assert (pressure.value > start) == (direction > 0)
+    assert start / 60.0001 <= pressure.value <= start * 60.0001

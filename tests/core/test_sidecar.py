@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from fragprune_plugins import sidecar
+from fragprune_plugins.errors import OutputError, SidecarError
+from fragprune_plugins.thresholds import ThresholdStore
+
+
+@pytest.fixture
+def trained() -> ThresholdStore:
+    store = ThresholdStore(6)
+    store.open(torch.linspace(0.1, 0.9, 6))
+    for step in range(3):
+        store.logits.grad = torch.linspace(-1, 1, 6) * (step + 1)
+        store.step(0.05)
+    return store
+
+
+@pytest.fixture
+def model(tmp_path):
+    path = tmp_path / "point_cloud.ply"
+    path.write_bytes(b"ply\nthe host's own bytes")
+    return path
+
+
+def test_what_is_saved_is_loaded_bit_for_bit(model, trained):
+    before = model.read_bytes()
+    path = sidecar.save(
+        model, trained, adapter="a-host", host_commit="c0ffee", settings={"iterations": 3}
+    )
+    assert path == model.with_name("point_cloud.fragprune.safetensors")
+    assert model.read_bytes() == before
+    for store in (None, ThresholdStore(6), ThresholdStore(0)):
+        loaded, info = sidecar.load(model, store)
+        assert store is None or loaded is store
+        for key, value in trained.state_dict().items():
+            again = loaded.state_dict()[key]
+            assert torch.equal(value, again) if torch.is_tensor(value) else value == again
+        assert (info.rows, info.adapter, info.host_commit) == (6, "a-host", "c0ffee")
+        assert info.settings == {"iterations": 3}
+
+
+def test_a_sidecar_of_an_earlier_model_file_is_refused(model, trained):
+    sidecar.save(model, trained)
+    model.write_bytes(model.read_bytes() + b" retrained")
+    with pytest.raises(SidecarError, match="thresholds of another model"):
+        sidecar.load(model)
+
+
+def broken(path, how: str) -> None:
+    data = path.read_bytes()
+    zero = torch.zeros
+    full = {"logits": zero(6), "exp_avg": zero(6), "exp_avg_sq": zero(6)}
+    header = int.from_bytes(data[:8], "little")
+    metadata = json.loads(data[8 : 8 + header])["__metadata__"]
+    if how == "truncated":
+        path.write_bytes(data[:-5])
+    elif how == "empty":
+        path.write_bytes(b"")
+    elif how == "corrupted header":
+        path.write_bytes(data[:9] + b"\xff\xff" + data[11:])
+    elif how == "not safetensors":
+        path.write_bytes(b"PK\x03\x04 some zip")
+    elif how == "foreign safetensors":
+        save_file({"weight": zero(3)}, path)
+    elif how == "another format":
+        save_file(full, path, metadata=metadata | {"format": "fragprune-thresholds-999"})
+    elif how == "no thresholds":
+        save_file({"weight": zero(3)}, path, metadata=metadata)
+    elif how == "metadata not numbers":
+        save_file(full, path, metadata=metadata | {"rows": "six"})
+    elif how == "metadata not json":
+        save_file(full, path, metadata=metadata | {"settings": "{"})
+    elif how == "fewer rows than stated":
+        save_file({k: v[:4].clone() for k, v in full.items()}, path, metadata=metadata)
+    elif how == "a scalar":
+        save_file({k: zero(()) for k in full}, path, metadata=metadata)
+    elif how == "unequal parts":
+        save_file(full | {"exp_avg": zero(2)}, path, metadata=metadata)
+    elif how == "a folder":
+        path.unlink()
+        path.mkdir()
+    elif how == "missing":
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "truncated",
+        "empty",
+        "corrupted header",
+        "not safetensors",
+        "foreign safetensors",
+        "another format",
+        "no thresholds",
+        "metadata not numbers",
+        "metadata not json",
+        "fewer rows than stated",
+        "a scalar",
+        "unequal parts",
+        "a folder",
+        "missing",
+    ],
+)
+def test_a_broken_sidecar_is_one_stated_error(model, trained, how):
+    broken(sidecar.save(model, trained), how)
+    untouched = ThresholdStore(6)
+    with pytest.raises(SidecarError) as caught:
+        sidecar.load(model, untouched)
+    assert "\n" not in str(caught.value)
+    assert caught.value.remedy
+    assert untouched.neutral
+
+
+def test_a_place_that_cannot_be_written_is_stated_and_the_old_sidecar_stays(
+    model, trained, monkeypatch
+):
+    path = sidecar.save(model, trained)
+    before = path.read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("safetensors.torch.save_file", full)
+    with pytest.raises(OutputError, match="No space left"):
+        sidecar.save(model, ThresholdStore(6))
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in model.parent.iterdir()) == [path.name, model.name]

@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fragprune_plugins.errors import AlignmentError, SidecarError
+from fragprune_plugins.thresholds import ThresholdStore
+
+
+class Shadow:
+    """A threshold as a row of plain lists: what the store should hold, worked out by hand."""
+
+    def __init__(self, count: int):
+        self.rows = [[-30.0, 0.0, 0.0] for _ in range(count)]  # logit, first, second moment
+        self.step_count = 0
+
+    def step(self, gradient: list[float], lr: float) -> None:
+        """Adam as its paper has it, in float64."""
+        self.step_count += 1
+        for row, g in zip(self.rows, gradient, strict=True):
+            row[1] = 0.9 * row[1] + 0.1 * g
+            row[2] = 0.999 * row[2] + 0.001 * g * g
+            first = row[1] / (1 - 0.9**self.step_count)
+            second = row[2] / (1 - 0.999**self.step_count)
+            row[0] -= lr * first / (math.sqrt(second) + 1e-15)
+
+    def replace(self, count: int) -> None:
+        self.__init__(count)
+
+
+def stepped(store: ThresholdStore, gradient: list[float], lr: float) -> None:
+    store.logits.grad = torch.tensor(gradient)
+    store.step(lr)
+
+
+operations = st.lists(
+    st.one_of(
+        st.tuples(st.just("keep"), st.integers(0, 2**12 - 1)),
+        st.tuples(st.just("append"), st.lists(st.integers(0, 99), max_size=4)),
+        st.tuples(st.just("orphans"), st.integers(0, 3)),
+        st.tuples(st.just("copy"), st.tuples(st.integers(0, 99), st.integers(0, 99))),
+        st.tuples(st.just("replace"), st.integers(0, 6)),
+        st.tuples(st.just("step"), st.integers(1, 1000)),
+    ),
+    max_size=14,
+)
+
+
+def apply(store: ThresholdStore, shadow: Shadow, operation: str, argument) -> None:
+    n = len(shadow.rows)
+    if operation == "keep":
+        mask = [bool(argument >> i & 1) for i in range(n)]
+        store.keep(torch.tensor(mask, dtype=torch.bool))
+        shadow.rows = [row for row, kept in zip(shadow.rows, mask, strict=True) if kept]
+    elif operation == "append" and n:
+        parents = [i % n for i in argument]
+        store.append(len(parents), torch.tensor(parents, dtype=torch.int64))
+        shadow.rows += [[shadow.rows[i][0], 0.0, 0.0] for i in parents]
+    elif operation == "orphans":
+        store.append(argument)
+        shadow.rows += [[-30.0, 0.0, 0.0] for _ in range(argument)]
+    elif operation == "copy" and n:
+        source, target = (i % n for i in argument)
+        store.copy(torch.tensor([source]), torch.tensor([target]))
+        shadow.rows[target] = list(shadow.rows[source])
+    elif operation == "replace":
+        store.replace(argument)
+        shadow.replace(argument)
+    elif operation == "step":
+        gradient = [((argument * (i + 3)) % 17 - 8) / 8 for i in range(n)]
+        stepped(store, gradient, 0.05)
+        shadow.step(gradient, 0.05)
+
+
+@given(operations)
+def test_rows_and_moments_follow_every_sequence_of_operations(sequence):
+    store, shadow = ThresholdStore(5), Shadow(5)
+    for operation, argument in sequence:
+        apply(store, shadow, operation, argument)
+        state = store.state_dict()
+        assert len(store) == len(shadow.rows)
+        for column, key in enumerate(("logits", "exp_avg", "exp_avg_sq")):
+            expected = torch.tensor([row[column] for row in shadow.rows])
+            torch.testing.assert_close(state[key], expected, rtol=1e-4, atol=2e-5)
+
+
+@given(st.integers(0, 2**8 - 1), st.integers(0, 2**8 - 1))
+def test_surviving_rows_train_bit_for_bit_as_they_would_have_alone(first, second):
+    """Rows do not interact, so a plain Adam on the survivors from the start is the oracle."""
+    generator = torch.Generator().manual_seed(first * 256 + second)
+    gradients = torch.randn(9, 8, generator=generator)
+    store, alive = ThresholdStore(8), torch.arange(8)
+    for i, gradient in enumerate(gradients):
+        if i in (3, 6):
+            bits = (first, second)[i == 6]
+            mask = torch.tensor([bool(bits >> int(row) & 1) for row in alive], dtype=torch.bool)
+            store.keep(mask)
+            alive = alive[mask]
+        stepped(store, gradient[alive].tolist(), 0.05)
+    plain = torch.full((len(alive),), -30.0, requires_grad=True)
+    adam = torch.optim.Adam([plain], lr=0.05, eps=1e-15)
+    for gradient in gradients:
+        plain.grad = gradient[alive].clone()
+        adam.step()
+    assert torch.equal(store.logits.detach(), plain.detach())
+
+
+def test_a_new_store_is_neutral_exactly_and_cannot_drift():
+    store = ThresholdStore(7)
+    assert store.neutral
+    assert len(store) == 7
+    # the cutoff -2 ln tau is beyond 2 ln 255, the farthest that any opacity reaches
+    assert (-2 * store.values.detach().double().log() > 2 * math.log(255)).all()
+    store.values.sum().backward()
+    store.logits.grad.mul_(0)  # a threshold that decides nothing gets no gradient from the image
+    store.step(0.05)
+    assert store.neutral
+    assert torch.equal(store.logits.detach(), torch.full((7,), -30.0))
+
+
+@given(st.lists(st.floats(0.0, 1.0, width=32), min_size=1, max_size=20))
+def test_opening_puts_each_threshold_just_below_the_skip_limit(opacities):
+    store = ThresholdStore(len(opacities))
+    store.open(torch.tensor(opacities)[:, None])
+    tau = store.values.detach().double()
+    limit = (1 / 255) / torch.tensor(opacities).double().clamp_min(1e-12)
+    assert (tau < limit).all()
+    drawable = limit < 0.99
+    assert (tau[drawable] > limit[drawable] * 0.999).all()
+    assert not store.neutral
+
+
+def test_opening_again_moves_only_rows_that_are_still_neutral():
+    store = ThresholdStore(2)
+    store.open(torch.tensor([0.5, 0.9]))
+    stepped(store, [-1.0, 1.0], 0.05)
+    learned = store.logits.detach().clone()
+    store.append(1)
+    store.open(torch.tensor([0.5, 0.9, 0.2]))
+    assert torch.equal(store.logits.detach()[:2], learned)
+    assert store.logits[2] > -30
+
+
+@given(operations)
+def test_state_dict_round_trips_bit_for_bit_and_training_goes_on_alike(sequence):
+    store, shadow = ThresholdStore(4), Shadow(4)
+    for operation, argument in sequence:
+        apply(store, shadow, operation, argument)
+    other = ThresholdStore(1, lr=0.05)
+    other.load_state_dict(store.state_dict())
+    for key, value in store.state_dict().items():
+        again = other.state_dict()[key]
+        assert torch.equal(value, again) if isinstance(value, torch.Tensor) else value == again
+    gradient = [0.25] * len(store)
+    stepped(store, gradient, 0.03)
+    stepped(other, gradient, 0.03)
+    assert torch.equal(store.logits, other.logits)
+
+
+def test_state_dict_is_a_copy():
+    store = ThresholdStore(2)
+    state = store.state_dict()
+    state["logits"].fill_(5.0)
+    assert store.neutral
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("short mask", lambda s: s.keep(torch.ones(2, dtype=torch.bool))),
+        ("indices as mask", lambda s: s.keep(torch.tensor([0, 1, 2]))),
+        ("column mask", lambda s: s.keep(torch.ones(3, 1, dtype=torch.bool))),
+        ("parent beyond the end", lambda s: s.append(1, torch.tensor([3]))),
+        ("negative parent", lambda s: s.append(1, torch.tensor([-1]))),
+        ("too few parents", lambda s: s.append(2, torch.tensor([0]))),
+        ("source beyond the end", lambda s: s.copy(torch.tensor([9]), torch.tensor([0]))),
+        ("unequal copy", lambda s: s.copy(torch.tensor([0, 1]), torch.tensor([0]))),
+        ("opacities of another model", lambda s: s.open(torch.ones(4))),
+    ],
+)
+def test_misuse_is_refused_with_both_counts_and_changes_nothing(name, call):
+    store = ThresholdStore(3)
+    with pytest.raises(AlignmentError) as caught:
+        call(store)
+    assert caught.value.where.startswith("ThresholdStore.")
+    assert any(digit.isdigit() for digit in caught.value.found + caught.value.expected)
+    assert len(store) == 3
+    assert store.neutral
+
+
+def test_a_state_whose_parts_do_not_fit_is_refused():
+    state = ThresholdStore(3).state_dict()
+    state["exp_avg"] = torch.zeros(2)
+    with pytest.raises(SidecarError, match="shapes"):
+        ThresholdStore(3).load_state_dict(state)

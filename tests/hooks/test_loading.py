@@ -1,0 +1,137 @@
+"""Plugins are found, blocked, loaded one by one and checked; none stops another."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from fragprune_plugins.adapter import HostAdapter
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins import load_plugins
+
+
+class Entry:
+    """An installed entry point; ``plugin`` may be an exception to raise on import."""
+
+    def __init__(self, name, plugin, value=None):
+        self.name, self.plugin, self.value = name, plugin, value or f"{name}_module"
+
+    def load(self):
+        if isinstance(self.plugin, BaseException):
+            raise self.plugin
+        return self.plugin
+
+
+def offering(*names):
+    """A plugin that offers adapters of these names."""
+
+    class Plugin:
+        @hookimpl
+        def fragprune_register_adapters(self, register):
+            for name in names:
+                register(SimpleNamespace(name=name))
+
+    return Plugin()
+
+
+GOOD = Entry("good", offering("good-host"))
+
+
+def codes(plugins):
+    return [(finding.level, finding.code) for finding in plugins.findings]
+
+
+def names(plugins):
+    return [adapter.name for adapter in plugins.adapters]
+
+
+class Misspelt:
+    @hookimpl
+    def fragprune_trunkate(self, inputs, store):
+        """No such hook."""
+
+
+class WrongArgument:
+    @hookimpl
+    def fragprune_truncate(self, inputs, tau):
+        """The hook has no such argument."""
+
+
+class Broken:
+    @hookimpl
+    def fragprune_register_adapters(self, register):
+        raise RuntimeError("my table is missing")
+
+
+@pytest.mark.parametrize("order", ["before", "after"])
+@pytest.mark.parametrize(
+    ("plugin", "words"),
+    [
+        (ImportError("libfancy.so is missing"), "ImportError: libfancy.so is missing"),
+        (ZeroDivisionError("at import"), "ZeroDivisionError"),
+        (Misspelt(), "fragprune_trunkate"),
+        (WrongArgument(), "tau"),
+        (Broken(), "RuntimeError: my table is missing"),
+    ],
+    ids=["import fails", "import raises", "misspelt hook", "unknown argument", "hook raises"],
+)
+def test_one_bad_plugin_is_reported_and_stops_no_other(plugin, words, order):
+    bad = Entry("bad", plugin)
+    plugins = load_plugins([bad, GOOD] if order == "before" else [GOOD, bad])
+    assert names(plugins) == ["good-host"]
+    assert codes(plugins) == [("error", "plugin-failed")]
+    assert words in plugins.findings[0].found
+    assert "bad = bad_module" in plugins.findings[0].where
+    assert list(plugins.loaded) == ["good"]
+    assert plugins.manager.get_plugin("bad") is None
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "expected"),
+    [
+        ("FRAGPRUNE_BLOCK", "other", ["good-host"]),
+        ("FRAGPRUNE_BLOCK", " other , good ", []),
+        ("FRAGPRUNE_ONLY", "other", ["other-host"]),
+        ("FRAGPRUNE_ONLY", "", ["good-host", "other-host"]),
+    ],
+)
+def test_plugins_are_blocked_by_name_before_they_are_loaded(monkeypatch, variable, value, expected):
+    monkeypatch.setenv(variable, value)
+    loaded = []
+    entries = [GOOD, Entry("other", offering("other-host"))]
+    for entry in entries:
+        load = entry.load
+        entry.load = lambda entry=entry, load=load: loaded.append(entry.name) or load()
+    plugins = load_plugins(entries)
+    for entry in entries:
+        del entry.load
+    assert names(plugins) == expected
+    assert len(loaded) == len(expected)
+    assert codes(plugins) == [("info", "plugin-blocked")] * (2 - len(expected))
+
+
+def test_a_second_distribution_under_the_same_name_is_reported():
+    twin = Entry("good", offering("twin-host"), value="twin_module")
+    plugins = load_plugins([GOOD, twin])
+    assert names(plugins) == ["good-host"]
+    assert codes(plugins) == [("warning", "plugin-shadowed")]
+    assert "twin_module" in plugins.findings[0].where
+    assert "good_module" in plugins.findings[0].found
+
+
+def test_the_same_entry_point_listed_twice_is_not_a_conflict():
+    assert codes(load_plugins([GOOD, GOOD])) == []
+
+
+def test_an_adapter_offered_twice_is_reported():
+    plugins = load_plugins([GOOD, Entry("more", offering("good-host", "a-host"))])
+    assert names(plugins) == ["a-host", "good-host"]
+    assert codes(plugins) == [("warning", "adapter-shadowed")]
+
+
+def test_what_is_installed_loads_without_findings():
+    plugins = load_plugins()
+    assert plugins.findings == []
+    assert "vanilla-3dgs" in names(plugins)
+    assert all(isinstance(adapter, HostAdapter) for adapter in plugins.adapters)
