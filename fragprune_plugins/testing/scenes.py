@@ -84,7 +84,9 @@ def random_thresholds(
     generator = torch.Generator().manual_seed(seed)
     tau = _uniform(generator, math.log(1e-3), math.log(0.7), n).exp()
     index = torch.arange(n)
-    tau = torch.where(index % 8 == 6, torch.sigmoid(torch.tensor(NEUTRAL_LOGIT).double()), tau)
+    tau = torch.where(
+        index % 8 == 6, torch.sigmoid(torch.tensor(NEUTRAL_LOGIT, dtype=torch.float64)), tau
+    )
     return torch.where(index % 8 == 7, 0.98, tau).to(dtype).to(device)
 
 
@@ -121,10 +123,14 @@ def one_splat(
     per_pixel = depth / width  # _plain_view: the focal length is the width
     splats = Splats(
         means=unproject(view, at, z),
-        opacities=torch.tensor([opacity]).double(),
-        scales=torch.tensor([[sigma[0] * per_pixel, sigma[1] * per_pixel, 1e-6]]).double(),
-        rotations=torch.tensor([[math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]]).double(),
-        colors=torch.tensor([color]).double(),
+        opacities=torch.tensor([opacity], dtype=torch.float64),
+        scales=torch.tensor(
+            [[sigma[0] * per_pixel, sigma[1] * per_pixel, 1e-6]], dtype=torch.float64
+        ),
+        rotations=torch.tensor(
+            [[math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]], dtype=torch.float64
+        ),
+        colors=torch.tensor([color], dtype=torch.float64),
     )
     return cast(RasterInputs(view=view, splats=splats), dtype)
 
@@ -182,7 +188,7 @@ def stack(
 def behind_camera(*, dtype: torch.dtype = torch.float32) -> RasterInputs:
     """Three splats that the near plane culls (z = -2, 0.1, exactly 0); nothing is drawn."""
     scene = one_splat(background=(0.1, 0.2, 0.3), dtype=torch.float64)
-    means = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.1], [0.1, 0.0, 0.0]]).double()
+    means = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.1], [0.1, 0.0, 0.0]], dtype=torch.float64)
     splats = concatenate(concatenate(scene.splats, scene.splats), scene.splats)
     return cast(replace(scene, splats=replace(splats, means=means)), dtype)
 
@@ -294,7 +300,7 @@ def _plain_view(width: int, height: int, background: tuple[float, float, float])
         height=height,
         fx=width,
         fy=width,
-        background=torch.tensor(background).double(),
+        background=torch.tensor(background, dtype=torch.float64),
     )
 
 
@@ -302,7 +308,7 @@ def _placements(
     generator: torch.Generator, n: int, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
     """Pixels (N, 2) and view depths (N,): most inside, some on tile borders, outside, behind."""
-    size = torch.tensor([width, height]).double()
+    size = torch.tensor([width, height], dtype=torch.float64)
     pixels = _uniform(generator, -0.05, 1.05, n, 2) * size
     depths = _uniform(generator, 1.0, 8.0, n)
     kind = torch.arange(n) % 10
@@ -335,7 +341,7 @@ def _rotations(generator: torch.Generator, n: int) -> Tensor:
 def _rotation_matrix(quaternion: Tensor) -> Tensor:
     """(3, 3) rotation of a unit quaternion (4,): the vector part's exponential."""
     w, x, y, z = quaternion.tolist()
-    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]).double()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
     turn: Tensor = torch.eye(3, dtype=torch.float64) + 2 * w * cross + 2 * cross @ cross
     return turn
 
