@@ -1,0 +1,122 @@
+"""Derivatives: by finite differences with the cuts off, and the host's own quirks with them on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
+from fragprune_plugins.testing import scenes
+from reference_renderer import Options, render
+
+F64 = torch.float64
+UNCUT = Options(alpha_min=0, transmittance_min=0, tiles=False, truncation="soft")
+
+
+def smooth_scene(n=3, **kind):
+    """Splats inside a small image, none capped, clamped or culled."""
+    made = scenes.random_scene(7, n, 9, 7, dtype=F64, **kind)
+    at = torch.tensor([[2.2, 3.1], [5.7, 2.4], [4.1, 4.9]]).double()[:n]
+    depths = torch.tensor([2.0, 3.0, 4.0]).double()[:n]
+    splats = replace(
+        made.splats,
+        means=scenes.unproject(made.view, at, depths),
+        opacities=torch.tensor([0.5, 0.8, 0.3]).double()[:n],
+    )
+    if splats.sh is not None:
+        splats = replace(splats, sh=splats.sh * 0.2)
+    return replace(made, splats=splats)
+
+
+def outputs(drawn):
+    return drawn.image, drawn.invdepth, drawn.alpha, drawn.fragments_per_pixel
+
+
+KINDS = {
+    "sh degree 0": {"sh_degree": 0},
+    "sh degree 1": {"sh_degree": 1},
+    "sh degree 3": {"sh_degree": 3},
+    "colours and covariances": {"colors": True, "cov3d": True},
+    "antialiased": {"colors": True, "antialiasing": True},
+    "scaled": {"colors": True, "scale_modifier": 1.3},
+}
+
+
+@pytest.mark.parametrize("truncated", [True, False], ids=["thresholds", "none"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_input_has_the_derivative_of_finite_differences(kind, truncated):
+    scene, leaves = scenes.leaves(smooth_scene(**KINDS[kind]))
+    options = replace(UNCUT, antialiasing=scene.antialiasing, scale_modifier=scene.scale_modifier)
+    hook = leaves.pop("means2d_hook")
+    names = list(leaves)
+    tau = torch.tensor([0.3, 0.6, 0.1], dtype=F64, requires_grad=truncated)
+
+    def drawn(*tensors):
+        given = dict(zip(names, tensors[:-1], strict=True))
+        camera = replace(camera_of(scene), background=given.pop("background"))
+        gaussians = replace(gaussians_of(scene), **given)
+        thresholds = tensors[-1] if truncated else None
+        made = outputs(render(camera, gaussians, thresholds, means2d_hook=hook, options=options))
+        return made if truncated else made[:3]  # without thresholds a count is a constant
+
+    assert torch.autograd.gradcheck(drawn, (*leaves.values(), tau), eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_means2d_gradient_is_that_of_normalised_device_coordinates(axis):
+    scene, leaves = scenes.leaves(smooth_scene(1, colors=True))
+    weight = torch.rand(3, 7, 9, generator=torch.Generator().manual_seed(0), dtype=F64)
+
+    def loss(shift, hook=None):
+        # clip.w times the shift, added to clip.x or .y, moves the image by the shift in NDC and
+        # leaves the covariance alone.
+        clip = scene.view.projmatrix
+        unit = torch.eye(4, dtype=F64)[axis]
+        camera = replace(camera_of(scene), projmatrix=clip + shift * clip[:, 3:] * unit)
+        drawn = render(camera, gaussians_of(scene), means2d_hook=hook, options=UNCUT)
+        return (drawn.image * weight).sum()
+
+    hook = leaves["means2d_hook"]
+    loss(0.0, hook).backward()
+    h = 1e-6
+    slope = (loss(h) - loss(-h)).item() / (2 * h)
+    assert hook.grad[0, axis].item() == pytest.approx(slope, rel=1e-6)
+    assert hook.grad[0, 2] == 0
+
+
+def test_the_means2d_hooks_values_are_unused():
+    scene = scenes.random_scene(2, 20, dtype=F64)
+    values = torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    plain = ReferenceEngine().rasterize(scene, None)
+    hooked = ReferenceEngine().rasterize(replace(scene, means2d_hook=values), None)
+    assert torch.equal(plain.image, hooked.image)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_gradients_of_an_awkward_scene_are_finite_and_zero_where_culled(dtype):
+    inputs, leaves = scenes.leaves(scenes.random_scene(9, 120, 48, 40, dtype=dtype))
+    tau = scenes.random_thresholds(9, 120, dtype=dtype).requires_grad_()
+    drawn = ReferenceEngine().rasterize(inputs, tau)
+    (drawn.image.square().sum() + drawn.invdepth.sum() + drawn.fragments_per_pixel).backward()
+    culled = drawn.radii == 0
+    assert culled.any()
+    background = leaves.pop("background")
+    assert background.grad.isfinite().all()
+    for name, leaf in {**leaves, "tau": tau}.items():
+        assert leaf.grad.isfinite().all(), name
+        assert not leaf.grad[culled].any(), name
+        assert leaf.grad[~culled].any(), name
+
+
+def test_a_laptop_sized_scene_is_drawn_and_differentiated():
+    inputs, leaves = scenes.leaves(scenes.random_scene(1, 5000, 160, 90))
+    tau = scenes.random_thresholds(1, 5000).requires_grad_()
+    drawn = ReferenceEngine().rasterize(inputs.with_counts(), tau)
+    (drawn.image.mean() + 1e-4 * drawn.fragments_per_pixel).backward()
+    assert drawn.fragments.sum() == drawn.fragments_per_gaussian.sum()
+    assert drawn.fragments_per_pixel.item() == pytest.approx(
+        drawn.fragments.double().mean().item(), rel=1e-5
+    )
+    assert all(leaf.grad.isfinite().all() for leaf in (*leaves.values(), tau))

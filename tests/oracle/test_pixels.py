@@ -1,0 +1,135 @@
+"""Images: by hand, and against loops over Python floats."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from oracle import naive
+
+from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
+from fragprune_plugins.testing import scenes
+from reference_renderer import Options, render
+
+F64 = torch.float64
+
+
+def draw(inputs, thresholds=None):
+    return ReferenceEngine().rasterize(inputs.with_counts(), thresholds)
+
+
+def test_a_splat_at_a_pixel_centre_has_its_opacity_there():
+    scene = scenes.one_splat(opacity=0.8, background=(0.0, 1.0, 0.5), dtype=F64)
+    pixel = draw(scene).image[:, 8, 8]
+    assert pixel.tolist() == pytest.approx([0.8 * 0.9, 0.8 * 0.5 + 0.2, 0.8 * 0.1 + 0.1])
+
+
+@pytest.mark.parametrize(("dx", "dy"), [(1, 0), (0, -2), (3, 2), (-4, 1)])
+def test_alpha_falls_off_with_the_dilated_rotated_ellipse(dx, dy):
+    angle = 0.7
+    scene = scenes.one_splat(sigma=(2.0, 1.0), angle=angle, opacity=0.9, dtype=F64)
+    # The sum of a rotated diagonal matrix and 0.3 I is diagonal in the same axes.
+    along = dx * math.cos(angle) + dy * math.sin(angle)
+    across = -dx * math.sin(angle) + dy * math.cos(angle)
+    q = along**2 / 4.3 + across**2 / 1.3
+    alpha = draw(scene).alpha[0, 8 + dy, 8 + dx].item()
+    assert alpha == pytest.approx(0.9 * math.exp(-q / 2), rel=1e-6)
+
+
+def test_the_nearer_splat_is_blended_first_whatever_the_storage_order():
+    scene = scenes.two_overlapping(opacities=(0.6, 0.7), dtype=F64)
+    alone = [
+        draw(replace(scene, splats=gaussian)).alpha[0, 9, 11].item()
+        for gaussian in (row(scene.splats, 0), row(scene.splats, 1))
+    ]
+    back, front = alone
+    drawn = draw(scene)
+    expected = [front, (1 - front) * back, (1 - front) * (1 - back)]
+    assert drawn.image[:, 9, 11].tolist() == pytest.approx(expected)
+    assert drawn.alpha[0, 9, 11].item() == pytest.approx(1 - expected[2])
+    assert drawn.invdepth[0, 9, 11].item() == pytest.approx(front / 2 + (1 - front) * back / 3)
+
+
+def test_equal_depths_are_blended_in_index_order():
+    one = scenes.one_splat(opacity=0.5, color=(1.0, 0.0, 0.0), dtype=F64)
+    other = scenes.one_splat(opacity=0.5, color=(0.0, 1.0, 0.0), dtype=F64)
+    red_first = replace(one, splats=scenes.concatenate(one.splats, other.splats))
+    green_first = replace(one, splats=scenes.concatenate(other.splats, one.splats))
+    assert draw(red_first).image[:, 8, 8].tolist() == pytest.approx([0.5, 0.25, 0.0])
+    assert draw(green_first).image[:, 8, 8].tolist() == pytest.approx([0.25, 0.5, 0.0])
+
+
+CASES = {
+    "plain": {},
+    "sh degree 0": {"sh_degree": 0},
+    "sh degree 3": {"sh_degree": 3},
+    "colours": {"colors": True},
+    "covariances": {"cov3d": True},
+    "antialiased": {"antialiasing": True},
+    "scaled": {"scale_modifier": 1.7},
+}
+
+
+@pytest.mark.parametrize("truncated", [False, True], ids=["whole", "truncated"])
+@pytest.mark.parametrize("name", CASES)
+def test_every_output_equals_that_of_loops_over_floats(name, truncated):
+    scene = scenes.random_scene(3, 40, 34, 20, dtype=F64, **CASES[name])
+    tau = scenes.random_thresholds(4, 40, dtype=F64) if truncated else None
+    drawn = draw(scene, tau)
+    splats = naive.splats_of(scene, tau)
+    per_row = [0] * 40
+    for y in range(20):
+        for x in range(34):
+            records, light = naive.records_at(splats, x, y)
+            for record in records:
+                per_row[record.row] += record.drawn
+            sums = [naive.sum_at(records, lambda r, c=c: r.color[c]) for c in range(3)]
+            background = scene.view.background.tolist()
+            expected = [s + light * b for s, b in zip(sums, background, strict=True)]
+            assert drawn.image[:, y, x].tolist() == pytest.approx(expected, rel=1e-9, abs=1e-12)
+            assert drawn.alpha[0, y, x].item() == pytest.approx(1 - light, abs=1e-12)
+            invdepth = naive.sum_at(records, lambda r: 1 / r.depth)
+            assert drawn.invdepth[0, y, x].item() == pytest.approx(invdepth, abs=1e-12)
+            assert drawn.fragments[y, x].item() == sum(r.drawn for r in records)
+    assert drawn.fragments_per_gaussian.tolist() == per_row
+    assert drawn.fragments_per_pixel.item() == pytest.approx(sum(per_row) / (34 * 20))
+    radii = {s.row: s.radius for s in splats}
+    assert drawn.radii.tolist() == [radii.get(i, 0) for i in range(40)]
+
+
+def test_evaluated_counts_every_splat_at_every_pixel_of_its_tiles():
+    scene = scenes.random_scene(5, 30, 34, 20, dtype=F64)
+    pairs = 0
+    for s in naive.splats_of(scene):
+        columns = min(34, 16 * s.rect[2]) - 16 * s.rect[0]
+        rows = min(20, 16 * s.rect[3]) - 16 * s.rect[1]
+        pairs += columns * rows
+    assert draw(scene).evaluated_per_pixel * 34 * 20 == pytest.approx(pairs)
+
+
+def test_single_precision_differs_only_by_rounding_and_the_odd_flip():
+    tau = scenes.random_thresholds(1, 200)
+    single = draw(scenes.random_scene(6, 200, 48, 40), tau).image.double()
+    double = draw(scenes.random_scene(6, 200, 48, 40, dtype=F64), tau.double()).image
+    off = (single - double).abs().amax(0)
+    assert (off > 2e-5).sum() <= 4
+    assert off.max() < 0.05
+
+
+def test_without_tiles_and_cuts_the_image_is_the_plain_sum_over_all_splats():
+    scene = scenes.stack([0.5, 0.4, 0.3], dtype=F64)
+    options = Options(alpha_min=0, transmittance_min=0, tiles=False)
+    drawn = render(camera_of(scene), gaussians_of(scene), options=options)
+    assert drawn.fragments.tolist() == [[3] * 17] * 17
+    assert drawn.alpha[0, 8, 8].item() == pytest.approx(1 - 0.5 * 0.6 * 0.7)
+
+
+def row(splats, i):
+    rows = {
+        name: tensor[i : i + 1]
+        for name in ("means", "opacities", "scales", "rotations", "colors")
+        if (tensor := getattr(splats, name)) is not None
+    }
+    return replace(splats, **rows)

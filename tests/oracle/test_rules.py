@@ -1,0 +1,245 @@
+"""The host's rules, one by one: what is culled, where a splat may draw, when a pixel stops."""
+
+from __future__ import annotations
+
+import ast
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import reference_renderer
+from fragprune_plugins import constants
+from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
+from fragprune_plugins.testing import scenes
+from reference_renderer import Options, covariance, project, scene
+
+F64 = torch.float64
+
+
+def draw(inputs, thresholds=None):
+    return ReferenceEngine().rasterize(inputs.with_counts(), thresholds)
+
+
+def loss(drawn):
+    return (
+        drawn.image.square().sum()
+        + drawn.invdepth.sum()
+        + drawn.alpha.sum()
+        + drawn.fragments_per_pixel
+    )
+
+
+def test_only_torch_and_the_standard_library_are_imported():
+    allowed = {"torch", "reference_renderer", *sys.stdlib_module_names}
+    for path in Path(reference_renderer.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) else []
+            assert {name.split(".")[0] for name in names} <= allowed, path
+
+
+def test_its_own_constants_are_those_of_the_core():
+    defaults = Options()
+    assert defaults.dilation == constants.DILATION
+    assert defaults.near == constants.NEAR
+    assert defaults.alpha_min == constants.ALPHA_MIN
+    assert defaults.alpha_max == constants.ALPHA_MAX
+    assert defaults.transmittance_min == constants.TRANSMITTANCE_MIN
+    assert scene.RIM_WIDTH == constants.RIM_WIDTH
+    assert scene.RIM_REACH == constants.RIM_REACH
+    assert scene.FALLOFF_MIN == constants.FALLOFF_MIN
+    assert covariance.FRUSTUM_MARGIN == constants.FRUSTUM_MARGIN
+    assert project.TILE == constants.TILE
+    assert project.ANTIALIASING_FLOOR == constants.ANTIALIASING_FLOOR
+    assert 1 / defaults.alpha_min == 255
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_splats_behind_the_near_plane_draw_nothing_and_get_zero_gradients(dtype):
+    inputs, leaves = scenes.leaves(scenes.behind_camera(dtype=dtype))
+    tau = torch.full((3,), 0.1, dtype=dtype, requires_grad=True)
+    drawn = draw(inputs, tau)
+    loss(drawn).backward()
+    assert drawn.radii.tolist() == [0, 0, 0]
+    assert torch.equal(drawn.image, inputs.view.background[:, None, None].expand(3, 17, 17))
+    for name, leaf in {**leaves, "tau": tau}.items():
+        assert name == "background" or not leaf.grad.any(), name
+
+
+@pytest.mark.parametrize("thresholds", [False, True])
+def test_no_gaussians_at_all_leave_the_background(thresholds):
+    inputs, leaves = scenes.leaves(scenes.empty())
+    tau = torch.zeros(0, requires_grad=True) if thresholds else None
+    drawn = draw(inputs, tau)
+    loss(drawn).backward()
+    assert torch.equal(drawn.image, inputs.view.background[:, None, None].expand(3, 18, 20))
+    assert drawn.radii.shape == drawn.fragments_per_gaussian.shape == (0,)
+    assert drawn.evaluated_per_pixel == 0
+    assert leaves["means"].grad.shape == (0, 3)
+    assert leaves["background"].grad.all()
+
+
+def test_a_singular_footprint_is_rejected_and_breaks_no_gradient():
+    flat = scenes.one_splat(sigma=(0.0, 0.0), dtype=F64)
+    flat = replace(
+        flat, dilation=0.0, splats=replace(flat.splats, scales=torch.zeros(1, 3).double())
+    )
+    inputs, leaves = scenes.leaves(replace(flat, antialiasing=True))
+    drawn = draw(inputs)
+    loss(drawn).backward()
+    assert drawn.radii.tolist() == [0]
+    assert drawn.alpha.max() == 0
+    assert all(leaf.grad.isfinite().all() for leaf in leaves.values())
+
+
+def test_radius_is_three_sigma_of_the_dilated_longer_axis_rounded_up():
+    drawn = draw(scenes.one_splat(sigma=(4.0, 1.0), width=40, height=40, dtype=F64))
+    assert drawn.radii.tolist() == [math.ceil(3 * math.sqrt(16.3))]
+
+
+def test_radius_of_a_round_splat_carries_the_hosts_floor_under_the_root():
+    drawn = draw(scenes.one_splat(sigma=(2.0, 2.0), dtype=F64))
+    assert drawn.radii.tolist() == [math.ceil(3 * math.sqrt(4.3 + math.sqrt(0.1)))]
+
+
+@pytest.mark.parametrize(
+    "x", [-40.0, -17.5, -7.0, -6.99, 0.0, 8.9, 9.0, 25.0, 39.0, 41.0, 46.9, 47, 60]
+)
+def test_tile_rectangle_is_the_hosts_integer_arithmetic(x):
+    inputs = scenes.one_splat((x, 8.0), sigma=(2.0, 2.0), width=40, height=20, dtype=F64)
+    camera = camera_of(inputs)
+    prints = project.project(camera, gaussians_of(inputs), None, Options())
+    # Exactly at x, so that the boundary cases are those meant.
+    prints = replace(prints, mean2d=torch.tensor([[x, 8.0]], dtype=F64))
+    radius = int(prints.radius.item())
+    x0 = min(3, max(0, int((x - radius) / 16)))
+    x1 = min(3, max(0, int((x + radius + 15) / 16)))
+    assert radius == 7
+    assert project.tile_rects(camera, prints).tolist() == [[x0, 0, x1, 1]]
+
+
+def columns_reached(x):
+    inputs = scenes.one_splat(
+        (x, 24.0), width=64, height=48, sigma=(5.0, 5.0), opacity=0.99, dtype=F64
+    )
+    drawn = draw(inputs)
+    assert drawn.radii.tolist() == [16]
+    return drawn.fragments.sum(0).nonzero()[:, 0].tolist()
+
+
+def test_a_splat_is_drawn_beyond_three_sigma_inside_its_tiles_and_nowhere_outside():
+    three_sigma, reach = 3 * math.sqrt(25.3), math.sqrt(25.3 * 2 * math.log(255 * 0.99))
+    assert three_sigma < 16 < reach < 17
+    # The square of radius 16 around 24 touches columns 0..47: alpha alone decides.
+    assert columns_reached(24.0) == list(range(24 - 16, 24 + 16 + 1))
+    # Around 16.9 it ends in column 31 though alpha reaches 33.
+    assert columns_reached(16.9) == list(range(1, 32))
+
+
+def test_an_offscreen_splat_has_radius_zero():
+    drawn = draw(scenes.one_splat((-30.0, 8.0), dtype=F64))
+    assert drawn.radii.tolist() == [0]
+    assert drawn.fragments.sum() == 0
+
+
+def test_alpha_is_capped_and_the_gradient_passes_through_the_cap():
+    scene = scenes.one_splat(opacity=0.999, color=(1.0, 0.5, 0.25), dtype=F64)
+    inputs, leaves = scenes.leaves(scene)
+    drawn = draw(inputs)
+    pixel = drawn.image[:, 8, 8]
+    assert pixel.tolist() == pytest.approx([0.99, 0.495, 0.2475], rel=1e-12)
+    pixel.sum().backward()
+    assert leaves["opacities"].grad.item() == pytest.approx(1.75)
+
+
+def test_a_pixel_stops_before_the_fragment_that_would_darken_it_too_much():
+    # 0.1^3 = 1e-3; times 0.05 is under 1e-4: the fourth is not blended, nor is the fifth, though
+    # alone the fifth would leave enough light.
+    inputs = scenes.stack([0.9, 0.9, 0.9, 0.95, 0.5], dtype=F64)
+    drawn = draw(inputs)
+    assert drawn.fragments[8, 8] == 3
+    assert drawn.alpha[0, 8, 8].item() == pytest.approx(1 - 1e-3)
+    first_three = replace(inputs, splats=gaussians_first(inputs.splats, 3))
+    assert torch.equal(draw(first_three).image[:, 8, 8], drawn.image[:, 8, 8])
+
+
+def test_a_stopped_fragment_gets_no_gradient():
+    inputs, leaves = scenes.leaves(scenes.stack([0.9, 0.9, 0.9, 0.95, 0.5], dtype=F64))
+    tau = torch.full((5,), 0.05, dtype=F64, requires_grad=True)
+    drawn = draw(inputs, tau)
+    (drawn.image[:, 8, 8].sum() + drawn.invdepth[0, 8, 8]).backward()
+    for name in ("means", "opacities", "scales", "rotations", "colors"):
+        assert not leaves[name].grad[3:].any(), name
+    assert not tau.grad[3:].any()
+    assert leaves["opacities"].grad[:3].all()
+
+
+def test_cutting_an_earlier_fragment_lets_the_pixel_go_deeper():
+    inputs = scenes.stack([0.9, 0.9, 0.9, 0.95, 0.5], dtype=F64)
+    x = 11  # q = 9 / 4.3 from the mean: the falloff is 0.35
+    open_, cut = torch.full((5,), 1e-9).double(), torch.tensor([0.5, 0.5, 0.5, 1e-9, 1e-9]).double()
+    assert draw(inputs, open_).fragments[8, x] == 5
+    assert draw(inputs, cut).fragments[8, x] == 2
+    at_mean = torch.ones(5).double().mul(1e-9)
+    at_mean[0] = 1.5  # larger than any falloff: nothing of the first is drawn
+    assert draw(inputs, open_).fragments[8, 8] == 3
+    assert draw(inputs, at_mean).fragments[8, 8] == 4
+    assert draw(inputs, at_mean).fragments_per_gaussian[0] == 0
+
+
+def test_scale_modifier_scales_scales_and_leaves_given_covariances():
+    base = scenes.one_splat(dtype=F64)
+    double = replace(base, scale_modifier=2.0)
+    scaled = replace(base, splats=replace(base.splats, scales=base.splats.scales * 2))
+    assert torch.allclose(draw(double).image, draw(scaled).image, atol=1e-14)
+    given = replace(double, splats=scenes.with_cov3d(base.splats))
+    assert torch.allclose(draw(given).image, draw(base).image, atol=1e-14)
+
+
+def test_antialiasing_dims_by_the_root_of_the_determinants_ratio():
+    base = scenes.one_splat(sigma=(0.5, 1.0), opacity=0.8, dtype=F64)
+    sharp = replace(base, antialiasing=True)
+    factor = math.sqrt(0.25 * 1.0 / (0.55 * 1.3))
+    assert draw(sharp).alpha[0, 8, 8].item() == pytest.approx(0.8 * factor, rel=1e-5)
+    assert torch.equal(draw(sharp).radii, draw(base).radii)
+    thin = replace(sharp, splats=replace(sharp.splats, scales=torch.full((1, 3), 1e-9).double()))
+    assert draw(thin).alpha[0, 8, 8].item() == pytest.approx(0.8 * math.sqrt(2.5e-5), abs=1e-3)
+
+
+def test_quaternions_are_used_as_given():
+    base = scenes.random_scene(1, 8, dtype=F64)
+    longer = replace(base, splats=replace(base.splats, rotations=base.splats.rotations * 1.2))
+    assert not torch.allclose(draw(base).image, draw(longer).image)
+
+
+def test_a_clamped_jacobian_coordinate_is_a_constant():
+    x = torch.tensor([0.5, 3.0, -3.0], dtype=F64, requires_grad=True)
+    z = torch.tensor([1.0, 2.0, 1.0], dtype=F64, requires_grad=True)
+    clamped = covariance.clamp_to_frustum(x, z, 1.0)
+    assert clamped.tolist() == pytest.approx([0.5, 2.6, -1.3])
+    clamped.sum().backward()
+    assert x.grad.tolist() == [1, 0, 0]
+    assert z.grad is None or not z.grad.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_outputs_have_the_inputs_dtype_and_the_contracts_shapes(dtype):
+    inputs = scenes.random_scene(2, 20, 33, 18, dtype=dtype)
+    drawn = draw(inputs, scenes.random_thresholds(2, 20, dtype=dtype))
+    assert drawn.image.dtype == drawn.invdepth.dtype == drawn.alpha.dtype == dtype
+    assert drawn.fragments_per_pixel.dtype == dtype
+    assert drawn.image.shape == (3, 18, 33)
+    assert drawn.invdepth.shape == drawn.alpha.shape == (1, 18, 33)
+    assert drawn.fragments.shape == (18, 33)
+    integers = (drawn.radii, drawn.fragments, drawn.fragments_per_gaussian)
+    assert {t.dtype for t in integers} == {torch.int32}
+    assert ReferenceEngine().rasterize(inputs, None).fragments is None
+
+
+def gaussians_first(splats, n):
+    names = ("means", "opacities", "scales", "rotations", "colors")
+    return replace(splats, **{name: getattr(splats, name)[:n] for name in names})
