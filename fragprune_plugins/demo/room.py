@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fragprune_plugins.demo.textures import (
+    Texture,
     checker,
     colour,
     linear,
@@ -47,7 +48,7 @@ def _paint(red: float, green: float, blue: float, **more: float) -> Material:
     return Material(colour(red, green, blue), **more)
 
 
-def _shell(wood: np.ndarray, brick: np.ndarray, rng: np.random.Generator) -> list[Shape]:
+def _shell(wood: Texture, brick: Texture, rng: np.random.Generator) -> list[Shape]:
     """Floor, two walls, skirting, rug, two framed pictures."""
     white = _paint(0.93, 0.91, 0.87)
     plaster = noise(_TEXELS, rng, 0.22) * colour(0.45, 0.66, 0.68)
@@ -77,7 +78,7 @@ def _shell(wood: np.ndarray, brick: np.ndarray, rng: np.random.Generator) -> lis
     ]
 
 
-def _table(wood: np.ndarray, rng: np.random.Generator) -> list[Shape]:
+def _table(wood: Texture, rng: np.random.Generator) -> list[Shape]:
     """A table on four thin legs; books, a stone, a glossy ball, a box with a photograph."""
     top, board = 0.66, Material(wood * np.float32(0.55), repeat=0.8)
     steel = _paint(0.16, 0.17, 0.19)
@@ -107,7 +108,7 @@ def _table(wood: np.ndarray, rng: np.random.Generator) -> list[Shape]:
     ]
 
 
-def _floor_things(wood: np.ndarray, brick: np.ndarray, rng: np.random.Generator) -> list[Shape]:
+def _floor_things(wood: Texture, brick: Texture, rng: np.random.Generator) -> list[Shape]:
     """A clipped tree in a brick planter, crates, a chequered ball."""
     leaves = photograph("grass.png", 128, rng) * linear(np.array([0.75, 1.0, 0.5], np.float32)) * 2
     clay = brick * np.float32(1.5) * linear(np.array([0.95, 0.62, 0.5], dtype=np.float32))

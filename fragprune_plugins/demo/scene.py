@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fragprune_plugins.demo.room import CENTRE, furnish
 from fragprune_plugins.demo.textures import displayed
-from fragprune_plugins.demo.tracer import FAR, Array, World
+from fragprune_plugins.demo.tracer import FAR, Array, World, times
 from fragprune_plugins.files import replacing, writable_folder
 
 
@@ -54,7 +54,7 @@ class Photo:
         offset = (pixels - np.array([self.width / 2, self.height / 2])) / self.focal
         local = np.concatenate([offset, np.ones((len(pixels), 1))], axis=1)
         local /= np.linalg.norm(local, axis=1, keepdims=True)
-        return (self.rotation.T @ local.T).astype(np.float32)
+        return times(self.rotation.T.astype(np.float32), local.T.astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -81,15 +81,15 @@ class SceneSettings:
 def photos(settings: SceneSettings) -> list[Photo]:
     """Cameras on a quarter of a sphere around the still life, evenly spread in every order.
 
-    A low-discrepancy sequence, so that any eight in a row, hence the held-out ones, cover it all.
+    An additive low-discrepancy sequence whose every eighth element is one as well, so that the
+    held-out views cover the arc too.
     """
-    golden = 1.32471795724474602596  # of the plane: Roberts' R2 sequence
     rng = np.random.default_rng([settings.seed, 1])
     focal = settings.width / 2 / math.tan(math.radians(29))
     cameras = []
     for index in range(settings.views):
-        azimuth = math.radians(2 + 86 * ((0.5 + index / golden) % 1))
-        elevation = math.radians(9 + 40 * ((0.5 + index / golden**2) % 1))
+        azimuth = math.radians(2 + 86 * ((0.5 + index * math.sqrt(2)) % 1))
+        elevation = math.radians(9 + 40 * ((0.5 + index * math.sqrt(3)) % 1))
         radius = 3.4 + rng.uniform(-0.3, 0.3)
         target = np.array(CENTRE) + rng.uniform(-0.12, 0.12, 3)
         back = np.array(

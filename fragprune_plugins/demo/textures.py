@@ -42,7 +42,7 @@ def photograph(name: str, size: int, rng: np.random.Generator) -> Texture:
         left, top = (image.width - side) // 2, (image.height - side) // 2
         square = image.convert("RGB").crop((left, top, left + side, top + side))
         small = square.resize((size, size), Image.Resampling.LANCZOS)
-    return linear(np.asarray(small, dtype=np.float32) / 255)
+    return linear((np.asarray(small, dtype=np.float32) / 255).astype(np.float32))
 
 
 def noise(size: int, rng: np.random.Generator, contrast: float = 0.5) -> Texture:
@@ -71,21 +71,24 @@ def planks(size: int, rng: np.random.Generator, count: int = 6) -> Texture:
     joint = np.where((across < 0.03) | (across > 0.97), 0.35, 1.0)
     joint = np.where(np.abs((v + shift) % 1 - 0.5) < 0.004, 0.35, joint)
     tint = linear(np.array([0.76, 0.56, 0.37], dtype=np.float32))
-    return ((shade * grain * joint)[..., None] * tint).astype(np.float32)
+    boards: Texture = (shade * grain * joint).astype(np.float32)[..., None] * tint
+    return boards
 
 
 def stripes(size: int, colours: list[Texture], rng: np.random.Generator) -> Texture:
     """Equal woven stripes across the first axis."""
     index = np.arange(size) * len(colours) // size
     rows = np.stack([c[0, 0] for c in colours])[index]
-    return (rows[:, None, :] * noise(size, rng, 0.45)).astype(np.float32)
+    cloth: Texture = rows[:, None, :] * noise(size, rng, 0.45)
+    return cloth
 
 
 def checker(size: int, first: Texture, second: Texture, count: int = 2) -> Texture:
     """Squares, ``count`` a side (even, so that they continue when the texture wraps)."""
     cell = np.arange(size) * count // size
     odd = ((cell[:, None] + cell[None, :]) % 2).astype(bool)
-    return np.where(odd[..., None], first[0, 0], second[0, 0]).astype(np.float32)
+    squares: Texture = np.where(odd[..., None], first[0, 0], second[0, 0])
+    return squares
 
 
 def sample(texture: Texture, u: NDArray[np.float32], v: NDArray[np.float32]) -> Texture:

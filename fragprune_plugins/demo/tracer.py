@@ -19,6 +19,12 @@ FAR = np.float32(1e6)
 _SKIN = np.float32(1e-3)  # a shadow ray starts this far off the surface, world units
 
 
+def times(matrix: Array, rays: Array) -> Array:
+    """``matrix @ rays``, (m, 3) or (3,) by (3, n), without BLAS: its threads would fight ours."""
+    product: Array = np.einsum("...j,jn->...n", matrix, rays)
+    return product
+
+
 @dataclass(frozen=True)
 class Material:
     """What a surface looks like.
@@ -76,8 +82,7 @@ class Box:
         object.__setattr__(self, "_turn", turn)
 
     def _local(self, point: Array) -> Array:
-        local: Array = self._turn @ (point - np.array(self.centre, dtype=np.float32)[:, None])
-        return local
+        return times(self._turn, point - np.array(self.centre, dtype=np.float32)[:, None])
 
     def bound(self) -> tuple[Array, float]:
         """The ball through the corners."""
@@ -86,7 +91,7 @@ class Box:
     def distance(self, origin: Array, direction: Array) -> Array:
         """Slab test."""
         start, half = self._local(origin), np.array(self.half, dtype=np.float32)[:, None]
-        ray = self._turn @ direction
+        ray = times(self._turn, direction)
         inverse = 1 / np.where(np.abs(ray) < 1e-9, np.float32(1e-9), ray)
         middle, reach = -start * inverse, half * np.abs(inverse)
         enter, leave = (middle - reach).max(axis=0), (middle + reach).min(axis=0)
@@ -109,7 +114,7 @@ class Box:
         else:
             u = 0.5 + 0.5 * u / half[across, 0]
             v = 0.5 + 0.5 * v / half[up, 0]
-        return self._turn.T @ normal, u.astype(np.float32), v.astype(np.float32)
+        return times(self._turn.T, normal), u.astype(np.float32), v.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -172,7 +177,7 @@ class Pole:
     def bound(self) -> tuple[Array, float]:
         """The ball around the middle."""
         base, axis, length = self._axis()
-        return (base + axis * length / 2)[:, 0], float(length) / 2 + self.radius
+        return (base + axis * (length / 2))[:, 0], float(length) / 2 + self.radius
 
     def distance(self, origin: Array, direction: Array) -> Array:
         """The quadratic in the plane across the axis, then a test of the height."""
@@ -226,7 +231,7 @@ class World:
         for index, shape in enumerate(self.shapes):
             centre, radius = shape.bound()
             offset = centre - origin[:, 0]
-            beside = offset @ offset - (offset @ direction) ** 2  # squared distance of the ray
+            beside = offset @ offset - times(offset, direction) ** 2  # squared distance of the ray
             near = np.flatnonzero(beside < 1.001 * radius**2)
             t = shape.distance(origin, direction[:, near])
             closer = t < nearest[near]
@@ -252,10 +257,10 @@ class World:
             normal[:, mine], u, v = shape.surface(point[:, mine])
             albedo[:, mine] = sample(shape.material.texture, u, v).T
             mirror = ray[:, mine] - 2 * (ray[:, mine] * normal[:, mine]).sum(0) * normal[:, mine]
-            shine = np.maximum(self.sun @ mirror, 0) ** 12
+            shine = np.maximum(times(self.sun, mirror), 0) ** 12
             extra[:, mine] = shape.material.gloss * shine
             albedo[:, mine] *= 1 + shape.material.glow
-        facing = self.sun @ normal
+        facing = times(self.sun, normal)
         toward = np.flatnonzero(facing > 0)
         lit = np.zeros(point.shape[1], dtype=np.float32)
         lit[toward] = ~self.shadowed(point[:, toward] + _SKIN * normal[:, toward])
@@ -268,7 +273,7 @@ class World:
     def shadowed(self, point: Array) -> NDArray[np.bool_]:
         """Whether anything stands between the points (3, n) and the sun."""
         across = np.linalg.svd(self.sun[None])[2][1:]  # the plane that the sun sees, (2, 3)
-        flat = across @ point
+        flat = times(across, point)
         dark = np.zeros(point.shape[1], dtype=bool)
         for shape in self.shapes:
             centre, radius = shape.bound()

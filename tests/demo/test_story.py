@@ -1,0 +1,114 @@
+"""The whole demo, very small, in a process of its own as a user starts it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fragprune_plugins.demo.story import DemoSettings, host_command, quotable, run_demo
+from fragprune_plugins.errors import OutputError
+
+TINY = """
+import json, sys
+from pathlib import Path
+from fragprune_plugins.demo.scene import SceneSettings
+from fragprune_plugins.demo.story import DemoSettings, run_demo
+scene = SceneSettings(views=9, width=48, height=36, supersample=1, points=400)
+settings = DemoSettings(iterations=60, finetune=30, scene=scene)
+print(json.dumps(run_demo(Path(sys.argv[1]), settings)))
+"""
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo") / "out"
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+        "OMP_WAIT_POLICY": "PASSIVE",
+    }
+    result = subprocess.run(
+        [sys.executable, "-c", TINY, str(out)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return out, json.loads(result.stdout), result.stderr
+
+
+@pytest.mark.slow
+def test_report_has_the_names_of_every_report(demo):
+    out, report, _ = demo
+    for side in ("before", "after"):
+        assert {
+            "psnr",
+            "ssim",
+            "lpips",
+            "fragments_per_pixel",
+            "evaluated_per_pixel",
+            "gaussians",
+            "frame_ms",
+            "frame_ms_se",
+        } <= report[side].keys()
+    assert report["after"]["fragments_per_pixel"] < report["before"]["fragments_per_pixel"]
+    assert report["after"]["gaussians"] == report["before"]["gaussians"]
+    assert report["iterations"] == 30
+    assert report["adapter"] == "vanilla-3dgs"
+    assert report["device"] == "cpu"
+    saved = json.loads((out / "report.json").read_text())
+    assert saved == report
+
+
+@pytest.mark.slow
+def test_pictures_and_page_are_there(demo):
+    out, report, _ = demo
+    for file in report["files"]:
+        assert (out / file).stat().st_size > 0
+    page = (out / "index.html").read_text()
+    for file in report["files"]:
+        assert file in page or file == "index.html"
+    assert Path(report["model_after"]).exists()
+
+
+@pytest.mark.slow
+def test_progress_is_on_stderr_throughout(demo):
+    _, _, stderr = demo
+    assert "Photographs" in stderr
+    assert stderr.count("Training") >= 2
+
+
+def test_command_is_one_a_user_could_type():
+    command = host_command(Path("scene"), Path("model"), DemoSettings(iterations=500, seed=4))
+    assert Path(command[0]).name == "train.py"
+    assert command[command.index("--iterations") + 1] == "500"
+    assert command[command.index("--densify_until_iter") + 1] == "325"
+    assert command[command.index("--seed") + 1] == "4"
+    assert command[-1] == "--eval"
+
+
+def test_a_folder_with_something_else_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(OutputError, match=r"thesis\.tex"):
+        run_demo(tmp_path)
+    assert (tmp_path / "thesis.tex").exists()
+    assert not (tmp_path / "scene").exists()
+
+
+def test_quotable_is_one_line():
+    side = {"fragments_per_pixel": 20.0, "gaussians": 9000, "views": 7}
+    report = {
+        "before": side,
+        "after": side | {"fragments_per_pixel": 12.5},
+        "fragments_ratio": 1.6,
+        "frame_ratio": 1.3,
+        "psnr_change": 0.04,
+    }
+    line = quotable(report)
+    assert "\n" not in line
+    assert line.startswith("1.60x fewer fragments per pixel (20.0 to 12.5)")
+    assert "+0.04 dB" in line
