@@ -93,7 +93,7 @@ def save_learning(path: Path, curves: Sequence[dict[str, float]], thresholds: Te
     window = max(1, min(50, len(drawn) // 4))
     mean = np.convolve(drawn, np.ones(window) / window, mode="valid")
     fragments.plot(steps, drawn, color="tab:red", alpha=0.25, linewidth=0.8)
-    fragments.plot(steps[window - 1 :], mean, color="tab:red")
+    fragments.plot(steps[window // 2 :][: len(mean)], mean, color="tab:red")
     fragments.set(xlabel="step", ylabel="drawn fragments per pixel", ylim=(0, None))
     median.plot(steps, [row["threshold_median"] for row in curves], color="tab:green")
     median.set(xlabel="step", ylabel="median threshold (falloff)", ylim=(0, None))

@@ -150,7 +150,7 @@ def make_scene(
     settings: SceneSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Photo]:
-    """Write ``images/`` and ``sparse/0/`` in COLMAP's text form.
+    """Write ``images/`` and ``sparse/0/`` in COLMAP's text form, and its points as PLY too.
 
     Args:
         folder: where to; made if need be.
@@ -179,6 +179,7 @@ def make_scene(
     _write(sparse / "cameras.txt", _cameras_text(cameras[0]))
     _write(sparse / "images.txt", _images_text(cameras))
     _write(sparse / "points3D.txt", _points_text(points, colours))
+    _write_point_cloud(sparse / "points3D.ply", points, colours)
     return cameras
 
 
@@ -213,6 +214,20 @@ def _points_text(points: NDArray[np.float64], colours: NDArray[np.uint8]) -> str
         r, g, b = (int(c) for c in colour)
         lines.append(f"{number} {x} {y} {z} {r} {g} {b} 0.5")
     return "\n".join(lines) + "\n"
+
+
+def _write_point_cloud(path: Path, points: NDArray[np.float64], colours: NDArray[np.uint8]) -> None:
+    """The columns that hosts read: position, normal (zero), 8-bit colour."""
+    from plyfile import PlyData, PlyElement
+
+    kinds = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    rows = np.zeros(len(points), dtype=[*kinds, ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+    for index, name in enumerate(("x", "y", "z")):
+        rows[name] = points[:, index]
+    for index, name in enumerate(("red", "green", "blue")):
+        rows[name] = colours[:, index]
+    with replacing(path) as temporary:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -35,7 +35,7 @@ def test_same_seed_same_bytes_other_seed_other_room(folder, tmp_path):
     make_scene(tmp_path / "again", SMALL)
     make_scene(tmp_path / "other", replace(SMALL, seed=1))
     files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    assert len(files) == SMALL.views + 3
+    assert len(files) == SMALL.views + 4
     for file in files:
         assert (tmp_path / "again" / file).read_bytes() == (folder / file).read_bytes()
     other = (tmp_path / "other" / "images" / "view_000.png").read_bytes()

@@ -41,7 +41,6 @@ def demo(tmp_path_factory):
     return out, json.loads(result.stdout), result.stderr
 
 
-@pytest.mark.slow
 def test_report_has_the_names_of_every_report(demo):
     out, report, _ = demo
     for side in ("before", "after"):
@@ -64,7 +63,6 @@ def test_report_has_the_names_of_every_report(demo):
     assert saved == report
 
 
-@pytest.mark.slow
 def test_pictures_and_page_are_there(demo):
     out, report, _ = demo
     for file in report["files"]:
@@ -75,7 +73,6 @@ def test_pictures_and_page_are_there(demo):
     assert Path(report["model_after"]).exists()
 
 
-@pytest.mark.slow
 def test_progress_is_on_stderr_throughout(demo):
     _, _, stderr = demo
     assert "Photographs" in stderr
@@ -100,7 +97,8 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
 
 
 def test_quotable_is_one_line():
-    side = {"fragments_per_pixel": 20.0, "gaussians": 9000, "views": 7}
+    side = {"fragments_per_pixel": 20.0, "gaussians": 9000, "views": 7, "frame_ms": 3.0}
+    side["frame_ms_se"] = 0.1
     report = {
         "before": side,
         "after": side | {"fragments_per_pixel": 12.5},
@@ -112,3 +110,6 @@ def test_quotable_is_one_line():
     assert "\n" not in line
     assert line.startswith("1.60x fewer fragments per pixel (20.0 to 12.5)")
     assert "+0.04 dB" in line
+    assert "faster" not in line  # no claim within the noise
+    report["after"]["frame_ms"] = 2.0
+    assert "1.30x faster frames" in quotable(report)
