@@ -16,6 +16,7 @@ from fragprune_plugins import constants
 from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
 from fragprune_plugins.testing import scenes
 from reference_renderer import Options, covariance, project, scene
+from reference_renderer.fragment import fragments
 
 F64 = torch.float64
 
@@ -68,6 +69,15 @@ def test_splats_behind_the_near_plane_draw_nothing_and_get_zero_gradients(dtype)
     assert torch.equal(drawn.image, inputs.view.background[:, None, None].expand(3, 17, 17))
     for name, leaf in {**leaves, "tau": tau}.items():
         assert name == "background" or not leaf.grad.any(), name
+
+
+@pytest.mark.parametrize(("ulps", "radius"), [(0, 0), (1, 7)])
+def test_the_near_plane_itself_is_culled(ulps, radius):
+    scene = scenes.one_splat(depth=0.2)
+    z = torch.nextafter(torch.tensor(0.2), torch.tensor(1.0)) if ulps else torch.tensor(0.2)
+    means = torch.stack([scene.splats.means[0, 0], scene.splats.means[0, 1], z])[None]
+    scene = replace(scene, splats=replace(scene.splats, means=means))
+    assert draw(scene).radii.tolist() == [radius]
 
 
 @pytest.mark.parametrize("thresholds", [False, True])
@@ -165,6 +175,24 @@ def test_a_pixel_stops_before_the_fragment_that_would_darken_it_too_much():
     assert drawn.alpha[0, 8, 8].item() == pytest.approx(1 - 1e-3)
     first_three = replace(inputs, splats=gaussians_first(inputs.splats, 3))
     assert torch.equal(draw(first_three).image[:, 8, 8], drawn.image[:, 8, 8])
+
+
+def test_a_pixel_goes_on_while_enough_light_is_left():
+    drawn = draw(scenes.stack([0.9, 0.9, 0.9, 0.89], dtype=F64))
+    assert drawn.fragments[8, 8] == 4
+    assert drawn.alpha[0, 8, 8].item() == pytest.approx(1 - 1.1e-4)
+
+
+def test_a_negative_squared_distance_is_skipped_and_overflows_nothing():
+    inputs = scenes.one_splat(dtype=F64)
+    prints = project.project(camera_of(inputs), gaussians_of(inputs), None, Options())
+    conic = torch.tensor([[-9.0, 0.0, -9.0]], dtype=F64, requires_grad=True)
+    pixels = torch.tensor([[8.0, 9.0], [20.0, 30.0]], dtype=F64)
+    found = fragments(replace(prints, conic=conic), pixels, torch.tensor([0.1]).double(), Options())
+    found.alpha.sum().backward()
+    assert not found.drawn.any()
+    assert not found.alpha.any()
+    assert not conic.grad.any()
 
 
 def test_a_stopped_fragment_gets_no_gradient():
