@@ -172,7 +172,7 @@ class _Rasterize(torch.autograd.Function):
         return outputs
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         tensors = ctx.saved_tensors
         image, invdepth, alpha, _, per_pixel = upstream
@@ -220,7 +220,7 @@ class CpuEngine:
         cameras = {k: getattr(view, k) for k in ("viewmatrix", "projmatrix", "campos")}
         arrays = {name: _plain(tensor) for name, tensor in {**read, **cameras}.items()}
         drawing = _Drawing(inputs, self._library, arrays)
-        image, invdepth, alpha, radii, per_pixel = _Rasterize.apply(
+        image, invdepth, alpha, radii, per_pixel = _Rasterize.apply(  # type: ignore[no-untyped-call]
             drawing, *(tensors[name] for name in _NAMES)
         )
         device = splats.means.device

@@ -123,7 +123,7 @@ def _path_of(build: str) -> str:
     return spec.origin
 
 
-def _open(build: str) -> Library:
+def open_build(build: str) -> Library:
     """Open one build and check that it speaks our version.
 
     Raises:
@@ -158,7 +158,7 @@ def _open(build: str) -> Library:
 def cpu_features() -> int:
     """Bits of fragprune_cpu_features of this machine; 0 when no build can tell."""
     try:
-        return int(_open("baseline").calls.fragprune_cpu_features())
+        return int(open_build("baseline").calls.fragprune_cpu_features())
     except Unavailable:
         return 0
 
@@ -170,7 +170,7 @@ def usable_builds() -> list[str]:
     for build, needs in BUILDS.items():
         if needs & ~features == 0:
             try:
-                _open(build)
+                open_build(build)
             except Unavailable:
                 continue
             found.append(build)
@@ -189,16 +189,16 @@ def choose() -> Library:
     if wanted and wanted not in BUILDS:
         names = ", ".join(["off", *BUILDS])
         raise Unavailable(f"{ENVIRONMENT}={wanted} is none of {names}")
-    baseline = _open("baseline")  # it alone may run anywhere, so it is the one to ask
+    baseline = open_build("baseline")  # it alone may run anywhere, so it is the one to ask
     features = int(baseline.calls.fragprune_cpu_features())
     if wanted:
         if BUILDS[wanted] & ~features:
             raise Unavailable(f"{ENVIRONMENT}={wanted}, which this processor lacks")
-        return _open(wanted)
+        return open_build(wanted)
     for build, needs in BUILDS.items():
         if needs & ~features == 0:
             try:
-                return _open(build)
+                return open_build(build)
             except Unavailable:
                 continue
     return baseline

@@ -1,0 +1,186 @@
+"""The cpu engine against the oracle in float64: images and every gradient.
+
+Both see the same numbers: scenes are float32 and cast to float64 for the oracle, so what differs is
+our arithmetic alone. A fragment whose q lies within that rounding of a cut may be drawn by one and
+not by the other, a pixel's stop likewise: pixels with unequal fragment counts are left out of the
+comparison and of the loss, and must be few. What is left differs by accumulated float32 rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.testing import scenes
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
+
+IMAGE_TOLERANCE = 2e-5
+"""About 2^-23 times the fragments of a pixel, twice over; 2e-6 is what most scenes show."""
+
+GRADIENT_TOLERANCE = 3e-4
+"""Of the largest entry: sums of a thousand terms of both signs, divided by 1 - alpha >= 0.01."""
+
+KINDS = {
+    "plain": {},
+    "sh 3, antialiasing": {"sh_degree": 3, "antialiasing": True},
+    "cov3d": {"cov3d": True},
+    "cov3d, antialiasing": {"cov3d": True, "antialiasing": True, "sh_degree": 0},
+    "colours, modifier": {"colors": True, "scale_modifier": 0.7},
+    "odd size, sh 2": {"width": 33, "height": 17, "sh_degree": 2},
+}
+
+
+def draw_pair(
+    engine: CpuEngine, inputs: RasterInputs, thresholds: torch.Tensor | None
+) -> tuple[RasterOutputs, RasterOutputs, torch.Tensor]:
+    """Both engines' outputs without gradients, and where their fragment counts agree, (H, W)."""
+    tau = None if thresholds is None else thresholds.double()
+    with torch.no_grad():
+        truth = ReferenceEngine().rasterize(scenes.cast(inputs, torch.float64).with_counts(), tau)
+        ours = engine.rasterize(inputs.with_counts(), thresholds)
+    return truth, ours, truth.fragments == ours.fragments
+
+
+def check_images(truth: RasterOutputs, ours: RasterOutputs, same: torch.Tensor) -> None:
+    assert (~same).sum() <= 1 + same.numel() // 500
+    for name in ("image", "invdepth", "alpha"):
+        expected = getattr(truth, name)
+        difference = (expected - getattr(ours, name))[:, same].abs()
+        scale = max(1.0, expected.abs().max().item())
+        assert difference.numel() == 0 or difference.max() < IMAGE_TOLERANCE * scale, name
+    assert ours.fragments is not None
+    assert ours.fragments.sum() == ours.fragments_per_gaussian.sum()
+    mean = ours.fragments.double().mean()
+    assert ours.fragments_per_pixel.item() == pytest.approx(mean.item(), rel=1e-6)
+    assert ours.evaluated_per_pixel >= mean
+
+
+def gradients(
+    engine: CpuEngine | ReferenceEngine,
+    inputs: RasterInputs,
+    thresholds: torch.Tensor | None,
+    same: torch.Tensor,
+    pressure: float,
+) -> dict[str, torch.Tensor]:
+    """Of one loss that uses every output, by leaf name."""
+    made, leaves = scenes.leaves(inputs)
+    if thresholds is not None:
+        leaves["thresholds"] = thresholds = thresholds.detach().clone().requires_grad_()
+    out = engine.rasterize(made, thresholds)
+    generator = torch.Generator().manual_seed(7)
+    loss = out.image.new_zeros(())
+    for tensor in (out.image, out.invdepth, out.alpha):
+        weight = torch.randn(tensor.shape, generator=generator) * same
+        loss = loss + (tensor * weight.to(tensor.dtype)).sum()
+    if thresholds is not None:
+        loss = loss + pressure * out.fragments_per_pixel
+    loss.backward()
+    return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+def check_gradients(
+    engine: CpuEngine,
+    inputs: RasterInputs,
+    thresholds: torch.Tensor | None,
+    same: torch.Tensor,
+    tolerance: float = GRADIENT_TOLERANCE,
+) -> None:
+    wide = scenes.cast(inputs, torch.float64)
+    tau = None if thresholds is None else thresholds.double()
+    truth = gradients(ReferenceEngine(), wide, tau, same, 5.0)
+    ours = gradients(engine, inputs, thresholds, same, 5.0)
+    for name, expected in truth.items():
+        found = ours[name]
+        assert found.shape == expected.shape
+        assert found.isfinite().all(), name
+        if expected.numel():
+            scale = expected.abs().max().item() + 1e-3
+            assert (found - expected).abs().max().item() < tolerance * scale, name
+
+
+@pytest.mark.parametrize("thresholded", [False, True], ids=["untruncated", "truncated"])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_images_and_gradients_equal_the_oracle(
+    engine: CpuEngine, seed: int, kind: str, thresholded: bool
+) -> None:
+    inputs = scenes.random_scene(seed, **KINDS[kind])
+    thresholds = scenes.random_thresholds(seed, len(inputs.splats)) if thresholded else None
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    assert torch.equal(truth.radii, ours.radii)
+    check_images(truth, ours, same)
+    check_gradients(engine, inputs, thresholds, same)
+
+
+def test_tall_stacks_stop_where_the_oracle_does(engine: CpuEngine) -> None:
+    inputs = scenes.stack([0.3, 0.9, 0.999, 0.5] * 30)
+    thresholds = torch.linspace(0.01, 0.6, 120)
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    check_images(truth, ours, same)
+    check_gradients(engine, inputs, thresholds, same)
+
+
+@pytest.mark.parametrize("scene", [scenes.empty(), scenes.behind_camera()])
+def test_nothing_to_draw_leaves_the_background(engine: CpuEngine, scene: RasterInputs) -> None:
+    _, ours, same = draw_pair(engine, scene, None)
+    assert same.all()
+    assert torch.equal(ours.image, scene.view.background[:, None, None].expand_as(ours.image))
+    assert not ours.radii.any()
+    check_gradients(engine, scene, None, same)
+
+
+@st.composite
+def awkward_scenes(draw: st.DrawFn) -> tuple[RasterInputs, torch.Tensor | None]:
+    """Tiny odd images; needles, sheets, points, giants and sub-pixel splats; many off the image."""
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**20)))
+    n = draw(st.sampled_from([0, 1, 2, 5, 9]))
+    view = scenes.random_view(generator, draw(st.integers(1, 37)), draw(st.integers(1, 35)))
+
+    def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64) * (high - low) + low
+
+    size = torch.tensor([view.width, view.height]).double()
+    pixels = uniform(-0.6, 1.6, n, 2) * size
+    depths = torch.where(torch.rand(n, generator=generator) < 0.15, -1.0, uniform(0.25, 6, n))
+    largest = draw(st.sampled_from([0.05, 1.0, 30.0, 3000.0]))  # pixels
+    scales = largest * torch.exp(uniform(-6.0, 0.0, n, 3)) * (depths.abs() / view.width)[:, None]
+    if draw(st.booleans()):
+        scales[:, draw(st.integers(0, 2))] = 0.0
+    splats = Splats(
+        means=scenes.unproject(view, pixels, depths),
+        opacities=uniform(0.001, 1.0, n),
+        scales=scales,
+        rotations=torch.randn(n, 4, generator=generator, dtype=torch.float64),
+        colors=uniform(0.0, 1.0, n, 3),
+    )
+    if n and draw(st.booleans()):
+        splats = replace(splats, rotations=torch.nn.functional.normalize(splats.rotations, dim=1))
+    if draw(st.booleans()):
+        splats = scenes.with_cov3d(splats)
+    thresholds = scenes.random_thresholds(n, n) if draw(st.booleans()) else None
+    inputs = RasterInputs(view, splats, antialiasing=draw(st.booleans()))
+    return scenes.cast(inputs, torch.float32), thresholds
+
+
+@settings(max_examples=60)
+@given(case=awkward_scenes())
+def test_awkward_scenes_equal_the_oracle(
+    engine: CpuEngine, case: tuple[RasterInputs, torch.Tensor | None]
+) -> None:
+    inputs, thresholds = case
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    away = (truth.radii - ours.radii).abs()
+    assert (away <= 1 + 1e-6 * truth.radii).all()
+    if away.any():
+        return  # 3 sigma within rounding of an integer: a whole tile more or less, rightly
+    check_images(truth, ours, same)
+    # A needle thousands of pixels long and one wide has a nearly singular covariance: the gradient
+    # of its rotation is a difference of large numbers, and float32 leaves two digits of it.
+    longest = max([0, *truth.radii.tolist()])
+    check_gradients(engine, inputs, thresholds, same, tolerance=2e-3 if longest < 500 else 3e-2)

@@ -1,0 +1,182 @@
+"""What the cpu engine promises to the bit: threads, runs, neutral thresholds, monotone cuts."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fragprune_plugins.constants import NEUTRAL_LOGIT
+from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.errors import InputError
+from fragprune_plugins.testing import scenes
+from fragprune_plugins.types import RasterInputs
+
+# Enough Gaussians and tiles for several pieces of work per thread, in sorting and binning too.
+LARGE = {"n": 20_000, "width": 150, "height": 100, "scale_modifier": 0.3}
+
+
+def everything(
+    engine: CpuEngine, inputs: RasterInputs, thresholds: torch.Tensor | None
+) -> dict[str, torch.Tensor]:
+    """All outputs and all gradients of one loss."""
+    made, leaves = scenes.leaves(inputs.with_counts())
+    if thresholds is not None:
+        leaves["thresholds"] = thresholds = thresholds.detach().clone().requires_grad_()
+    out = engine.rasterize(made, thresholds)
+    loss = out.image.square().sum() + out.invdepth.sum() + out.alpha.sum()
+    (loss + out.fragments_per_pixel).backward()
+    kept = {name: getattr(out, name).detach() for name in ("image", "invdepth", "alpha", "radii")}
+    kept |= {"fragments": out.fragments, "each": out.fragments_per_gaussian}
+    return kept | {f"grad {name}": leaf.grad for name, leaf in leaves.items()}
+
+
+def assert_identical(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> None:
+    for name, tensor in first.items():
+        assert torch.equal(tensor, second[name]), name
+
+
+def test_threads_and_runs_do_not_change_a_bit(engine: CpuEngine, single_thread: None) -> None:
+    inputs = scenes.random_scene(3, **LARGE)
+    thresholds = scenes.random_thresholds(3, LARGE["n"])
+    alone = everything(engine, inputs, thresholds)
+    assert_identical(alone, everything(engine, inputs, thresholds))
+    for threads in (2, 3, 7):
+        torch.set_num_threads(threads)
+        assert_identical(alone, everything(engine, inputs, thresholds))
+
+
+def test_two_python_threads_at_once(engine: CpuEngine) -> None:
+    cases = [scenes.random_scene(seed, 400, 60, 50) for seed in range(4)]
+    expected = [everything(engine, case, None) for case in cases]
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda case: everything(engine, case, None), cases * 5))
+    for i, result in enumerate(found):
+        assert_identical(expected[i % len(cases)], result)
+
+
+@pytest.mark.parametrize("antialiasing", [False, True])
+def test_neutral_thresholds_are_no_thresholds(engine: CpuEngine, antialiasing: bool) -> None:
+    inputs = scenes.random_scene(5, 200, 70, 50, sh_degree=3, antialiasing=antialiasing)
+    neutral = torch.sigmoid(torch.full((200,), NEUTRAL_LOGIT))
+    assert_identical(everything(engine, inputs, None), everything(engine, inputs, neutral))
+
+
+@given(seed=st.integers(0, 10_000), factor=st.floats(1.0, 3.0))
+def test_raising_a_threshold_never_adds_an_eligible_fragment(
+    engine: CpuEngine, seed: int, factor: float
+) -> None:
+    # Opacities too low for any pixel to stop, so that eligible fragments are the drawn ones.
+    inputs = scenes.random_scene(seed, 12, 21, 19)
+    faint = inputs.splats.opacities * 0.2
+    inputs = replace(inputs, splats=replace(inputs.splats, opacities=faint)).with_counts()
+    low = scenes.random_thresholds(seed, 12)
+    with torch.no_grad():
+        before = engine.rasterize(inputs, low)
+        after = engine.rasterize(inputs, (low * factor).clamp(max=0.99))
+    assert (after.fragments <= before.fragments).all()
+    assert (after.fragments_per_gaussian <= before.fragments_per_gaussian).all()
+    assert torch.equal(after.radii, before.radii)
+
+
+def test_truncated_fragments_pass_on_no_gradient_but_the_rim(engine: CpuEngine) -> None:
+    inputs, leaves = scenes.leaves(scenes.one_splat((8.3, 8.0), sigma=(3.0, 3.0)))
+    thresholds = torch.tensor([0.999], requires_grad=True)  # no pixel centre is that close
+    out = engine.rasterize(inputs.with_counts(), thresholds)
+    (out.image.sum() + out.fragments_per_pixel).backward()
+    assert out.fragments.sum() == 0
+    for name, leaf in leaves.items():
+        assert name == "background" or not leaf.grad.any(), name
+    assert thresholds.grad.item() != 0
+
+
+@pytest.mark.parametrize("field", ["means", "opacities", "scales", "rotations", "sh"])
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf"), 1e38])
+def test_a_broken_gaussian_takes_only_itself_along(
+    engine: CpuEngine, field: str, poison: float
+) -> None:
+    inputs = scenes.random_scene(1, 40)
+    values = getattr(inputs.splats, field).clone()
+    values[7] = poison
+    broken = replace(inputs, splats=replace(inputs.splats, **{field: values}))
+    absent = replace(
+        inputs, splats=replace(inputs.splats, opacities=inputs.splats.opacities.clone())
+    )
+    absent.splats.opacities[7] = 0.0
+    found = everything(engine, broken, scenes.random_thresholds(0, 40))
+    expected = everything(engine, absent, scenes.random_thresholds(0, 40))
+    assert torch.equal(found["image"], expected["image"])
+    others = torch.arange(40) != 7
+    for name, tensor in expected.items():
+        if name.startswith("grad") and len(tensor) == 40:
+            assert torch.equal(found[name][others], tensor[others]), name
+            assert not found[name][~others].any(), name
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 1), (16, 16), (15, 33)])
+def test_any_image_size(engine: CpuEngine, size: tuple[int, int]) -> None:
+    found = everything(engine, scenes.random_scene(2, 30, *size), None)
+    assert found["image"].shape == (3, size[1], size[0])
+    assert found["image"].isfinite().all()
+
+
+def test_gradients_come_in_the_dtype_and_only_where_they_are_wanted(engine: CpuEngine) -> None:
+    inputs = scenes.random_scene(0, dtype=torch.float64)
+    opacities = inputs.splats.opacities.requires_grad_()
+    out = engine.rasterize(inputs, None)
+    out.image.sum().backward()
+    assert opacities.grad.dtype == torch.float64
+    assert inputs.splats.means.grad is None
+
+
+def test_subsets_of_gradients_equal_the_whole(engine: CpuEngine) -> None:
+    inputs = scenes.random_scene(4, 120, 50, 40, sh_degree=2, antialiasing=True)
+    thresholds = scenes.random_thresholds(4, 120)
+    made, leaves = scenes.leaves(inputs)
+    tau = thresholds.clone().requires_grad_()
+    engine.rasterize(made, tau).image.square().sum().backward()
+    for name in ("opacities", "means", "sh", "scales"):
+        alone = getattr(inputs.splats, name).clone().requires_grad_()
+        case = replace(inputs, splats=replace(inputs.splats, **{name: alone}))
+        engine.rasterize(case, thresholds).image.square().sum().backward()
+        # Lists are tighter without a threshold's gradient; sums run over the same fragments.
+        torch.testing.assert_close(alone.grad, leaves[name].grad, rtol=1e-4, atol=1e-4)
+
+
+def test_backward_twice_and_graph_freed(engine: CpuEngine) -> None:
+    made, leaves = scenes.leaves(scenes.random_scene(0))
+    loss = engine.rasterize(made, None).image.sum()
+    loss.backward(retain_graph=True)
+    first = leaves["means"].grad.clone()
+    loss.backward()
+    assert torch.equal(leaves["means"].grad, 2 * first)
+    with pytest.raises(RuntimeError, match="second time"):
+        loss.backward()
+
+
+def test_double_backward_is_refused(engine: CpuEngine) -> None:
+    made, leaves = scenes.leaves(scenes.random_scene(0))
+    loss = engine.rasterize(made, None).image.square().sum()
+    (grad,) = torch.autograd.grad(loss, leaves["means"], create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        grad.sum().backward()
+
+
+def test_changes_in_place_are_noticed(engine: CpuEngine) -> None:
+    made, leaves = scenes.leaves(scenes.random_scene(0))
+    loss = engine.rasterize(made, None).image.sum()
+    with torch.no_grad():
+        leaves["opacities"].mul_(0.5)
+    with pytest.raises(RuntimeError, match="inplace"):
+        loss.backward()
+
+
+def test_wrong_thresholds_never_reach_the_library(engine: CpuEngine) -> None:
+    from fragprune_plugins.engines import rasterize
+
+    with pytest.raises(InputError, match="thresholds"):
+        rasterize(scenes.random_scene(0), torch.zeros(3), engine=engine)

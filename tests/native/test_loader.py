@@ -1,0 +1,168 @@
+"""Which build is opened, and what is said when none can be; header and Python agree."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fragprune_plugins.native
+from fragprune_plugins import constants
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.native import loader
+
+HEADER = (Path(fragprune_plugins.native.__file__).parent / "include/fragprune.h").read_text()
+needs_native = pytest.mark.skipif(not loader.usable_builds(), reason="no compiled rasterizer here")
+
+
+@pytest.fixture(autouse=True)
+def _decide_anew():
+    loader.forget()
+    yield
+    loader.forget()
+
+
+def test_header_and_python_hold_the_same_constants() -> None:
+    found = dict(re.findall(r"#define FRAGPRUNE_([A-Z_]+) ([-(0-9][^\n]*)", HEADER))
+    assert int(found.pop("API_VERSION")) == loader.API_VERSION
+    assert len(found) == 12
+    for name, value in found.items():
+        assert eval(value) == getattr(constants, name), name
+
+
+@pytest.mark.parametrize(
+    "mirror", [loader.Inputs, loader.Outputs, loader.OutputGrads, loader.InputGrads, loader.Error]
+)
+def test_header_and_python_hold_the_same_structs(mirror: type[ctypes.Structure]) -> None:
+    name = f"fragprune_{re.sub(r'(?<!^)(?=[A-Z])', '_', mirror.__name__).lower()}"
+    (body,) = re.findall(rf"typedef struct {name} {{(.*?)}} {name};", HEADER, re.DOTALL)
+    body = re.sub(r"/\*.*?\*/", "", body, flags=re.DOTALL)
+    declared = re.findall(r"(\w+(?: \w+)?) \*?(\w+)(?:\[\d+\])?;", body)
+    assert [field for _, field in declared] == [field[0] for field in mirror._fields_]
+
+
+def test_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(loader.ENVIRONMENT, "off")
+    assert not loader.available()
+    assert "switched off" in loader.describe()["reason"]
+    with pytest.raises(EngineError, match="switched off"):
+        create_engine("cpu")
+    assert create_engine("auto").name == "reference"
+
+
+def test_absent_is_remembered_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(loader.ENVIRONMENT, raising=False)
+    calls = []
+
+    def nothing(name: str) -> None:
+        calls.append(name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(importlib.util, "find_spec", nothing)
+        assert not loader.available()
+        assert "not installed" in loader.describe()["reason"]
+        assert not loader.available()
+    assert len(calls) == 1
+
+
+def test_a_broken_file_is_a_reason_not_a_crash(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken.so"
+    broken.write_bytes(b"not a library")
+    monkeypatch.setattr(loader, "_path_of", lambda build: str(broken))
+    assert "cannot be opened" in loader.describe()["reason"]
+
+
+def test_an_unknown_build_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(loader.ENVIRONMENT, "sse9")
+    assert "none of off, avx512, avx2, baseline" in loader.describe()["reason"]
+
+
+@needs_native
+@pytest.mark.parametrize("build", loader.usable_builds())
+def test_the_environment_chooses(monkeypatch: pytest.MonkeyPatch, build: str) -> None:
+    monkeypatch.setenv(loader.ENVIRONMENT, build)
+    described = loader.describe()
+    assert described["available"]
+    assert described["build"] == build
+    assert described["lanes"] == {"baseline": 4, "avx2": 8, "avx512": 16}[build]
+
+
+@needs_native
+def test_the_best_build_is_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(loader.ENVIRONMENT, raising=False)
+    assert loader.describe()["build"] == loader.usable_builds()[0]
+    assert create_engine("auto").name == "cpu"
+
+
+@needs_native
+def test_a_processor_without_avx_gets_the_baseline(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(loader.ENVIRONMENT, raising=False)
+    monkeypatch.setattr(loader, "BUILDS", {"avx512": 1 << 20, "avx2": 1 << 21, "baseline": 0})
+    assert loader.describe()["build"] == "baseline"
+
+
+@needs_native
+def test_bad_calls_get_a_status_and_a_message() -> None:
+    calls = loader.library().calls
+    error = loader.Error()
+    for inputs in (loader.Inputs(), loader.Inputs(width=3, height=3, count=-1)):
+        outputs = loader.Outputs()
+        status = calls.fragprune_forward(inputs, outputs, None, error)
+        assert status != loader.OK
+        assert error.message
+    stale = loader.Inputs()
+    stale.size = 8
+    assert calls.fragprune_forward(stale, loader.Outputs(), None, error) != loader.OK
+    assert b"version" in error.message
+    status = calls.fragprune_backward(None, loader.OutputGrads(), loader.InputGrads(), 1, error)
+    assert status != loader.OK
+    calls.fragprune_free(None)
+
+
+@needs_native
+def test_only_the_interface_is_exported() -> None:
+    listing = subprocess.run(
+        ["nm", "-D", "--defined-only", loader.library().path], capture_output=True, text=True
+    )
+    if listing.returncode:
+        pytest.skip("no nm")
+    ours = {line.split()[-1] for line in listing.stdout.splitlines() if " T " in line}
+    declared = set(re.findall(r"FRAGPRUNE_EXPORT \w+ (\w+)\(", HEADER))
+    assert {name for name in ours if not name.startswith("_")} == declared
+
+
+@needs_native
+def test_opening_the_library_does_not_need_torch() -> None:
+    code = (
+        "import sys; from fragprune_plugins.native import loader;"
+        "assert loader.available(); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@needs_native
+def test_memory_is_returned() -> None:
+    """A state that nobody freed would grow by 3 MB per turn here."""
+    import resource
+
+    from fragprune_plugins.engines.cpu import CpuEngine
+    from fragprune_plugins.testing import scenes
+
+    engine = CpuEngine()
+    made, _ = scenes.leaves(scenes.random_scene(0, 5000, 300, 200, scale_modifier=0.5))
+    grown = 0
+    for turn in range(40):
+        engine.rasterize(made, None).image.sum().backward()
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        if turn == 10:
+            grown = peak
+    unit = 1 if sys.platform == "darwin" else 1024
+    assert (peak - grown) * unit < 40e6
