@@ -1,0 +1,163 @@
+"""Invariant 3: every Gaussian keeps its own threshold, whatever the host does to its rows.
+
+The oracle is the host itself: each row's red coefficient is set to a number, and hosts copy colours
+from parents to children bit for bit. Thresholds start as a function of that number.
+"""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from miniature import joint
+
+from fragprune_plugins.errors import AlignmentError
+
+COUNT = 16
+
+
+def identity(model):
+    return model._features_dc.detach()[:, 0, 0].round().long()
+
+
+def label(host, model):
+    """Give row i the identity i, and a threshold and moments that only i has."""
+    numbers = torch.arange(len(model.get_xyz)).float()
+    with torch.no_grad():
+        model._features_dc[:, 0, 0] = numbers
+    store = host.store(model)
+    store.load_state_dict(
+        {
+            "logits": -3 + numbers / 8,
+            "exp_avg": numbers + 1,
+            "exp_avg_sq": numbers + 1,
+            "adam_step": 2.0,
+            "steps": 2,
+        }
+    )
+
+
+def expect_ancestors(host, model):
+    store, state = host.store(model), host.store(model).state_dict()
+    assert len(store) == len(model.get_xyz) == len(identity(model))
+    expected = -3 + identity(model).float() / 8
+    assert torch.equal(state["logits"], expected)
+    moments = state["exp_avg"]
+    old = moments != 0  # children start without moments, as the hosts' do
+    assert torch.equal(moments[old], identity(model).float()[old] + 1)
+    assert torch.equal(state["exp_avg_sq"], moments)
+
+
+def act(model, arguments, action, seed, share):
+    generator = torch.Generator().manual_seed(seed)
+    n = len(model.get_xyz)
+    chance = torch.rand(n, generator=generator)
+    if action == "prune":
+        gone = chance < share
+        model.prune_points(gone.numpy() if seed % 2 else gone)
+    elif action in ("clone", "split"):
+        grads = torch.rand(n, 1, generator=generator)
+        extent = {"clone": 1e6, "split": 1e-6}[action] if seed % 3 else 3.0
+        getattr(model, f"densify_and_{action}")(grads, 1 - share, extent)
+    elif action == "densify and prune":
+        model.xyz_gradient_accum = torch.rand(n, 1, generator=generator)
+        model.denom = (torch.rand(n, 1, generator=generator) < 0.8).float()
+        with torch.no_grad():
+            model._opacity[chance < share / 2] = -9.0
+        model.max_radii2D = 40 * torch.rand(n, generator=generator)
+        model.densify_and_prune(1 - share, 0.005, 3.0, 20 if seed % 2 else None)
+    elif action == "reset opacity":
+        model.reset_opacity()
+    elif action == "restore":
+        file = io.BytesIO()
+        torch.save((model.capture(), 7), file)
+        file.seek(0)
+        capture, _ = torch.load(file, weights_only=False)
+        model.restore(capture, arguments)
+
+
+actions = st.tuples(
+    st.sampled_from(["prune", "clone", "split", "densify and prune", "reset opacity", "restore"]),
+    st.integers(0, 99),
+    st.floats(0.05, 0.6),
+)
+
+
+@settings(max_examples=40)
+@given(st.lists(actions, min_size=1, max_size=7))
+def test_every_row_has_its_ancestors_threshold(sequence):
+    with joint() as host:
+        model, camera = host.model(COUNT), host.camera(16, 12)
+        host.step(model, camera, 1)  # so that the host's optimizer has moments to move
+        label(host, model)
+        for action, seed, share in sequence:
+            act(model, host.arguments, action, seed, share)
+            expect_ancestors(host, model)
+            if len(model.get_xyz) in (0, *range(400, 10_000)):
+                return
+        assert host.render(camera, model)["render"].isfinite().all()
+
+
+def test_a_split_in_three_is_followed():
+    with joint() as host:
+        model = host.model(COUNT)
+        label(host, model)
+        model.densify_and_split(torch.ones(COUNT, 1), 0.5, 1e-6, N=3)
+        expect_ancestors(host, model)
+        assert len(model.get_xyz) == 3 * COUNT
+
+
+def test_two_models_have_two_stores():
+    with joint() as host:
+        first, second = host.model(COUNT), host.model(7, seed=1)
+        label(host, first)
+        label(host, second)
+        first.prune_points(torch.arange(COUNT) < 3)
+        second.densify_and_clone(torch.ones(7, 1), 0.5, 1e9)
+        expect_ancestors(host, first)
+        expect_ancestors(host, second)
+        assert (len(host.store(first)), len(host.store(second))) == (COUNT - 3, 14)
+
+
+def test_rows_that_change_behind_the_store_are_refused_with_both_counts(tmp_path):
+    with joint() as host:
+        model, camera = host.model(COUNT), host.camera(16, 12)
+        host.step(model, camera, 1)
+        host.store(model).keep(torch.arange(COUNT) < 10)
+        for attempt in (
+            lambda: host.render(camera, model),
+            lambda: model.save_ply(str(tmp_path / "a.ply")),
+            model.capture,
+            lambda: model.prune_points(torch.arange(COUNT) < 4),
+        ):
+            with pytest.raises(AlignmentError) as caught:
+                attempt()
+            assert "16" in caught.value.found
+            assert "10" in caught.value.expected
+
+
+def test_children_that_are_not_copies_are_refused_before_the_host_appends(monkeypatch):
+    with joint() as host:
+        model = host.model(COUNT)
+        label(host, model)
+        postfix = type(model).densification_postfix
+
+        def shuffled(self, xyz, features_dc, *rest):
+            return postfix(self, xyz, features_dc.flip(0), *rest)
+
+        monkeypatch.setattr(type(model), "densification_postfix", shuffled)
+        with pytest.raises(AlignmentError, match="not copies of the selected parents"):
+            model.densify_and_clone(torch.ones(COUNT, 1), 0.5, 1e9)
+        expect_ancestors(host, model)
+        assert len(model.get_xyz) == COUNT
+
+
+def test_a_new_training_setup_starts_over():
+    with joint() as host:
+        model = host.model(COUNT)
+        label(host, model)
+        model.training_setup(host.arguments)
+        assert host.store(model).neutral

@@ -1,0 +1,96 @@
+"""Invariant 6: in stage 2 only what ``--train`` names and the thresholds move, to the bit."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from miniature import running, tensors
+
+from fragprune_plugins.schedule import Settings
+
+MOVES = {
+    "opacity": {"opacity"},
+    "appearance": {"opacity", "f_dc", "f_rest"},
+    "all": {"xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"},
+}
+
+
+@pytest.mark.parametrize("train", MOVES)
+def test_only_what_is_named_moves(train):
+    with running(Settings(iterations=9, train=train), from_step=2) as host:
+        model = host.model(20)
+        model.active_sh_degree = 1
+        camera = host.camera()
+        exposure = torch.nn.Parameter(torch.ones(3, 4))
+        model.exposure_optimizer = torch.optim.Adam([exposure], lr=0.1, weight_decay=0.1)
+        model.training_setup(host.arguments)
+        for iteration in (1, 2):
+            host.step(model, camera, iteration)
+        for group in model.optimizer.param_groups:
+            group["weight_decay"] = 0.01
+        before, colour = tensors(model), exposure.detach().clone()
+        for iteration in (3, 4, 5, 6):
+            model.update_learning_rate(iteration)
+            image = host.render(camera, model)["render"] * exposure[:, :1, None]
+            (image - camera.original_image).abs().mean().backward()
+            model.optimizer.step()
+            model.optimizer.zero_grad(set_to_none=True)
+            model.exposure_optimizer.step()
+            model.exposure_optimizer.zero_grad(set_to_none=True)
+        moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
+        assert moved == MOVES[train]
+        assert torch.equal(exposure.detach(), colour) == (train != "all")
+        assert host.store(model).steps == 4
+
+
+@pytest.mark.parametrize("train", MOVES)
+def test_no_row_and_no_band_is_added_removed_or_reset(train):
+    with running(Settings(iterations=9, train=train)) as host:
+        model, camera = host.model(20), host.camera()
+        for iteration in (1, 2):
+            host.step(model, camera, iteration)
+        before = tensors(model)
+        model.xyz_gradient_accum += 1.0
+        model.densify_and_prune(1e-9, 0.9, 1.0, 20)
+        model.reset_opacity()
+        model.oneupSHdegree()
+        assert model.active_sh_degree == 0
+        assert all(torch.equal(value, before[name]) for name, value in tensors(model).items())
+
+
+def test_before_stage_two_the_host_has_its_way():
+    with running(Settings(iterations=9), from_step=1) as host:
+        model, camera = host.model(20), host.camera()
+        host.step(model, camera, 1)
+        model.xyz_gradient_accum += 1.0
+        model.densify_and_prune(1e-9, 0.005, 1.0, None)
+        model.oneupSHdegree()
+        assert len(model.get_xyz) > 20
+        assert model.active_sh_degree == 1
+        rows = len(model.get_xyz)
+        host.step(model, camera, 2)
+        model.densify_and_prune(1e-9, 0.005, 1.0, None)
+        assert len(model.get_xyz) == rows
+
+
+def test_the_rates_of_stage_two_are_the_schedules():
+    settings = Settings(iterations=5, train="appearance", opacity_lr=0.02)
+    with running(settings) as host:
+        model, camera = host.model(20), host.camera()
+        rates = []
+        for iteration in range(1, 6):
+            host.step(model, camera, iteration)
+            rates.append({g["name"]: g["lr"] for g in model.optimizer.param_groups})
+    assert [r["opacity"] for r in rates] == pytest.approx([0.02 * 0.1 ** (i / 4) for i in range(5)])
+    assert [r["f_dc"] for r in rates] == pytest.approx([0.0025 * 0.1 ** (i / 4) for i in range(5)])
+
+
+def test_the_control_trains_the_same_without_thresholds():
+    with running(Settings(iterations=9, truncate=False)) as host:
+        model, camera = host.model(20), host.camera()
+        before = tensors(model)
+        for iteration in (1, 2, 3):
+            host.step(model, camera, iteration)
+        assert host.store(model).neutral
+        moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
+        assert moved == {"opacity"}

@@ -1,0 +1,123 @@
+"""Invariants 1 and 7: off is off, and what is unknown is refused whole."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+import pytest
+from miniature import HOST, imported, running
+
+from fragprune_plugins import session as sessions
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.errors import LateImportError, SeamError, SessionError
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.session import Session
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+STAND_INS = ("diff_gaussian_rasterization", "simple_knn", "simple_knn._C")
+
+
+def session(adapter=None, **options):
+    options = {"drop_in": True} | options
+    return Session(adapter or Vanilla3DGS(), HostRepo(HOST), load_plugins(), **options)
+
+
+def found(seam):
+    value = import_module(seam.module)
+    for name in seam.attribute.split("."):
+        value = vars(value)[name]
+    return value
+
+
+def test_every_object_of_the_host_is_its_own_again_after_the_session():
+    with running() as host:
+        seams = host.adapter.seams
+        ours = {seam: found(seam) for seam in seams}
+        assert host.deactivate() == []
+        for seam in seams:
+            if not seam.external:  # the rasterizer's stand-in left with the session
+                assert found(seam) is not ours[seam]
+                assert found(seam) is ours[seam].__wrapped__
+        assert not [name for name in STAND_INS if name in sys.modules]
+        assert host.deactivate() == []
+        model = import_module("scene.gaussian_model").GaussianModel(1)
+        model.oneupSHdegree()
+        assert model.active_sh_degree == 1
+    assert sessions.active_session() is None
+
+
+def test_a_second_session_is_refused_and_the_first_goes_on():
+    with running() as host:
+        with pytest.raises(SessionError, match="a session is active"):
+            session().activate()
+        assert sessions.active_session() is host.session
+        assert host.model() is not None
+    with session():
+        pass  # and after the first has gone there may be another
+
+
+def test_a_session_can_be_activated_again():
+    again = session()
+    for _ in range(2):
+        with again:
+            assert "simple_knn" in sys.modules
+        assert "simple_knn" not in sys.modules
+
+
+class Newer(Vanilla3DGS):
+    """Expects a parameter that the host does not have."""
+
+    seams = (
+        *Vanilla3DGS.seams,
+        Seam(Role.STEP, "utils.loss_utils", "l1_loss", ("kernel_size",)),
+    )
+
+
+def test_a_changed_host_that_is_imported_already_leaves_nothing_patched():
+    with imported(HOST):
+        loss = import_module("utils.loss_utils").l1_loss
+        with pytest.raises(SeamError, match="kernel_size"):
+            session(Newer()).activate()
+        assert import_module("utils.loss_utils").l1_loss is loss
+        assert not [name for name in STAND_INS if name in sys.modules]
+        assert sessions.active_session() is None
+        with session():  # nothing of the refused one is in the way
+            import_module("scene")
+
+
+def test_a_changed_host_cannot_be_imported_under_us():
+    with imported(HOST), session(Newer()):
+        with pytest.raises(SeamError, match="kernel_size"):
+            import_module("utils.loss_utils")
+        assert "utils.loss_utils" not in sys.modules
+
+
+def test_a_rasterizer_that_was_imported_before_us_is_refused():
+    with session():
+        kept = sys.modules["diff_gaussian_rasterization"]
+    sys.modules["diff_gaussian_rasterization"] = kept
+    try:
+        with pytest.raises(LateImportError, match="already imported"):
+            session().activate()
+        assert sys.modules["diff_gaussian_rasterization"] is kept
+        assert "simple_knn" not in sys.modules
+        assert sessions.active_session() is None
+    finally:
+        del sys.modules["diff_gaussian_rasterization"]
+
+
+def test_a_render_function_that_a_script_already_holds_is_refused():
+    with imported(HOST):
+        with session():
+            import_module("gaussian_renderer")
+        script = type(sys)("a_training_script")
+        script.render = import_module("gaussian_renderer").render
+        sys.modules["a_training_script"] = script
+        try:
+            with pytest.raises(LateImportError, match="a_training_script"):
+                session().activate()
+            assert import_module("gaussian_renderer").render is script.render
+        finally:
+            del sys.modules["a_training_script"]

@@ -1,0 +1,65 @@
+"""The fragment pressure that rides on the host's loss is the one written on paper."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from miniature import joint, running
+
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.schedule import Settings
+
+
+class Notes:
+    """Remembers what was rasterized."""
+
+    @hookimpl(tryfirst=True)
+    def fragprune_truncate(self, inputs, store):
+        self.inputs = inputs
+
+
+@pytest.mark.parametrize("pressure", [0.0, 1e-4, 0.02])
+def test_gradients_are_those_of_loss_plus_pressure_times_fragments(pressure):
+    notes = Notes()
+    with joint(Settings(iterations=9, pressure=pressure), plugins=[notes]) as host:
+        model, camera = host.model(40), host.camera()
+        model.update_learning_rate(1)
+        store = host.store(model)
+        with torch.no_grad():
+            store.logits.copy_(torch.linspace(-3, 0, 40))
+        image = host.render(camera, model)["render"]
+        loss = (image - camera.original_image).abs().mean() * 3
+        loss.backward()
+        leaves = [store.logits, *(g["params"][0] for g in model.optimizer.param_groups)]
+        ours = [leaf.grad.clone() for leaf in leaves]
+        # The same as a function of leaves, no term added on the way.
+        for leaf in leaves:
+            leaf.grad = None
+        image = host.render(camera, model)["render"]
+        outputs = host.engine(torch.device("cpu")).rasterize(notes.inputs, store.values)
+        loss = (outputs.image - camera.original_image).abs().mean() * 3
+        (loss + pressure * outputs.fragments_per_pixel).backward()
+        assert torch.equal(outputs.image, image)
+        for leaf, grad in zip(leaves, ours, strict=True):
+            torch.testing.assert_close(leaf.grad, grad, rtol=1e-5, atol=1e-9)
+
+
+def test_evaluation_renders_feel_no_pressure_and_count_for_nothing():
+    with joint(Settings(iterations=9, pressure=0.1)) as host:
+        model, camera, other = host.model(), host.camera(), host.camera(side=0.4)
+        host.step(model, camera, 1)
+        before = host.finish()
+        with torch.no_grad():
+            host.render(other, model)
+        assert host.finish() == before
+
+
+def test_more_pressure_means_fewer_fragments():
+    drawn = []
+    for pressure in (0.0, 0.01):
+        with running(Settings(iterations=30, pressure=pressure, threshold_lr=0.3)) as host:
+            model, camera = host.model(40), host.camera()
+            for iteration in range(1, 31):
+                host.step(model, camera, iteration)
+            drawn.append(host.finish().fragments_after)
+    assert drawn[1] < 0.8 * drawn[0]
