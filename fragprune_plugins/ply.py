@@ -3,7 +3,8 @@
 One ``vertex`` element of float32 columns, values before activation: x y z, nx ny nz (zeros),
 f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
 (logit), scale_0..2 (log), rot_0..3 (w x y z, any length). ``fragprune export`` adds one column,
-``trunc_threshold``: the threshold itself, in falloff, in (0, 1). Unknown columns are ignored.
+``trunc_threshold``: the threshold itself, in falloff, in (0, 1). Unknown columns are ignored,
+except Mip-Splatting's ``filter_3D``: ignoring that one would draw another picture.
 """
 
 from __future__ import annotations
@@ -110,6 +111,13 @@ def read_ply(path: Path) -> SplatFile:
             f"a PLY without {', '.join(missing)}",
             "the columns of a Gaussian splat",
             "A point cloud or mesh is not a trained splat. " + _REMEDY,
+        )
+    if "filter_3D" in names:
+        raise ModelFileError(
+            str(path),
+            "a Mip-Splatting model, whose 3D filter (filter_3D) changes shapes and opacities",
+            "a splat that is drawn as it is stored",
+            "Fuse the filter first (create_fused_ply.py there), or fine-tune with fragprune run.",
         )
     rest = sorted(
         (name for name in names if name.startswith("f_rest_") and name[7:].isdigit()),

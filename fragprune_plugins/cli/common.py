@@ -71,7 +71,7 @@ class Command(click.Command):
             codes: dict[type[FragpruneError], int] = {UsageError: 2, Interrupted: 130}
             ctx.exit(codes.get(type(error), 1))
         except KeyboardInterrupt:
-            click.echo("Interrupted; nothing was written.", err=True)
+            click.echo("Interrupted.", err=True)
             ctx.exit(130)
         click.echo(json.dumps(_strict(report.data)) if as_json else report.text)
         ctx.exit(report.exit_code)

@@ -122,6 +122,14 @@ def spoil(path: Path, how: str) -> None:
         without(path, "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_3")
     elif how == "odd sh":
         without(path, "f_rest_8")
+    elif how == "mip":
+        rows = PlyData.read(path)["vertex"].data
+        table = np.zeros(
+            len(rows), dtype=[*((n, "f4") for n in rows.dtype.names), ("filter_3D", "f4")]
+        )
+        for name in rows.dtype.names:
+            table[name] = rows[name]
+        PlyData([PlyElement.describe(table, "vertex")]).write(path)
     elif how == "faces only":
         faces = np.array([(1,)], dtype=[("a", "i4")])
         PlyData([PlyElement.describe(faces, "face")]).write(path)
@@ -143,6 +151,7 @@ MESSAGES = {
     "a picture": "not readable as PLY",
     "points": "without f_dc_0, f_dc_1, f_dc_2, opacity, rot_3",
     "odd sh": "8 f_rest columns",
+    "mip": "Mip-Splatting model",
     "faces only": "without a vertex element",
     "empty": "0 Gaussians",
     "nan": r"NaN or infinity in 2 of 8 rows \(scale_2\)",
