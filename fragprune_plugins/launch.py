@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 from fragprune_plugins.adapter import CommandLine, HostAdapter
 from fragprune_plugins.detect import HostRepo, choose
@@ -276,15 +276,18 @@ class _Runner:
         known = set(sys.modules)
         try:
             with session, _host_process(self.host.script, arguments, self.device):
-                runpy.run_path(str(self.host.script), run_name="__main__")
-        except KeyboardInterrupt as error:
-            saved = session.save_interrupted() if learn else None
-            raise Interrupted(
-                self.host.script.name,
-                "Ctrl-C" + (f"; thresholds so far are beside {saved}" if saved else ""),
-                "the run to end",
-                "Resume with fragprune run --stage finetune." if saved else "Start it again.",
-            ) from error
+                try:
+                    runpy.run_path(str(self.host.script), run_name="__main__")
+                except KeyboardInterrupt as error:  # here, where saving still writes the sidecar
+                    saved = session.save_interrupted() if learn else None
+                    raise Interrupted(
+                        self.host.script.name,
+                        "Ctrl-C" + (f"; thresholds so far are beside {saved}" if saved else ""),
+                        "the run to end",
+                        "Resume with fragprune run --stage finetune."
+                        if saved
+                        else "Start it again.",
+                    ) from error
         except SystemExit as error:
             if error.code not in (None, 0):
                 raise HostFailed(
@@ -296,9 +299,9 @@ class _Runner:
         finally:
             self.output = session.output or self.output
             _forget_modules(self.repo.root, known)
-        if learn:
-            self.learned = session.finish()
-            self.curves = session.curves
+            if learn:
+                self.learned = session.finish()
+                self.curves = session.curves
 
     def summary(self, seconds: float) -> RunSummary:
         """Everything the command line prints."""
@@ -352,9 +355,18 @@ def _split(command: list[str]) -> tuple[Path, list[str]]:
     return script, words[1:]
 
 
+class _Flags(argparse.ArgumentParser):
+    """Says what is wrong with a flag as we say everything."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(
+            "the host's command", message, "flags the host understands", "Correct the command."
+        )
+
+
 def _parse(script: Path, arguments: list[str], line: CommandLine) -> _Invocation:
     """Read the few flags we need; the host parses them all itself."""
-    parser = argparse.ArgumentParser(add_help=False)
+    parser = _Flags(add_help=False)
     parser.add_argument(line.iterations, dest="iterations", type=int)
     parser.add_argument(*line.output, dest="output")
     parser.add_argument(*line.source, dest="source")

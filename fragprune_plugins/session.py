@@ -469,10 +469,10 @@ class Session:
                 parameter.requires_grad_(group.get("name") in trained)
 
     def _report(self, state: _ModelState) -> None:
-        if state.stats is not None:
-            self.curves.append(asdict(state.stats))
-            self.hook.fragprune_step(stats=state.stats)
-            state.stats = None
+        stats, state.stats = state.stats, None  # first, so that an observer may raise
+        if stats is not None:
+            self.curves.append(asdict(stats))
+            self.hook.fragprune_step(stats=stats)
 
     def _on_view(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         arguments = signature(wrapped).bind(*args, **kwargs).arguments
