@@ -228,9 +228,10 @@ class GraphdecoAdapter(HostAdapter):
         return (*rest, spatial_lr_scale or model.spatial_lr_scale)
 
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
-        """The 12-tuple of ``capture`` with fresh optimizer moments."""
+        """The 12-tuple of ``capture``, fresh moments, and the thresholds of the PLY's sidecar."""
         import torch
 
+        from fragprune_plugins import sidecar
         from fragprune_plugins.files import replacing
         from fragprune_plugins.ply import read_ply
 
@@ -249,6 +250,9 @@ class GraphdecoAdapter(HostAdapter):
             lr=0.0,
             eps=1e-15,
         )
+        state: dict[str, Any] = optimizer.state_dict()
+        if sidecar.path_beside(ply).exists():
+            state["fragprune"] = sidecar.load(ply)[0].state_dict()
         capture = (
             m.sh_degree,
             parameters["xyz"],
@@ -260,7 +264,7 @@ class GraphdecoAdapter(HostAdapter):
             torch.zeros(rows),
             torch.zeros(rows, 1),
             torch.zeros(rows, 1),
-            optimizer.state_dict(),
+            state,
             0.0,
         )
         with replacing(target) as temporary:
