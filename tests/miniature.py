@@ -31,7 +31,14 @@ HOST = Path(demo.__file__).with_name("host")
 TINY = [
     *("-r", "1", "--sh_degree", "1", "--eval"),
     *("--densify_from_iter", "4", "--densification_interval", "5"),
-    *("--densify_grad_threshold", "0.0008", "--opacity_reset_interval", "3000"),
+    *(
+        "--densify_until_iter",
+        "18",
+        "--densify_grad_threshold",
+        "0.0008",
+        "--opacity_reset_interval",
+        "3000",
+    ),
     *("--test_iterations", "-1"),
 ]
 """Flags with which a run of a few dozen iterations densifies and prunes."""

@@ -1,0 +1,229 @@
+"""Whole runs of the demo's host through the launcher: neutral, interrupted, resumed, rendered."""
+
+from __future__ import annotations
+
+import random
+import runpy
+import signal
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from miniature import HOST, TINY, joint, running
+
+from fragprune_plugins import launch, sidecar
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.errors import Interrupted
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.launch import RunOptions, _forget_modules, _host_process, run
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.schedule import Schedule, Settings
+from fragprune_plugins.session import Session
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+
+def command(scene, out, iterations, *more):
+    arguments = ["-s", str(scene), "-m", str(out), "--iterations", str(iterations), *TINY]
+    return [str(HOST / "train.py"), *arguments, *map(str, more)]
+
+
+class Never(Schedule):
+    def at(self, step):
+        return replace(super().at(step), learn=False)
+
+
+def host_run(scene, out, wrapped):
+    """25 iterations with our drop-in; with the session around them or not."""
+    settings = Settings(iterations=25)
+    session = Session(
+        Vanilla3DGS(),
+        HostRepo(HOST),
+        load_plugins(),
+        settings,
+        schedule=Never(settings),
+        freeze=False,
+        drop_in=True,
+    )
+    script, *arguments = command(scene, out, 25, "--checkpoint_iterations", 25)
+    known = set(sys.modules)
+    with _host_process(HOST / "train.py", arguments, "cpu"):
+        try:
+            if wrapped:
+                session.activate()
+            else:
+                session._install_stand_ins()
+            runpy.run_path(script, run_name="__main__")
+        finally:
+            session.deactivate()
+            _forget_modules(HOST, known)
+    (capture, _) = torch.load(out / "chkpnt25.pth", weights_only=False)
+    ply = out / "point_cloud" / "iteration_25" / "point_cloud.ply"
+    streams = random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state()
+    return ply.read_bytes(), capture, streams, session
+
+
+def flat(value):
+    if isinstance(value, dict):
+        return [x for key in value for x in (key, *flat(value[key]))]
+    if isinstance(value, list | tuple):
+        return [x for item in value for x in flat(item)]
+    return [value]
+
+
+def test_a_neutral_run_is_the_hosts_own_to_the_bit(photographs, tmp_path):
+    alone = host_run(photographs, tmp_path / "alone", wrapped=False)
+    ours = host_run(photographs, tmp_path / "ours", wrapped=True)
+    assert ours[3]._last_state.steps == 25  # it did follow
+    assert len(read_ply(tmp_path / "ours/point_cloud/iteration_25/point_cloud.ply").xyz) != 150
+    assert ours[0] == alone[0]
+    for one, other in zip(flat(ours[1]), flat(alone[1]), strict=True):
+        assert torch.equal(one, other) if torch.is_tensor(one) else one == other
+    assert ours[2][:2] == alone[2][:2]
+    assert torch.equal(ours[2][2], alone[2][2])
+    assert not list(tmp_path.rglob("*.safetensors"))
+
+
+def test_freshly_opened_thresholds_change_no_pixel_and_no_gradient():
+    pictures, gradients = [], []
+    for opened in (False, True):
+        with joint(Settings(iterations=9, pressure=0.0)) as host:
+            model, camera = host.model(40), host.camera()
+            if opened:
+                host.store(model).open(model.get_opacity)
+            package = host.render(camera, model)
+            (package["render"] - camera.original_image).square().sum().backward()
+            pictures.append(package["render"].detach())
+            leaves = [g["params"][0] for g in model.optimizer.param_groups]
+            gradients.append([x.grad for x in [package["viewspace_points"], *leaves]])
+            assert host.store(model).neutral != opened
+    assert torch.equal(*pictures)
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
+
+
+class InterruptAt:
+    """Ctrl-C at the end of a learned step."""
+
+    def __init__(self, step):
+        self.step, self.finished = step, []
+
+    @hookimpl
+    def fragprune_step(self, stats):
+        if stats.step == self.step:
+            signal.raise_signal(signal.SIGINT)
+
+    @hookimpl
+    def fragprune_finished(self, summary):
+        self.finished.append(summary)
+
+
+def with_plugin(monkeypatch, plugin):
+    def load():
+        plugins = load_plugins()
+        plugins.manager.register(plugin, "test")
+        return plugins
+
+    monkeypatch.setattr(launch, "load_plugins", load)
+
+
+OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
+
+
+@pytest.fixture
+def trained(photographs, tmp_path):
+    """A finished stage 1 of ten iterations."""
+    out = tmp_path / "out"
+    run(command(photographs, out, 10), replace(OPTIONS, stage="off"))
+    return out
+
+
+def test_ctrl_c_in_stage_two_keeps_what_was_learned_and_the_run_can_be_resumed(
+    photographs, trained, monkeypatch
+):
+    finetune = replace(OPTIONS, stage="finetune")
+    plugin = InterruptAt(4)
+    with_plugin(monkeypatch, plugin)
+    with pytest.raises(Interrupted) as caught:
+        run(command(photographs, trained, 10), finetune)
+    (saved,) = trained.glob("point_cloud/*/*.safetensors")
+    model = saved.with_name("point_cloud.ply")
+    assert str(model) in caught.value.found
+    store, info = sidecar.load(model)
+    assert info.adapter == "vanilla-3dgs"
+    assert store.steps == 4
+    assert not store.neutral
+    assert "diff_gaussian_rasterization" not in sys.modules
+    assert [summary.steps for summary in plugin.finished] == [4]  # however it ended
+
+    monkeypatch.undo()
+    learned = store.values.detach()
+    summary = run(command(photographs, trained, 10), finetune)
+    resumed, _ = sidecar.load(summary.model_after)
+    assert resumed.steps == 4 + 7  # hosts take no step in their last iteration
+    assert (resumed.values.detach() - learned).abs().max() < 0.5
+
+
+def test_train_then_finetune_then_render(photographs, tmp_path):
+    out = tmp_path / "out"
+    summary = run(command(photographs, out, 12), OPTIONS)
+    assert (summary.iterations, summary.adapter, summary.stage) == (8, "vanilla-3dgs", "auto")
+    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
+    for name in ("xyz", "f_dc", "f_rest", "scaling", "rotation"):
+        assert torch.equal(getattr(before, name), getattr(after, name))
+    assert not torch.equal(before.opacity, after.opacity)
+    store, _ = sidecar.load(summary.model_after)
+    assert len(store) == summary.gaussians == len(after.xyz)
+    assert summary.fragments_after < summary.fragments_before
+    assert [c["step"] for c in summary.curves] == list(range(1, 9))
+    # the host's own render script, with and without what lies beside its model
+    renders = out / "test" / "ours_20" / "renders"
+    script = str(HOST / "render.py")
+    run(["python", script, "-m", str(out), "--skip_train"], OPTIONS)
+    truncated = [p.read_bytes() for p in sorted(renders.iterdir())]
+    sidecar.path_beside(summary.model_after).unlink()
+    run(["python", script, "-m", str(out), "--skip_train"], OPTIONS)
+    assert truncated != [p.read_bytes() for p in sorted(renders.iterdir())]
+
+
+def test_a_finished_ply_without_a_checkpoint_is_enough(photographs, trained):
+    before = {p for p in trained.rglob("*") if p.is_file()}
+    summary = run(command(photographs, trained, 10), replace(OPTIONS, stage="finetune"))
+    assert summary.iterations == 8
+    old, new = read_ply(summary.model_before), read_ply(summary.model_after)
+    assert torch.equal(old.xyz, new.xyz)
+    made = {p.name for p in trained.rglob("*") if p.is_file()} - {p.name for p in before}
+    assert made == {"point_cloud.fragprune.safetensors"}
+
+
+def test_joint_learning_through_densification_keeps_rows_together(photographs, tmp_path):
+    settings = Settings(iterations=8, threshold_lr=0.3)
+    options = RunOptions(stage="joint", from_iter=3, device="cpu", settings=settings)
+    summary = run(command(photographs, tmp_path / "out", 20), options)
+    store, _ = sidecar.load(summary.model_after)
+    rows = len(read_ply(summary.model_after).xyz)
+    assert rows != 150
+    assert len(store) == rows == summary.gaussians
+
+
+def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path):
+    """One run, its first ten iterations the host's own, densification included."""
+    options = RunOptions(stage="finetune", from_iter=12, device="cpu")
+    flags = ("--save_iterations", 14, "--checkpoint_iterations", 12)
+    out = tmp_path / "out"
+    summary = run(command(photographs, out, 20, *flags), options)
+    capture, _ = torch.load(out / "chkpnt12.pth", weights_only=False)
+    final = read_ply(summary.model_after)
+    assert torch.equal(capture[1].detach(), final.xyz)
+    assert torch.equal(capture[4].detach(), final.scaling)
+    assert len(final.xyz) != 150
+    assert summary.iterations == 8
+
+
+def test_two_sessions_never_share_a_store():
+    with running() as host:
+        first = host.store(host.model(5))
+    with running() as host:
+        assert host.store(host.model(5)) is not first

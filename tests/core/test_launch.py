@@ -1,0 +1,210 @@
+"""The launcher over skeleton hosts, whose training script is whatever a test wants."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from skeleton import skeleton
+
+from fragprune_plugins.errors import Interrupted, UnknownHostError, UsageError
+from fragprune_plugins.launch import HostFailed, RunOptions, _parse, _split, run
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+CPU = RunOptions(stage="off", device="cpu")
+
+
+@pytest.fixture
+def host(tmp_path):
+    """A host's folder, and a way to say what its train.py does."""
+    root = tmp_path / "host"
+    skeleton(root)
+
+    def write(code: str, name: str = "train.py") -> str:
+        (root / name).write_text(code)
+        return str(root / name)
+
+    return write
+
+
+def parsed(repo, *arguments):
+    line = Vanilla3DGS().command_line(repo)
+    return _parse(Path("train.py"), list(map(str, arguments)), line)
+
+
+@pytest.mark.parametrize("interpreter", [[], ["python"], ["python3.11"], ["/usr/bin/python3"]])
+def test_an_interpreter_in_front_may_be_left_out(host, interpreter):
+    script = host("")
+    assert _split([*interpreter, script, "-s", "x"]) == (Path(script), ["-s", "x"])
+
+
+@pytest.mark.parametrize(
+    "command", [[], ["python"], ["python", "-m", "train"], ["bash", "run.sh"], ["missing.py"]]
+)
+def test_a_command_without_a_script_is_a_usage_error(command):
+    with pytest.raises(UsageError):
+        _split(command)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["-m", "out", "-s", "data", "--iterations", "70", "--start_checkpoint", "c.pth"],
+        ["-mout", "-sdata", "--iterations=70", "--start_checkpoint=c.pth"],
+        ["--model_path", "out", "--source_path=data", "--iter", "70", "--start", "c.pth"],
+        ["--iter=9", "-m", "x", "-m", "out", "-s", "data", "--iter", "70", "--start=c.pth"],
+    ],
+    ids=["plain", "joined", "abbreviated", "given twice"],
+)
+@pytest.mark.parametrize("extra", [[], ["--eval", "-r", "2", "--test_iterations", "-1", "7"]])
+def test_the_few_flags_we_need_are_read_as_the_host_will(tmp_path, words, extra):
+    flags = parsed(skeleton(tmp_path), *words, *extra).flags
+    assert (flags.output, flags.source, flags.iterations) == ("out", "data", 70)
+    assert flags.resume == "c.pth"
+
+
+def test_added_flags_come_last_and_so_win(tmp_path):
+    host = parsed(skeleton(tmp_path), "--iterations", 5, "--checkpoint_iterations", 2, 3)
+    assert host.flags.save_checkpoints == [2, 3]
+    words = host.with_flags(iterations=9, save_checkpoints=[2, 3, 5])
+    assert words[-6:] == ["--iterations", "9", "--checkpoint_iterations", "2", "3", "5"]
+    assert host.arguments[-1] == "3"
+
+
+def test_a_flag_with_an_impossible_value_is_a_usage_error(tmp_path):
+    with pytest.raises(UsageError, match="iterations"):
+        parsed(skeleton(tmp_path), "--iterations", "many")
+
+
+NOTES = """
+import json, sys
+from pathlib import Path
+import neighbour
+Path(sys.argv[1]).write_text(json.dumps([sys.argv, sys.path[0], __name__, __file__]))
+sys.path.append("/left/behind")
+sys.argv.append("left behind")
+sys.stdout = None
+"""
+
+
+def test_the_script_sees_a_fresh_interpreter_and_leaves_ours_as_it_was(host, tmp_path):
+    script = host(NOTES)
+    host("", name="neighbour.py")
+    before = sys.argv[:], sys.path[:], sys.stdout, sys.stderr
+    summary = run(["python", script, str(tmp_path / "notes")], CPU)
+    assert (sys.argv, sys.path, sys.stdout, sys.stderr) == before
+    argv, first, name, file = json.loads((tmp_path / "notes").read_text())
+    assert (argv, first) == ([script, str(tmp_path / "notes")], str(Path(script).parent))
+    assert (name, file) == ("__main__", script)
+    assert "neighbour" not in sys.modules
+    assert (summary.stage, summary.iterations, summary.device) == ("off", 0, "cpu")
+
+
+def test_modules_of_an_environment_inside_the_host_are_not_forgotten(host, tmp_path):
+    script = host(
+        "import sys\n"
+        f"sys.path.insert(0, {str(tmp_path / 'host/venv/site-packages')!r})\n"
+        "import a_librarys_own_module"
+    )
+    library = tmp_path / "host" / "venv" / "site-packages"
+    library.mkdir(parents=True)
+    (library / "a_librarys_own_module.py").write_text("")
+    run([script], CPU)
+    assert sys.modules.pop("a_librarys_own_module")
+
+
+@pytest.mark.parametrize("end", ["sys.exit(3)", "sys.exit('no data')"])
+def test_a_hosts_own_failure_is_passed_on(host, end):
+    before = sys.argv[:], sys.stdout
+    with pytest.raises(HostFailed) as caught:
+        run([host(f"import sys; sys.stdout = None; {end}")], CPU)
+    assert end.split("(")[1].strip("')") in caught.value.found
+    assert (sys.argv, sys.stdout) == before
+
+
+@pytest.mark.parametrize("end", ["sys.exit()", "sys.exit(0)", ""])
+def test_a_host_that_ends_well_is_no_failure(host, end):
+    run([host(f"import sys; {end}")], CPU)
+
+
+def test_a_hosts_exception_is_its_own_and_nothing_stays_patched(host):
+    script = host("import diff_gaussian_rasterization, scene; raise KeyError('theirs')")
+    with pytest.raises(KeyError, match="theirs"):
+        run([script], CPU)
+    assert not {"scene", "diff_gaussian_rasterization"} & set(sys.modules)
+
+
+def test_ctrl_c_before_anything_was_learned_is_stated(host):
+    with pytest.raises(Interrupted) as caught:
+        run([host("raise KeyboardInterrupt")], CPU)
+    assert caught.value.found == "Ctrl-C"
+    assert caught.value.remedy == "Start it again."
+
+
+@pytest.mark.parametrize("arguments", [[], ["-m", "empty"]])
+def test_nothing_to_start_from_says_what_to_name(host, tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError) as caught:
+        run([host("raise SystemExit(9)"), *arguments], RunOptions(stage="finetune", device="cpu"))
+    assert "nothing to start from" in caught.value.found
+    assert "--start_checkpoint" in caught.value.expected
+
+
+def test_a_checkpoint_that_is_not_there_is_a_usage_error(host):
+    command = [host("raise SystemExit(9)"), "--start_checkpoint", "nowhere.pth"]
+    with pytest.raises(UsageError, match="no such file"):
+        run(command, RunOptions(stage="auto", device="cpu"))
+
+
+STAGES = """
+import argparse, torch
+from pathlib import Path
+parser = argparse.ArgumentParser()
+parser.add_argument("-m")
+parser.add_argument("--iterations", type=int, default=12_345)
+parser.add_argument("--checkpoint_iterations", type=int, nargs="+", default=[])
+parser.add_argument("--start_checkpoint")
+args = parser.parse_args()
+out = Path(args.m)
+out.mkdir(exist_ok=True)
+with (out / "log").open("a") as log:
+    print(args.iterations, args.checkpoint_iterations, args.start_checkpoint, file=log)
+if args.start_checkpoint:
+    assert torch.load(args.start_checkpoint)[1] == 12_345
+for iteration in args.checkpoint_iterations:
+    torch.save(((), iteration), out / f"chkpnt{iteration}.pth")
+"""
+
+
+def test_stage_one_is_asked_for_a_checkpoint_and_stage_two_resumes_it(host, tmp_path):
+    """The number of iterations is nowhere on the command line: it is read from the source."""
+    from fragprune_plugins.schedule import Settings
+
+    out = tmp_path / "out"
+    options = RunOptions(device="cpu", settings=Settings(iterations=100))
+    run([host(STAGES), "-m", str(out)], options)
+    checkpoint = out / "chkpnt12345.pth"
+    assert (out / "log").read_text().splitlines() == [
+        "12345 [12345] None",
+        f"12445 [] {checkpoint}",
+    ]
+    (out / "log").unlink()
+    run([host(STAGES), "-m", str(out), "--start_checkpoint", str(checkpoint)], options)
+    assert (out / "log").read_text().splitlines() == [f"12445 [] {checkpoint}"]
+
+
+def test_insisting_on_a_gpu_that_is_not_there_is_a_usage_error(host):
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    with pytest.raises(UsageError, match="no CUDA device"):
+        run([host("")], RunOptions(device="cuda"))
+
+
+def test_a_script_of_no_host_is_refused_before_it_runs(tmp_path):
+    (tmp_path / "train.py").write_text("raise SystemExit('it ran')")
+    with pytest.raises(UnknownHostError):
+        run([str(tmp_path / "train.py")], CPU)

@@ -1,0 +1,63 @@
+"""Hosts with nothing inside: signatures and the rasterizer call, written from their interfaces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fragprune_plugins.detect import HostRepo
+
+SETTINGS = [
+    *("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier"),
+    *("viewmatrix", "projmatrix", "sh_degree", "campos", "prefiltered", "debug"),
+]
+
+MODEL = {
+    "__init__": "sh_degree",
+    "capture": "",
+    "restore": "model_args, training_args",
+    "training_setup": "training_args",
+    "update_learning_rate": "iteration",
+    "save_ply": "path",
+    "load_ply": "path",
+    "reset_opacity": "",
+    "oneupSHdegree": "",
+    "_prune_optimizer": "mask",
+    "cat_tensors_to_optimizer": "tensors_dict",
+    "densify_and_clone": "grads, grad_threshold, scene_extent",
+    "densify_and_split": "grads, grad_threshold, scene_extent, N=2",
+    "densify_and_prune": "max_grad, min_opacity, extent, max_screen_size",
+}
+
+STATES = ("2023", "August 2024", "October 2024")
+
+
+def skeleton(root: Path, state: str = "2023", **methods: str | None) -> HostRepo:
+    """One public state of vanilla 3DGS; ``methods`` add to the model's, change or (None) drop."""
+    model = MODEL | {"load_ply": "path, use_train_test_exp=False"} if state != "2023" else MODEL
+    model = {name: args for name, args in (model | methods).items() if args is not None}
+    settings = SETTINGS + (["antialiasing"] if state != "2023" else [])
+    parameters = "viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0"
+    if state == "October 2024":
+        parameters += ", separate_sh=False"
+    outputs = "image, radii" if state == "2023" else "image, radii, depth"
+    files = {
+        "arguments/__init__.py": "class OptimizationParams:\n"
+        "    def __init__(self, parser):\n        self.iterations = 12_345\n",
+        "scene/__init__.py": "class Scene:\n    def __init__(self, args, gaussians): ...\n",
+        "scene/gaussian_model.py": "class GaussianModel:\n"
+        + "\n".join(
+            f"    def {name}({', '.join(filter(None, ['self', args]))}): ..."
+            for name, args in model.items()
+        ),
+        "gaussian_renderer/__init__.py": f"def render({parameters}, override_color=None):\n"
+        f"    s = GaussianRasterizationSettings({', '.join(f'{n}=0' for n in settings)})\n"
+        "    rasterizer = GaussianRasterizer(raster_settings=s)\n"
+        f"    {outputs} = rasterizer(means3D=1)\n",
+        "train.py": "from gaussian_renderer import render\n"
+        + ("SparseGaussianAdam\n" if state == "October 2024" else ""),
+    }
+    for name, text in files.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return HostRepo(root)
