@@ -6,6 +6,7 @@ import os
 import random
 import tempfile
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +29,7 @@ CALIBRATE_AT = 0.85
 """Share of the run after which a target is met by a uniform shift; then opacities alone adapt."""
 
 CALIBRATION_VIEWS = 24
+RECORDS = 100
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 # Learning rates at the start of stage 2; all decay with the opacity's. SH rates are the hosts';
@@ -38,12 +40,12 @@ _GEOMETRY = {"xyz": 1.6e-6, "scaling": 0.0005, "rotation": 0.0001}
 
 @dataclass(frozen=True)
 class Record:
-    """Averages over the steps since the last record, for curves.
+    """One point of the curves.
 
     Attributes:
-        step: last step of the span, counted from 1.
-        loss: photometric loss.
-        fragments_per_pixel: drawn, on the training views of the span.
+        step: counted from 1.
+        loss: photometric loss, mean over the last pass of the training views.
+        fragments_per_pixel: drawn, likewise.
         pressure: lambda at ``step``.
         thresholds: quantiles ``QUANTILES`` over all Gaussians at ``step``.
     """
@@ -210,7 +212,8 @@ class _Run:
         self.held = False
         self.records: list[Record] = []
         self._untruncated: dict[str, float] = {}
-        self._span: list[tuple[float, float]] = []
+        # Views differ more than steps do: averages are over one pass of them.
+        self._recent: deque[tuple[float, float]] = deque(maxlen=len(dataset.train))
 
         rates = {"opacity": settings.opacity_lr}
         if settings.train in ("appearance", "all"):
@@ -239,7 +242,7 @@ class _Run:
         from tqdm import tqdm
 
         total = self.settings.iterations
-        every = min(len(self.dataset.train), max(1, total // 20))  # one pass: views differ
+        every = max(1, total // RECORDS)
         with tqdm(total=total, disable=not progress, desc="fine-tuning", unit="it") as bar:
             for shot in self._order():
                 if self.calibration is not None and self.step >= self.calibration:
@@ -290,7 +293,7 @@ class _Run:
             self.store.step(plan.threshold_lr)
             self.pressure.observe(plan.progress, drawn / max(self._baseline(shot), 1e-9))
         self.step += 1
-        self._span.append((float(loss.detach()), drawn))
+        self._recent.append((float(loss.detach()), drawn))
 
     def _baseline(self, shot: Shot) -> float:
         """Fragments per pixel of the untruncated model as it came in, measured once a view."""
@@ -315,7 +318,7 @@ class _Run:
         self.held = True
 
     def _record(self) -> Record:
-        losses, fragments = zip(*self._span, strict=True)
+        losses, fragments = zip(*self._recent, strict=True)
         points = torch.tensor(QUANTILES)
         values = self.store.values.detach()
         step = max(1, len(values) // 100_000)  # torch.quantile refuses very long inputs
@@ -327,5 +330,4 @@ class _Run:
             thresholds=tuple(torch.quantile(values[::step], points).tolist()),
         )
         self.records.append(record)
-        self._span = []
         return record
