@@ -79,7 +79,8 @@ class RunSummary:
         train_seconds: wall time of both stages.
         target_reached: whether a target speed-up was met within 5% on training views; None
             without a target.
-        curves: a dict per learned step: step, fragments_per_pixel, pressure, threshold_median.
+        curves: a dict per learned step: step, loss, fragments_per_pixel, pressure,
+            threshold_median.
         settings: of the fine-tuning.
     """
 

@@ -18,6 +18,7 @@ class Role(Enum):
     STEP = "count one training step"
     VIEW = "remember which model is being rendered"
     RASTERIZE = "draw with thresholds"
+    LOSS = "note the host's loss when it goes backward"
     PARENTS = "work out the parents of the rows about to be appended"
     KEEP = "keep the surviving rows"
     APPEND = "append rows"

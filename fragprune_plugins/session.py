@@ -7,11 +7,12 @@ steps ourselves: hosts pass offset iterations. One store per model object.
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 import weakref
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -59,12 +60,14 @@ class StepStats:
         fragments_per_pixel: drawn in this step's view.
         pressure: lambda used.
         threshold_median: over all Gaussians, in falloff.
+        loss: the host's own, without the pressure.
     """
 
     step: int
     fragments_per_pixel: float
     pressure: float
     threshold_median: float
+    loss: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -526,8 +529,6 @@ class Session:
 
     def _press(self, state: _ModelState, view: int, outputs: Any) -> Any:
         """Put the fragment pressure into the host's loss and keep this step's figures."""
-        from dataclasses import replace
-
         plan = state.plan
         assert plan is not None
         fragments = state.drawn[view] = state.last_drawn
@@ -542,6 +543,12 @@ class Session:
             return outputs
         term = outputs.fragments_per_pixel * self.pressure.value
         return replace(outputs, image=_AddToLoss.apply(outputs.image, term))  # type: ignore[no-untyped-call]
+
+    def _on_loss(self, seam: Seam, wrapped: Any, tensor: Any, args: Any, kwargs: Any) -> Any:
+        state = self._last_state
+        if state is not None and state.stats is not None and tensor.numel() == 1:
+            state.stats = replace(state.stats, loss=float(tensor.detach()))
+        return wrapped(*args, **kwargs)
 
     def _on_parents(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         state = self._models.get(model)
@@ -669,6 +676,7 @@ _HANDLERS: dict[Role, Callable[..., Any]] = {
     Role.STEP: Session._on_step,
     Role.VIEW: Session._on_view,
     Role.RASTERIZE: Session._on_rasterize,
+    Role.LOSS: Session._on_loss,
     Role.PARENTS: Session._on_parents,
     Role.KEEP: Session._on_keep,
     Role.APPEND: Session._on_append,

@@ -74,7 +74,7 @@ def write_page(
 
 
 def save_learning(path: Path, curves: Sequence[dict[str, float]], thresholds: Tensor) -> None:
-    """Draw fragments and the median threshold over the steps, and where all thresholds ended.
+    """Draw loss, fragments and median threshold over the steps, and all thresholds at the end.
 
     Args:
         path: the PNG.
@@ -85,22 +85,26 @@ def save_learning(path: Path, curves: Sequence[dict[str, float]], thresholds: Te
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12, 3.2), layout="constrained")
+    figure = Figure(figsize=(15, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
-    fragments, median, spread = figure.subplots(1, 3)
+    loss, fragments, median, spread = figure.subplots(1, 4)
     steps = np.array([row["step"] for row in curves])
-    drawn = np.array([row["fragments_per_pixel"] for row in curves])
-    window = max(1, min(50, len(drawn) // 4))
-    mean = np.convolve(drawn, np.ones(window) / window, mode="valid")
-    fragments.plot(steps, drawn, color="tab:red", alpha=0.25, linewidth=0.8)
-    fragments.plot(steps[window // 2 :][: len(mean)], mean, color="tab:red")
-    fragments.set(xlabel="step", ylabel="drawn fragments per pixel", ylim=(0, None))
+    window = max(1, min(50, len(steps) // 4))
+    for axes, key, color, label in (
+        (loss, "loss", "tab:purple", "loss of the host"),
+        (fragments, "fragments_per_pixel", "tab:red", "drawn fragments per pixel"),
+    ):
+        values = np.array([row[key] for row in curves])
+        mean = np.convolve(values, np.ones(window) / window, mode="valid")
+        axes.plot(steps, values, color=color, alpha=0.25, linewidth=0.8)
+        axes.plot(steps[window // 2 :][: len(mean)], mean, color=color)
+        axes.set(xlabel="step", ylabel=label, ylim=(0, None))
     median.plot(steps, [row["threshold_median"] for row in curves], color="tab:green")
     median.set(xlabel="step", ylabel="median threshold (falloff)", ylim=(0, None))
-    values = thresholds.detach().cpu().numpy()
-    spread.hist(np.maximum(values, 1e-4), bins=np.geomspace(1e-4, 1, 60), color="tab:blue")
+    final = thresholds.detach().cpu().numpy()
+    spread.hist(np.maximum(final, 1e-4), bins=np.geomspace(1e-4, 1, 60), color="tab:blue")
     spread.set(xscale="log", xlabel="threshold (falloff)", ylabel="Gaussians")
-    for axes in (fragments, median, spread):
+    for axes in (loss, fragments, median, spread):
         axes.grid(alpha=0.25)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)

@@ -117,6 +117,7 @@ class GraphdecoAdapter(HostAdapter):
     scripts: tuple[str, ...] = ("train.py",)
     seams = (
         *MODEL_SEAMS,
+        Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(Role.VIEW, "gaussian_renderer", "render", ("viewpoint_camera", "pc")),
         Seam(
             Role.RASTERIZE,
