@@ -242,7 +242,7 @@ class Session:
         return findings
 
     def __enter__(self) -> Session:
-        return self.activate()
+        return self if _active is self else self.activate()
 
     def __exit__(self, *exc: object) -> None:
         self.deactivate()
