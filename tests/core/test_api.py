@@ -1,0 +1,114 @@
+"""One line in a fork, in a process of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fragprune_plugins import demo
+
+HOST = Path(demo.__file__).with_name("host")
+
+
+@pytest.fixture
+def fork(tmp_path):
+    """The demo's host as somebody's fork of it, rewritten for the CPU."""
+    root = tmp_path / "fork"
+    for path in HOST.rglob("*.py"):
+        target = root / path.relative_to(HOST)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(path.read_text().replace('"cuda"', '"cpu"').replace(".cuda()", ""))
+    return root
+
+
+SCRIPT = """
+import json, sys
+sys.argv[0] = sys.argv[1] + "/train.py"
+sys.path.insert(0, sys.argv[1])
+import fragprune_plugins
+session = fragprune_plugins.activate(stage="joint", settings=fragprune_plugins.Settings(20))
+
+from types import SimpleNamespace
+import numpy as np, torch
+from arguments import OptimizationParams
+from argparse import ArgumentParser
+from gaussian_renderer import render
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from fragprune_plugins.errors import SessionError
+
+seen = {}
+cloud = SimpleNamespace(
+    points=np.random.default_rng(0).uniform(-1, 1, (20, 3)), colors=np.full((20, 3), 0.5)
+)
+model = GaussianModel(1)
+model.create_from_pcd(cloud, 1.0)
+parser = ArgumentParser()
+model.training_setup(OptimizationParams(parser).extract(parser.parse_args([])))
+camera = Camera(
+    0, np.eye(3), np.array([0, 0, 3.0]), 0.8, 0.6, np.zeros((18, 24, 3), np.uint8), "a", "cpu"
+)
+pipe = SimpleNamespace(debug=False, compute_cov3D_python=False, convert_SHs_python=False)
+def draw():
+    return render(camera, model, pipe, torch.zeros(3))["render"]
+for iteration in (1, 2):
+    model.update_learning_rate(iteration)
+    draw().abs().mean().backward()
+    model.optimizer.step()
+    model.optimizer.zero_grad(set_to_none=True)
+store = session.store(model)
+seen["steps"] = store.steps
+with torch.no_grad():
+    store.logits.fill_(20.0)
+    seen["truncated"] = not draw().any().item()
+    with fragprune_plugins.paused():
+        seen["paused"] = draw().any().item()
+    seen["truncated again"] = not draw().any().item()
+try:
+    fragprune_plugins.activate()
+except SessionError:
+    seen["twice"] = "refused"
+seen["undone"] = fragprune_plugins.deactivate() == fragprune_plugins.deactivate() == []
+seen["inactive"] = "diff_gaussian_rasterization" not in sys.modules
+with fragprune_plugins.paused():
+    seen["paused when inactive"] = True
+print(json.dumps(seen))
+"""
+
+LATE = """
+import json, sys
+sys.argv[0] = sys.argv[1] + "/train.py"
+sys.path.insert(0, sys.argv[1])
+import fragprune_plugins
+from fragprune_plugins.errors import LateImportError
+with fragprune_plugins.activate(stage="off"):  # its stand-ins let the host be imported
+    from gaussian_renderer import render
+    import gaussian_renderer
+original = gaussian_renderer.render
+import __main__
+__main__.render = original
+try:
+    fragprune_plugins.activate(host=sys.argv[1], adapter="vanilla_3dgs", stage="off")
+except LateImportError as error:
+    print(json.dumps([error.found, gaussian_renderer.render is original]))
+"""
+
+
+def test_one_line_above_the_imports_is_enough(fork, python):
+    assert python(SCRIPT, fork) == {
+        "steps": 2,
+        "truncated": True,
+        "paused": True,
+        "truncated again": True,
+        "twice": "refused",
+        "undone": True,
+        "inactive": True,
+        "paused when inactive": True,
+    }
+
+
+def test_one_line_below_the_imports_is_refused_with_the_holder(fork, python):
+    found, restored = python(LATE, fork)
+    assert "__main__" in found
+    assert restored

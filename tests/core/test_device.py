@@ -1,0 +1,112 @@
+"""``--device cpu``: what names CUDA runs on the CPU, and afterwards nothing has happened."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from fragprune_plugins import device
+from fragprune_plugins.device import cpu_only
+
+FACTORIES = {
+    "zeros": lambda d: torch.zeros(3, device=d),
+    "ones": lambda d: torch.ones((2, 2), dtype=torch.float32, device=d),
+    "empty": lambda d: torch.empty(3, device=d),
+    "full": lambda d: torch.full((2,), 7.0, device=d),
+    "eye": lambda d: torch.eye(3, device=d),
+    "arange": lambda d: torch.arange(3, device=d),
+    "linspace": lambda d: torch.linspace(0, 1, 3, device=d),
+    "rand": lambda d: torch.rand(3, device=d),
+    "randn": lambda d: torch.randn(3, device=d),
+    "randint": lambda d: torch.randint(0, 3, (3,), device=d),
+    "tensor": lambda d: torch.tensor([1, 2], device=d),
+    "as_tensor": lambda d: torch.as_tensor([1, 2], device=d),
+    "zeros_like": lambda d: torch.zeros_like(torch.ones(2), device=d),
+    "rand_like": lambda d: torch.rand_like(torch.ones(2), device=d),
+    "new_zeros": lambda d: torch.ones(2).new_zeros(3, device=d),
+    "to": lambda d: torch.ones(2).to(d),
+    "to with dtype": lambda d: torch.ones(2).to(d, torch.float64),
+    "to by keyword": lambda d: torch.ones(2).to(device=d),
+    "module": lambda d: torch.nn.Linear(2, 2).to(d).weight,
+    "parameter": lambda d: torch.nn.Parameter(torch.ones(2, device=d)),
+}
+
+needs_no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA calls succeed here")
+
+
+@pytest.mark.parametrize("name", ["cuda", "cuda:0", "cuda:7", torch.device("cuda", 0)], ids=str)
+@pytest.mark.parametrize("make", FACTORIES.values(), ids=FACTORIES)
+def test_tensors_asked_for_on_cuda_are_made_on_the_cpu(make, name):
+    with cpu_only():
+        assert make(name).device.type == "cpu"
+
+
+def test_cuda_methods_return_the_tensor_itself_as_on_a_gpu_they_would():
+    tensor, module = torch.ones(2, requires_grad=True), torch.nn.Linear(2, 2)
+    with cpu_only():
+        assert tensor.cuda() is tensor
+        assert tensor.cuda(0) is tensor
+        assert tensor.cuda(non_blocking=True) is tensor
+        assert module.cuda() is module
+    assert module.weight.device.type == "cpu"
+
+
+def test_values_that_only_look_like_devices_are_left_alone():
+    with cpu_only():
+        assert torch.nn.functional.pad(torch.ones(1, 2), (1, 1), mode="reflect").shape == (1, 4)
+        assert torch.einsum("i,i->", torch.ones(2), torch.ones(2)) == 2
+    assert device._redirected("cudaX") == "cudaX"
+    assert device._redirected("cpu") == "cpu"
+
+
+def test_events_measure_and_calls_without_a_meaning_do_nothing():
+    with cpu_only():
+        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        start.record()
+        sum(range(10_000))
+        end.record()
+        torch.cuda.synchronize()
+        end.synchronize()
+        assert end.query()
+        assert 0 < start.elapsed_time(end) < 1000
+        torch.cuda.set_device(torch.device("cuda:0"))
+        torch.cuda.empty_cache()
+        assert torch.cuda.memory_allocated() == torch.cuda.current_device() == 0
+        assert torch.cuda.is_available() in (True, False)  # hosts ask; we do not lie
+
+
+@pytest.mark.parametrize("where", [{}, {"map_location": "cuda"}, {"map_location": "cuda:0"}])
+def test_checkpoints_load_to_the_cpu(tmp_path, where):
+    torch.save({"a": torch.arange(3)}, tmp_path / "x.pth")
+    with cpu_only():
+        assert torch.load(tmp_path / "x.pth", **where)["a"].device.type == "cpu"
+        assert torch.load(tmp_path / "x.pth", "cuda")["a"].tolist() == [0, 1, 2]
+        assert torch.load(tmp_path / "x.pth", weights_only=True)["a"].tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt])
+def test_everything_is_put_back_however_the_block_ends(error):
+    names = list(device._SUBSTITUTES)
+    before = [getattr(torch.cuda, name) for name in names], torch.load, torch.Tensor.cuda
+
+    def block():
+        with cpu_only():
+            assert torch.cuda.Event is not before[0][names.index("Event")]
+            if error:
+                raise error
+
+    if error:
+        with pytest.raises(error):
+            block()
+    else:
+        block()
+    after = [getattr(torch.cuda, name) for name in names], torch.load, torch.Tensor.cuda
+    assert after == before
+
+
+@needs_no_gpu
+def test_outside_the_block_cuda_is_refused_as_ever():
+    with cpu_only():
+        torch.zeros(1, device="cuda")
+    with pytest.raises((RuntimeError, AssertionError)):
+        torch.zeros(1, device="cuda")

@@ -1,0 +1,97 @@
+"""What answers for the hosts' compiled packages, against re-derivations in plain Python."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fragprune_plugins.lineage import stand_ins
+from fragprune_plugins.lineage.stand_ins import (
+    SparseGaussianAdam,
+    mean_squared_neighbour_distance,
+)
+
+coordinates = st.tuples(*[st.integers(-20, 20).map(lambda i: i / 4)] * 3)
+
+
+@given(st.lists(coordinates, max_size=25))
+def test_neighbour_distances_are_those_of_a_brute_force_search(points):
+    cloud = torch.tensor(points, dtype=torch.float32).reshape(-1, 3)
+    expected = []
+    for i, p in enumerate(points):
+        near = sorted(math.dist(p, q) ** 2 for j, q in enumerate(points) if j != i)[:3]
+        expected.append(sum(near) / len(near) if near else 0.0)
+    found = mean_squared_neighbour_distance(cloud)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, torch.tensor(expected).reshape(-1), rtol=1e-5, atol=1e-6)
+
+
+def test_simple_knn_answers_under_both_its_names():
+    modules = stand_ins.simple_knn()
+    assert set(modules) == {"simple_knn", "simple_knn._C"}
+    assert modules["simple_knn"]._C is modules["simple_knn._C"]
+    with pytest.raises(AttributeError):  # dunders included: torch's inspection asks for them
+        modules["simple_knn._C"].__wrapped__  # noqa: B018
+
+
+@given(st.lists(st.lists(st.booleans(), min_size=4, max_size=4), min_size=1, max_size=6))
+def test_sparse_adam_moves_visible_rows_by_the_formula_without_bias_correction(visible):
+    generator = torch.Generator().manual_seed(1)
+    start = torch.randn(4, 2, generator=generator)
+    gradients = torch.randn(len(visible), 4, 2, generator=generator)
+    parameter = torch.nn.Parameter(start.clone())
+    untouched = torch.nn.Parameter(start.clone())
+    groups = [
+        {"params": [parameter], "lr": 0.1, "name": "a"},
+        {"params": [untouched], "lr": 0.1, "name": "b"},
+    ]
+    optimizer = SparseGaussianAdam(groups, lr=0.0, eps=1e-15)
+    for gradient, rows in zip(gradients, visible, strict=True):
+        parameter.grad = gradient.clone()
+        optimizer.step(torch.tensor(rows), 4)
+    for row in range(4):
+        for column in range(2):
+            x, m, v = start[row, column].item(), 0.0, 0.0
+            for gradient, rows in zip(gradients, visible, strict=True):
+                if rows[row]:
+                    g = gradient[row, column].item()
+                    m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
+                    x -= 0.1 * m / (math.sqrt(v) + 1e-15)
+            assert parameter[row, column].item() == pytest.approx(x, rel=1e-4, abs=1e-5)
+    assert torch.equal(untouched, start)
+
+
+def rasterizer(sparse_adam=False, draw=lambda call: call):
+    return stand_ins.rasterizer("a_package", ("bg", "viewmatrix", "debug"), sparse_adam, draw)
+
+
+def test_the_rasterizer_takes_positional_and_keyword_calls_alike():
+    module = rasterizer()
+    settings = module.GaussianRasterizationSettings(bg=1, viewmatrix=2, debug=False)
+    assert settings._fields == ("bg", "viewmatrix", "debug")
+    draw = module.GaussianRasterizer(raster_settings=settings)
+    by_keyword = draw(means3D=1, means2D=2, opacities=3, shs=4, scales=5, rotations=6)
+    by_position = draw(1, 2, 3, 4, None, 5, 6)
+    assert by_keyword == by_position
+    assert by_keyword.settings is settings
+    assert list(draw.parameters()) == []
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_sparse_adam_is_there_only_for_hosts_that_look_for_it(sparse):
+    """Its mere presence makes a late-2024 host call with separate bands."""
+    assert hasattr(rasterizer(sparse_adam=sparse), "SparseGaussianAdam") == sparse
+
+
+def test_visible_means_in_front_of_the_near_plane():
+    module = rasterizer()
+    view = torch.eye(4)
+    view[3, 2] = 1.0  # one unit towards +z
+    settings = module.GaussianRasterizationSettings(bg=None, viewmatrix=view, debug=False)
+    points = torch.tensor([[0.0, 0, 0], [9, 9, -0.79], [0, 0, -0.81], [0, 0, -5]])
+    visible = module.GaussianRasterizer(settings).markVisible(points)
+    assert visible.tolist() == [True, True, False, False]
