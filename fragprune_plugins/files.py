@@ -30,11 +30,11 @@ def replacing(path: Path) -> Iterator[Path]:
         )
         os.close(handle)
         temporary = Path(name)
+        yield temporary
         # mkstemp makes private files; give this one the permissions a plain open() would.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
-        yield temporary
         os.replace(temporary, path)
     except OSError as error:
         raise OutputError(

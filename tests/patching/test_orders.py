@@ -66,8 +66,9 @@ for order in sys.argv[2]:
         ledger = None
     check()
 assert not findings, findings
-assert "torch" not in sys.modules
-print(json.dumps("torch" in sys.modules))
+real_torch = hasattr(sys.modules.get("torch"), "__version__")
+assert not real_torch
+print(json.dumps(real_torch))
 """
 
 
