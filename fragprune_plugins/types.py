@@ -229,6 +229,7 @@ class RasterOutputs:
         evaluated_per_pixel: (Gaussian, pixel) pairs the engine tested, its waste included.
         fragments: (H, W) int32 drawn fragments per pixel, when counts were asked for.
         fragments_per_gaussian: (N,) int32 drawn fragments, when counts were asked for.
+        stages: milliseconds of the forward pass by stage, from engines that keep time.
     """
 
     image: Tensor
@@ -239,3 +240,4 @@ class RasterOutputs:
     evaluated_per_pixel: float
     fragments: Tensor | None = None
     fragments_per_gaussian: Tensor | None = None
+    stages: dict[str, float] | None = None

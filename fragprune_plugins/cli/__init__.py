@@ -18,6 +18,7 @@ _COMMANDS = {
     "export": "export",
     "adapters": "adapters",
     "check": "check",
+    "bench": "bench",
     "doctor": "doctor",
 }
 """Command name to module in this package, which defines ``command``; in the order of --help."""

@@ -1,0 +1,1 @@
+"""Benchmarks: a scene everybody can make again, medians with spread, ratios in one run."""

@@ -1,0 +1,181 @@
+"""Timing rasterizers side by side: interleaved rounds, the same picture checked, peak memory."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
+
+Pass = Literal["forward", "forward_backward"]
+
+SAME_PICTURE = 1e-3
+"""Largest mean absolute difference, in intensity, at which two engines drew the same picture."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One thing to time.
+
+    Attributes:
+        scene: its name.
+        view: the camera.
+        splats: activated Gaussians.
+        kind: forward only, or with every gradient.
+        thresholds: (N,) or None.
+    """
+
+    scene: str
+    view: View
+    splats: Splats
+    kind: Pass
+    thresholds: Tensor | None = None
+
+
+def measure(
+    cases: Sequence[Case],
+    engines: Sequence[Engine],
+    *,
+    repeats: int = 9,
+    say: Callable[[str], None] = lambda _: None,
+) -> list[dict[str, Any]]:
+    """Time every case on every engine, all of them once a round.
+
+    Args:
+        cases: what to draw.
+        engines: who draws; the first one's picture is what the others' are compared with.
+        repeats: rounds after one to warm up.
+        say: told each finished round.
+
+    Returns:
+        One dict a case and engine: scene, width, height, gaussians, pass, engine, threads,
+        truncated, fragments_per_pixel, evaluated_per_pixel, ms_median, ms_min, ms_se, stages
+        (medians in ms), peak_mb (beyond inputs and outputs; None where the system cannot tell),
+        difference (mean absolute, from the first engine's picture).
+    """
+    jobs = [(case, engine, _prepare(case, engine)) for case in cases for engine in engines]
+    times: list[list[float]] = [[] for _ in jobs]
+    stages: list[list[dict[str, float]]] = [[] for _ in jobs]
+    last: list[RasterOutputs] = []
+    peaks = []
+    for _, _, job in jobs:
+        outputs, peak = _with_peak(job)
+        last.append(outputs)
+        peaks.append(peak)
+    for turn in range(repeats):
+        order = range(len(jobs)) if turn % 2 == 0 else reversed(range(len(jobs)))
+        for index in order:
+            started = time.perf_counter()
+            outputs = jobs[index][2]()
+            spent = 1e3 * (time.perf_counter() - started)
+            times[index].append(spent)
+            parts = dict(outputs.stages or {})
+            if jobs[index][0].kind == "forward_backward" and parts:
+                parts["backward"] = spent - sum(parts.values())
+            stages[index].append(parts)
+        say(f"round {turn + 1} of {repeats}")
+    results = []
+    for index, (case, engine, _) in enumerate(jobs):
+        first = last[index - index % len(engines)]
+        results.append(
+            {
+                "scene": case.scene,
+                "width": case.view.width,
+                "height": case.view.height,
+                "gaussians": len(case.splats),
+                "pass": case.kind,
+                "engine": engine.name,
+                "threads": torch.get_num_threads(),
+                "truncated": case.thresholds is not None,
+                "fragments_per_pixel": float(last[index].fragments_per_pixel),
+                "evaluated_per_pixel": last[index].evaluated_per_pixel,
+                "ms_median": statistics.median(times[index]),
+                "ms_min": min(times[index]),
+                "ms_se": _standard_error(times[index]),
+                "stages": {
+                    name: statistics.median(part[name] for part in stages[index])
+                    for name in stages[index][0]
+                },
+                "peak_mb": peaks[index],
+                "difference": float((last[index].image - first.image).detach().abs().mean()),
+            }
+        )
+    return results
+
+
+def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float]:
+    """How much of the fragments saved is time saved, by size: 1 is all of it.
+
+    (frame time untruncated / truncated) over (fragments untruncated / truncated), forward.
+    """
+    found: dict[str, float] = {}
+    forward = [r for r in results if r["engine"] == engine and r["pass"] == "forward"]
+    for plain in forward:
+        for cut in forward:
+            same = all(plain[k] == cut[k] for k in ("scene", "width", "height", "gaussians"))
+            if same and cut["truncated"] and not plain["truncated"]:
+                time_ratio = plain["ms_median"] / cut["ms_median"]
+                fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
+                found[f"{plain['width']}x{plain['height']}"] = time_ratio / fragments
+    return found
+
+
+def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
+    """A call that draws once; with gradients of a fixed random loss where they are asked for."""
+    inputs = RasterInputs(case.view, case.splats)
+    if case.kind == "forward":
+
+        @torch.no_grad()
+        def draw() -> RasterOutputs:
+            return engine.rasterize(inputs, case.thresholds)
+
+        return draw
+
+    names = ("means", "opacities", "scales", "rotations", "sh")
+    leaves = {n: getattr(case.splats, n).detach().clone().requires_grad_(True) for n in names}
+    hook = torch.zeros(len(case.splats), 3, requires_grad=True)
+    thresholds = None
+    if case.thresholds is not None:
+        thresholds = case.thresholds.clone().requires_grad_(True)
+    inputs = RasterInputs(case.view, replace(case.splats, **leaves), hook)
+    stream = torch.Generator().manual_seed(0)
+    weight = torch.randn(3, case.view.height, case.view.width, generator=stream)
+
+    def draw_and_differentiate() -> RasterOutputs:
+        for leaf in (*leaves.values(), hook, *([] if thresholds is None else [thresholds])):
+            leaf.grad = None
+        outputs = engine.rasterize(inputs, thresholds)
+        torch.autograd.backward(outputs.image, weight)
+        return outputs
+
+    return draw_and_differentiate
+
+
+def _standard_error(values: Sequence[float]) -> float:
+    return statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
+
+
+def _with_peak(job: Callable[[], RasterOutputs]) -> tuple[RasterOutputs, float | None]:
+    """Run once (this also warms up); the highest resident memory above where it began, in MB."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # Linux: forget the old peak
+        before = _status("VmRSS")
+        outputs = job()
+        return outputs, max(0.0, _status("VmHWM") - before)
+    except OSError:
+        return job(), None
+
+
+def _status(field: str) -> float:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field):
+            return float(line.split()[1]) / 1024
+    raise OSError(f"no {field} in /proc/self/status")

@@ -1,0 +1,167 @@
+"""``fragprune bench``: how fast the engines are here, and what truncation gives."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fragprune_plugins.cli.common import FILE, Command, Report, engine_options, set_threads
+from fragprune_plugins.errors import UsageError
+
+TRUNCATION = 16 / 255
+"""The threshold every Gaussian gets in the truncated rows: 0.63 of the fragments, as learned."""
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise UsageError("--size", repr(text), "WIDTHxHEIGHT, such as 640x480", "Correct it.")
+    return int(width), int(height)
+
+
+@click.command("bench", cls=Command)
+@click.option(
+    "--size",
+    "sizes",
+    multiple=True,
+    default=("640x480", "1280x960"),
+    show_default=True,
+    help="Image size; may be given several times.",
+)
+@click.option(
+    "--gaussians",
+    multiple=True,
+    type=click.IntRange(min=1),
+    default=(100_000,),
+    show_default=True,
+    help="How many the generated scene has; may be given several times.",
+)
+@click.option("--model", type=FILE, help="Time this .ply instead, with its own thresholds.")
+@click.option("--cameras", type=FILE, help="With --model: its first view is drawn.")
+@click.option("--repeats", type=click.IntRange(min=2), default=9, show_default=True)
+@click.option("--forward-only", is_flag=True, help="Leave gradients out.")
+@engine_options
+def command(
+    sizes: tuple[str, ...],
+    gaussians: tuple[int, ...],
+    model: Path | None,
+    cameras: Path | None,
+    repeats: int,
+    forward_only: bool,
+    engine: str,
+    threads: int | None,
+) -> Report:
+    """Time rasterization, forward and with every gradient, with and without truncation.
+
+    The generated scene is the same on every machine. All rows are timed in turns, so that a busy
+    machine slows them alike; close other programs all the same, and read the load printed below.
+
+    \b
+    Examples:
+      fragprune bench
+      fragprune bench --size 320x240 --size 3840x2160 --gaussians 10000 --gaussians 3000000
+      fragprune bench --model point_cloud.ply --cameras cameras.json --size 1280x720
+    """
+    if (model is None) != (cameras is None):
+        raise UsageError("options", "one of --model and --cameras", "both or none", "Add it.")
+
+    import torch
+
+    from fragprune_plugins.bench.measure import Case, measure, translation
+    from fragprune_plugins.engines import create_engine
+
+    set_threads(threads)
+    rasterizer = create_engine(engine)
+    kinds = ("forward",) if forward_only else ("forward", "forward_backward")
+    cases: list[Case] = []
+    for name, splats, view, learned in _scenes(model, cameras, gaussians, sizes):
+        cut = torch.full((len(splats),), TRUNCATION) if learned is None else learned
+        for kind in kinds:
+            cases += [Case(name, view, splats, kind, thresholds) for thresholds in (None, cut)]  # type: ignore[arg-type]
+    before = os.getloadavg()[0]
+    results = measure(
+        cases, [rasterizer], repeats=repeats, say=lambda text: click.echo(text, err=True)
+    )
+    machine = {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "load_before": before,
+        "load_after": os.getloadavg()[0],
+        "platform": platform.platform(),
+        "torch": torch.__version__,
+        "native": _native(),
+    }
+    share = translation(results, rasterizer.name)
+    data = {"results": results, "translation": share, "machine": machine}
+    return Report(data, _table(results, share, machine))
+
+
+def _scenes(
+    model: Path | None, cameras: Path | None, gaussians: tuple[int, ...], sizes: tuple[str, ...]
+) -> list[tuple[str, Any, Any, Any]]:
+    """(name, activated splats, view, learned thresholds or None), one a count and size."""
+    from dataclasses import replace
+
+    from fragprune_plugins.bench.scene import make_scene, make_view
+
+    if model is not None and cameras is not None:
+        from fragprune_plugins.cli.common import load_model
+        from fragprune_plugins.finetuning.cameras import load_cameras
+
+        splat, learned = load_model(model)
+        _, view = load_cameras(cameras)[0]
+        return [
+            (model.stem, splat.splats(), replace(view, width=w, height=h), learned)
+            for w, h in map(_size, sizes)
+        ]
+    return [
+        (f"bench-{count}", make_scene(count).splats(), make_view(*_size(size)), None)
+        for count in gaussians
+        for size in sizes
+    ]
+
+
+def _table(results: list[dict[str, Any]], share: dict[str, float], machine: dict[str, Any]) -> str:
+    lines = [
+        f"{'scene':<16}{'size':>11}  {'pass':<17}{'cut':<5}{'frag/px':>8}{'tested':>8}"
+        f"{'median ms':>11}{'min':>9}{'±se':>7}{'peak MB':>9}"
+    ]
+    for r in results:
+        peak = "-" if r["peak_mb"] is None else f"{r['peak_mb']:.0f}"
+        lines.append(
+            f"{r['scene']:<16}{r['width']:>6}x{r['height']:<4}  {r['pass']:<17}"
+            f"{'yes' if r['truncated'] else 'no':<5}{r['fragments_per_pixel']:>8.1f}"
+            f"{r['evaluated_per_pixel']:>8.1f}{r['ms_median']:>11.2f}{r['ms_min']:>9.2f}"
+            f"{r['ms_se']:>7.2f}{peak:>9}"
+        )
+        if r["stages"]:
+            parts = ", ".join(f"{name} {ms:.2f}" for name, ms in r["stages"].items())
+            lines.append(f"{'':<29}{parts}")
+    for size, value in share.items():
+        lines.append(f"{size}: {100 * value:.0f}% of the fragments saved is time saved")
+    lines.append(
+        f"{results[0]['engine']} engine ({machine['native']}), {results[0]['threads']} threads on "
+        f"{machine['processor']}; load {machine['load_before']:.1f} to {machine['load_after']:.1f}"
+    )
+    return "\n".join(lines)
+
+
+def _native() -> str | None:
+    from fragprune_plugins.native import loader
+
+    found = loader.describe()
+    return str(found["build"]) if found["available"] else None
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
