@@ -85,6 +85,18 @@ def test_the_rates_of_stage_two_are_the_schedules():
     assert [r["f_dc"] for r in rates] == pytest.approx([0.0025 * 0.1 ** (i / 4) for i in range(5)])
 
 
+def test_thresholds_step_once_a_counted_step_however_often_the_hosts_optimizer_does():
+    """A subclass whose step() calls its parent's fires the hook twice."""
+    with running(Settings(iterations=9)) as host:
+        model, camera = host.model(20), host.camera()
+        for iteration in (1, 2, 3):
+            model.update_learning_rate(iteration)
+            host.render(camera, model)["render"].sum().backward()
+            model.optimizer.step()
+            model.optimizer.step()
+        assert host.store(model).steps == 3
+
+
 def test_the_control_trains_the_same_without_thresholds():
     with running(Settings(iterations=9, truncate=False)) as host:
         model, camera = host.model(20), host.camera()
@@ -94,3 +106,13 @@ def test_the_control_trains_the_same_without_thresholds():
         assert host.store(model).neutral
         moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
         assert moved == {"opacity"}
+
+
+@pytest.mark.parametrize("train", MOVES)
+def test_frozen_parameters_ask_the_engine_for_no_gradient(train):
+    """That is a third of the backward pass."""
+    with running(Settings(iterations=9, train=train)) as host:
+        model, camera = host.model(20), host.camera()
+        host.step(model, camera, 1)
+        asking = {g["name"] for g in model.optimizer.param_groups if g["params"][0].requires_grad}
+        assert asking == MOVES[train]

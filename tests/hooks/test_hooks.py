@@ -115,6 +115,8 @@ def test_hook_fragprune_truncate():
 
     with joint(plugins=[Fixed()]) as host:
         model, camera = host.model(), host.camera()
+        assert host.render(camera, model)["render"].any()
+        assert seen == []  # nobody is asked about a neutral store
         model.update_learning_rate(1)
         background = torch.tensor([0.2, 0.4, 0.6])
         image = host.render(camera, model, background)["render"]
