@@ -7,6 +7,7 @@
 #include <limits>
 #include <memory>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
 #include "gaussian.h"
@@ -33,20 +34,10 @@ class Buffer {
   size_t size_ = 0;
 };
 
-// The ellipse {q <= reach} by rows: where it begins and ends in x for an interval of y.
-struct Ellipse {
-  float reach;            // squared radius, a little more than the cutoff
-  float half_height;      // pixels
-  float rightmost;        // dy at which x is largest; -rightmost for the smallest
-  float var_along;        // variance of x given y, pixels^2
-  float inv_down;         // 1 / variance of y
-};
-
-struct Splat {
+// One cache line, for blending reads splats in no order at all.
+struct alignas(64) Splat {
   Brush brush;
-  Ellipse ellipse;
-  uint16_t tile_x0, tile_x1, tile_y0, tile_y1;  // the host's rectangle, half open
-  uint32_t id;                                  // row of the inputs
+  uint32_t id;  // row of the inputs
 };
 
 // Spans only preselect, the fragment test decides. This much is added to every reach so that their
@@ -54,14 +45,65 @@ struct Splat {
 constexpr float kReachMargin = 1.0002f, kReachFloor = 1e-3f;
 constexpr float kSpanMargin = 0.01f;  // pixels
 
-inline Ellipse ellipse_of(const Projection& p, float list_cut) {
-  Ellipse e;
-  e.reach = -list_cut * static_cast<float>(2 / 1.44269504088896341) * kReachMargin + kReachFloor;
-  e.half_height = std::sqrt(e.reach * p.var_y) + kSpanMargin;
-  e.rightmost = p.cov * std::sqrt(e.reach / p.var_x);
-  e.var_along = p.det / p.var_y;
-  e.inv_down = 1 / p.var_y;
+// The ellipse {q <= reach} by rows: where it begins and ends in x for an interval of y.
+template <class V>
+struct Ellipse {
+  V slope;        // dx/dy of the line on which x is most likely given y
+  V reach;        // squared radius, a little more than the cutoff
+  V half_height;  // pixels
+  V rightmost;    // dy at which x is largest; -rightmost for the smallest
+  V var_along;    // variance of x given y, pixels^2
+  V inv_down;     // 1 / variance of y
+};
+
+// `power` is how far the exponent may fall from its peak; see Brush for the others.
+template <class V>
+inline Ellipse<V> ellipse_of(V scale, V skew, V down, V power) {
+  const V unit = broadcast<V>(0.5f * kLog2E), slope = -skew / scale;
+  const V var_down = unit / (down * down), cov = slope * var_down;
+  Ellipse<V> e;
+  e.slope = slope;
+  e.reach = power * broadcast<V>(2 / kLog2E * kReachMargin) + broadcast<V>(kReachFloor);
+  e.var_along = unit / (scale * scale);
+  e.inv_down = down * down / unit;
+  e.half_height = sqrt(e.reach * var_down) + broadcast<V>(kSpanMargin);
+  e.rightmost = cov * sqrt(e.reach / (e.var_along + slope * cov));
   return e;
+}
+
+// Where an ellipse's span ends, right (side 1) or left (side -1) of its mean, over rows low..high.
+template <class V>
+inline V span_end(const Ellipse<V>& e, V low, V high, V side) {
+  const V at = min(max(e.rightmost * side, low), high);
+  const V inside = e.var_along * (e.reach - at * at * e.inv_down);
+  return e.slope * at + side * (sqrt(max(inside, broadcast<V>(0.f))) + broadcast<V>(kSpanMargin));
+}
+
+// Tiles x0..x1, both included, of one row of tiles.
+struct Run {
+  uint16_t row, x0, x1;
+};
+
+// The runs of tiles that a splat's ellipse reaches within the host's rectangle.
+template <class Emit>
+inline void reached_tiles(const Camera& c, const Projection& p, const Brush& b, Emit emit) {
+  const Ellipse<float> e = ellipse_of(b.scale, b.skew, b.down, b.log_opacity - b.list_cut);
+  const float tile = kTile;
+  const float top = std::max(std::ceil(b.y - e.half_height), p.tile_y0 * tile);
+  const float bottom =
+      std::min({std::floor(b.y + e.half_height), c.height - 1, p.tile_y1 * tile - 1});
+  if (!(top <= bottom)) return;
+  const float left = p.tile_x0 * tile, right = std::min(c.width, p.tile_x1 * tile) - 1;
+  const int last = static_cast<int>(bottom) / kTile;
+  for (int row = static_cast<int>(top) / kTile; row <= last; row++) {
+    const float low = std::max(row * tile, top) - b.y;
+    const float high = std::min(row * tile + tile - 1, bottom) - b.y;
+    const float x0 = std::max(left, std::ceil(b.x + span_end(e, low, high, -1.f)));
+    const float x1 = std::min(right, std::floor(b.x + span_end(e, low, high, 1.f)));
+    if (x0 <= x1)
+      emit(Run{static_cast<uint16_t>(row), static_cast<uint16_t>(static_cast<int>(x0) / kTile),
+               static_cast<uint16_t>(static_cast<int>(x1) / kTile)});
+  }
 }
 
 // Stable radix sort of positions by the bits of positive floats.
@@ -121,44 +163,27 @@ struct TileLists {
   Buffer<uint32_t> slot_count;   // per splat
 };
 
-// Calls emit(tile_y, x0, x1), x1 included, for the tiles of each row that the ellipse reaches.
-template <class Emit>
-inline void reached_tiles(const Camera& c, const Splat& s, Emit emit) {
-  const Brush& brush = s.brush;
-  const Ellipse& e = s.ellipse;
-  const float top = std::max(std::ceil(brush.y - e.half_height), s.tile_y0 * float(kTile));
-  const float bottom = std::min({std::floor(brush.y + e.half_height), c.height - 1,
-                                 s.tile_y1 * float(kTile) - 1});
-  if (!(top <= bottom)) return;
-  const float left = s.tile_x0 * float(kTile);
-  const float right = std::min(c.width, s.tile_x1 * float(kTile)) - 1;
-  const int last = static_cast<int>(bottom) / kTile;
-  for (int row = static_cast<int>(top) / kTile; row <= last; row++) {
-    const float low = std::max(float(row * kTile), top) - brush.y;
-    const float high = std::min(float(row * kTile + kTile - 1), bottom) - brush.y;
-    const float at_right = clamp(e.rightmost, low, high), at_left = clamp(-e.rightmost, low, high);
-    const float in_right = e.var_along * (e.reach - at_right * at_right * e.inv_down);
-    const float in_left = e.var_along * (e.reach - at_left * at_left * e.inv_down);
-    const float x0 = std::max(left, std::ceil(brush.x + brush.slope * at_left -
-                                              std::sqrt(std::max(in_left, 0.f)) - kSpanMargin));
-    const float x1 = std::min(right, std::floor(brush.x + brush.slope * at_right +
-                                                std::sqrt(std::max(in_right, 0.f)) + kSpanMargin));
-    if (x0 <= x1) emit(row, static_cast<int>(x0) / kTile, static_cast<int>(x1) / kTile);
-  }
-}
+// What projection leaves: splats that can draw, in the order of the inputs.
+struct Scene {
+  Buffer<Splat> splats;
+  Buffer<float> depth;         // per splat
+  Buffer<uint32_t> run_begin;  // per splat, one more at the end
+  Buffer<Run> runs;
+};
 
-inline TileLists distribute(Team& team, const Camera& c, const Splat* splats,
+inline TileLists distribute(Team& team, const Camera& c, const Scene& scene,
                             const Buffer<uint32_t>& order, bool with_slots) {
-  struct Run {
-    uint32_t splat, row;
-    uint16_t x0, x1;
-  };
-  const size_t n = order.size();
-  const size_t tiles = static_cast<size_t>(c.tiles_x) * c.tiles_y;
+  const size_t n = order.size(), across = static_cast<size_t>(c.tiles_x);
+  const size_t tiles = across * c.tiles_y;
   const size_t parts = n < 1u << 12 ? 1 : static_cast<size_t>(std::min(team.size(), 16));
   const size_t grain = n / parts + 1;
-  std::vector<std::vector<Run>> runs(parts);
-  std::vector<uint64_t> part_total(parts, 0);
+  const auto each_tile = [&](uint32_t splat, auto visit) {
+    for (uint32_t r = scene.run_begin[splat]; r < scene.run_begin[splat + 1]; r++) {
+      const Run run = scene.runs[r];
+      for (size_t t = run.row * across + run.x0; t <= run.row * across + run.x1; t++) visit(t);
+    }
+  };
+  std::vector<uint64_t> total(parts, 0);
   Buffer<uint32_t> cursor(parts * tiles);
   TileLists lists;
   if (with_slots) {
@@ -168,57 +193,40 @@ inline TileLists distribute(Team& team, const Camera& c, const Splat* splats,
   team.each(parts, 1, [&](size_t part, size_t) {
     uint32_t* mine = &cursor[part * tiles];
     std::memset(mine, 0, tiles * sizeof *mine);
-    std::vector<Run>& out = runs[part];
-    out.reserve(3 * grain);
-    uint64_t total = 0;
-    for (size_t i = part * grain; i < std::min(n, (part + 1) * grain); i++) {
-      const uint32_t k = order[i];
-      const uint64_t before = total;
-      reached_tiles(c, splats[k], [&](int row, int x0, int x1) {
-        out.push_back({k, static_cast<uint32_t>(row), static_cast<uint16_t>(x0),
-                       static_cast<uint16_t>(x1)});
-        for (int x = x0; x <= x1; x++) mine[static_cast<size_t>(row) * c.tiles_x + x]++;
-        total += x1 - x0 + 1;
-      });
-      if (with_slots) {
-        lists.slot_begin[k] = static_cast<uint32_t>(before);
-        lists.slot_count[k] = static_cast<uint32_t>(total - before);
-      }
-    }
-    part_total[part] = total;
+    for (size_t i = part * grain; i < std::min(n, (part + 1) * grain); i++)
+      each_tile(order[i], [&](size_t t) { mine[t]++; });
+    for (size_t t = 0; t < tiles; t++) total[part] += mine[t];
   });
-  uint64_t total = 0;
-  for (uint64_t& t : part_total) {
-    const uint64_t before = total;
-    total += t;
-    t = before;
-  }
-  if (total > std::numeric_limits<uint32_t>::max()) throw std::length_error("tile lists");
+  uint64_t entries = 0;
+  for (uint64_t& t : total) entries += std::exchange(t, entries);
+  if (entries > std::numeric_limits<uint32_t>::max()) throw std::length_error("tile lists");
   lists.first.resize(tiles + 1);
   uint32_t position = 0;
   for (size_t t = 0; t < tiles; t++) {
     lists.first[t] = position;
-    for (size_t part = 0; part < parts; part++) {
-      const uint32_t here = cursor[part * tiles + t];
-      cursor[part * tiles + t] = position;
-      position += here;
-    }
+    for (size_t part = 0; part < parts; part++)
+      position += std::exchange(cursor[part * tiles + t], position);
   }
   lists.first[tiles] = position;
-  lists.splat = Buffer<uint32_t>(total);
-  if (with_slots) lists.slot = Buffer<uint32_t>(total);
+  lists.splat = Buffer<uint32_t>(entries);
+  if (with_slots) lists.slot = Buffer<uint32_t>(entries);
   team.each(parts, 1, [&](size_t part, size_t) {
     uint32_t* mine = &cursor[part * tiles];
-    uint32_t slot = static_cast<uint32_t>(part_total[part]);
-    for (const Run& run : runs[part])
-      for (int x = run.x0; x <= run.x1; x++) {
-        const uint32_t at = mine[static_cast<size_t>(run.row) * c.tiles_x + x]++;
-        lists.splat[at] = run.splat;
-        if (with_slots) lists.slot[at] = slot++;
+    uint32_t slot = static_cast<uint32_t>(total[part]);
+    for (size_t i = part * grain; i < std::min(n, (part + 1) * grain); i++) {
+      const uint32_t k = order[i], before = slot;
+      if (with_slots)
+        each_tile(k, [&](size_t t) {
+          lists.splat[mine[t]] = k;
+          lists.slot[mine[t]++] = slot++;
+        });
+      else
+        each_tile(k, [&](size_t t) { lists.splat[mine[t]++] = k; });
+      if (with_slots) {
+        lists.slot_begin[k] = before;
+        lists.slot_count[k] = slot - before;
       }
-    if (with_slots)
-      for (size_t i = part * grain; i < std::min(n, (part + 1) * grain); i++)
-        lists.slot_begin[order[i]] += static_cast<uint32_t>(part_total[part]);
+    }
   });
   return lists;
 }

@@ -13,7 +13,8 @@ namespace fp {
 constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlockRows = kTile / kBlockHeight, kBlocks = kBlockRows * 4;
 constexpr int kPixels = kTile * kTile;
-constexpr int kWord = 64;  // Gaussians per word of bits
+constexpr int kWord = 64;    // Gaussians per word of bits
+constexpr int kBatch = 256;  // Gaussians staged at once
 
 // What the forward pass leaves for the backward pass, pixels in block order.
 struct TilePixels {
@@ -40,33 +41,27 @@ inline Lanes lane_y() {
 inline int block_x(int block) { return block % 4 * kBlockWidth; }
 inline int block_y(int block) { return block / 4 * kBlockHeight; }
 
-// Ellipses of up to kWord Gaussians, one array per number.
-struct EllipseRows {
-  alignas(64) float x[kWord], y[kWord], slope[kWord], reach[kWord], half_height[kWord],
-      rightmost[kWord], var_along[kWord], inv_down[kWord];
+// Up to kWord brushes, one array per number that finding blocks needs.
+struct BrushColumns {
+  alignas(64) float x[kWord], y[kWord], scale[kWord], skew[kWord], down[kWord], power[kWord];
 };
 
 // For each block, the bits of the Gaussians that reach it; only the first `count` are meant.
-inline void find_blocks(const EllipseRows& e, int count, uint64_t* reached) {
-  const Lanes zero = broadcast<Lanes>(0.f), margin = broadcast<Lanes>(kSpanMargin);
+inline void find_blocks(const BrushColumns& columns, int count, uint64_t* reached) {
+  const Lanes one = broadcast<Lanes>(1.f);
   std::memset(reached, 0, kBlocks * sizeof *reached);
   for (int i = 0; i < count; i += kLanes) {
-    const Lanes y = load(e.y + i), x = load(e.x + i), slope = load(e.slope + i);
-    const Lanes height = load(e.half_height + i), rightmost = load(e.rightmost + i);
-    const Lanes reach = load(e.reach + i), var = load(e.var_along + i);
-    const Lanes inv_down = load(e.inv_down + i);
+    const Lanes x = load(columns.x + i), y = load(columns.y + i);
+    const Ellipse<Lanes> e = ellipse_of(load(columns.scale + i), load(columns.skew + i),
+                                        load(columns.down + i), load(columns.power + i));
     for (int row = 0; row < kBlockRows; row++) {
       const float first = static_cast<float>(row * kBlockHeight);
-      const Lanes low = max(broadcast<Lanes>(first) - y, -height);
-      const Lanes high = min(broadcast<Lanes>(first + (kBlockHeight - 1)) - y, height);
+      const Lanes low = max(broadcast<Lanes>(first) - y, -e.half_height);
+      const Lanes high = min(broadcast<Lanes>(first + (kBlockHeight - 1)) - y, e.half_height);
       const Mask crosses = ge(high, low);
       if (!bits(crosses)) continue;
-      const Lanes at_right = min(max(rightmost, low), high);
-      const Lanes at_left = min(max(-rightmost, low), high);
-      const Lanes in_right = sqrt(max(var * (reach - at_right * at_right * inv_down), zero));
-      const Lanes in_left = sqrt(max(var * (reach - at_left * at_left * inv_down), zero));
-      const Lanes right = fma(slope, at_right, x) + in_right + margin;
-      const Lanes left = fma(slope, at_left, x) - in_left - margin;
+      const Lanes right = x + span_end(e, low, high, one);
+      const Lanes left = x + span_end(e, low, high, -one);
       for (int column = 0; column < 4; column++) {
         const float from = static_cast<float>(column * kBlockWidth);
         const Mask hit = both(crosses, both(ge(right, broadcast<Lanes>(from)),
@@ -80,41 +75,28 @@ inline void find_blocks(const EllipseRows& e, int count, uint64_t* reached) {
 }
 
 // Copies a word's worth of Gaussians out of the scene, in coordinates of the tile.
-inline void stage(const Splat* splats, const Tile& tile, int first, int count, EllipseRows& e,
-                  Brush* brushes) {
+inline void stage(const Splat* splats, const Tile& tile, int first, int count,
+                  BrushColumns& columns, LocalBrush* brushes) {
+  constexpr int ahead = 16;  // entries; long enough to hide a miss of the caches
   for (int j = 0; j < count; j++) {
-    const Splat& s = splats[tile.list[first + j]];
-    Brush b = s.brush;
-    b.x -= tile.x;
-    b.y -= tile.y;
-    brushes[j] = b;
-    e.x[j] = b.x;
-    e.y[j] = b.y;
-    e.slope[j] = b.slope;
-    e.reach[j] = s.ellipse.reach;
-    e.half_height[j] = s.ellipse.half_height;
-    e.rightmost[j] = s.ellipse.rightmost;
-    e.var_along[j] = s.ellipse.var_along;
-    e.inv_down[j] = s.ellipse.inv_down;
+    if (first + j + ahead < tile.length)
+      __builtin_prefetch(&splats[tile.list[first + j + ahead]]);
+    const Brush& b = splats[tile.list[first + j]].brush;
+    brushes[j] = localize(b, static_cast<float>(tile.x), static_cast<float>(tile.y));
+    columns.x[j] = b.x - tile.x;
+    columns.y[j] = b.y - tile.y;
+    columns.scale[j] = b.scale;
+    columns.skew[j] = b.skew;
+    columns.down[j] = b.down;
+    columns.power[j] = b.log_opacity - b.list_cut;
   }
-}
-
-struct Fragments {
-  Lanes u, dy, power;
-};
-inline Fragments meet(const Brush& b, Lanes px, Lanes py) {
-  Fragments f;
-  f.dy = py - broadcast<Lanes>(b.y);
-  f.u = fma(broadcast<Lanes>(-b.slope), f.dy, px - broadcast<Lanes>(b.x));
-  f.power = power_of(f.u, f.dy, broadcast<Lanes>(b.along), broadcast<Lanes>(b.down));
-  return f;
 }
 
 // ---- forward ---------------------------------------------------------------------------------
 
 struct BlockPixels {
-  Lanes light;  // transmittance while alive, then 0
-  Lanes final_light;
+  Lanes light;        // transmittance as if pixels never stopped: below the stop, it stays there
+  Lanes final_light;  // transmittance at the stop
   Lanes r, g, b, inv_z;
   IntLanes drawn, stop;
   bool alive;
@@ -124,41 +106,49 @@ struct TileCounts {
   int64_t drawn = 0, evaluated = 0;
 };
 
-// Blends the Gaussians in `todo`, front to back, into one block.
+// Blends a batch, front to back, into one block: the Gaussians whose bit is set in words[0],
+// words[kBlocks], ... Returns how many it met. (Local copies of the pixels, one by one: a struct
+// would be copied in small pieces, which stalls the loads that follow.)
 template <bool kCountEach>
-inline int blend_block(const Brush* brushes, uint64_t todo, int first, Lanes px, Lanes py,
-                       BlockPixels& pixels, int32_t* drawn_each) {
-  const Lanes floor = broadcast<Lanes>(kTransmittanceMin), one = broadcast<Lanes>(1.f);
-  BlockPixels p = pixels;
-  int evaluated = 0;
-  while (todo) {
-    const int j = __builtin_ctzll(todo);
-    todo &= todo - 1;
-    evaluated++;
-    const Brush& b = brushes[j];
-    const Fragments f = meet(b, px, py);
-    const Mask inside = ge(f.power, broadcast<Lanes>(b.cut));
-    const Lanes alpha = where(inside, alpha_of(exp2(f.power), broadcast<Lanes>(b.opacity)));
-    const Lanes after = p.light * (one - alpha);
-    const Mask alive = ge(after, floor);
-    const Lanes weight = where(alive, alpha * p.light);
-    p.light = where(alive, after);
-    p.final_light = select(alive, after, p.final_light);
-    p.stop = select(alive, broadcast_int(first + j + 1), p.stop);
-    const Mask drawn = both(inside, alive);
-    p.drawn = increment(drawn, p.drawn);
-    p.r = fma(weight, broadcast<Lanes>(b.r), p.r);
-    p.g = fma(weight, broadcast<Lanes>(b.g), p.g);
-    p.b = fma(weight, broadcast<Lanes>(b.b), p.b);
-    p.inv_z = fma(weight, broadcast<Lanes>(b.inv_z), p.inv_z);
-    if (kCountEach) drawn_each[j] += __builtin_popcount(bits(drawn));
-    if (!bits(alive)) {
-      p.alive = false;
-      break;
+inline int blend_block(const LocalBrush* brushes, const uint64_t* words, int count, int first, Lanes px,
+                       Lanes py, BlockPixels& pixels, int32_t* drawn_each) {
+  const Lanes floor = broadcast<Lanes>(kTransmittanceMin);
+  const Lanes tiny = broadcast<Lanes>(1e-30f);  // no denormal numbers: they are slow
+  Lanes light = pixels.light, final_light = pixels.final_light;
+  Lanes r = pixels.r, g = pixels.g, blue = pixels.b, inv_z = pixels.inv_z;
+  IntLanes drawn_count = pixels.drawn, stop = pixels.stop;
+  int met = 0;
+  for (int base = 0; base < count && pixels.alive; base += kWord, words += kBlocks) {
+    for (uint64_t todo = *words; todo; todo &= todo - 1) {
+      const int j = base + __builtin_ctzll(todo);
+      const LocalBrush& b = brushes[j];
+      met++;
+      const Lanes exponent = meet(b, px, py).exponent;
+      const Mask inside = ge(exponent, broadcast<Lanes>(b.cut));
+      const Lanes alpha = where(inside, capped(exp2(exponent)));
+      const Lanes after = fnma(light, alpha, light);
+      const Mask alive = ge(after, floor);
+      const Lanes weight = where(alive, alpha * light);
+      light = max(after, tiny);
+      final_light = select(alive, after, final_light);
+      stop = select(alive, broadcast_int(first + j + 1), stop);
+      const Mask drawn = both(inside, alive);
+      drawn_count = increment(drawn, drawn_count);
+      r = fma(weight, broadcast<Lanes>(b.r), r);
+      g = fma(weight, broadcast<Lanes>(b.g), g);
+      blue = fma(weight, broadcast<Lanes>(b.b), blue);
+      inv_z = fma(weight, broadcast<Lanes>(b.inv_z), inv_z);
+      if (kCountEach) drawn_each[j] += __builtin_popcount(bits(drawn));
+      if (!bits(alive)) {
+        pixels.alive = false;
+        break;
+      }
     }
   }
-  pixels = p;
-  return evaluated;
+  pixels.light = light, pixels.final_light = final_light;
+  pixels.r = r, pixels.g = g, pixels.b = blue, pixels.inv_z = inv_z;
+  pixels.drawn = drawn_count, pixels.stop = stop;
+  return met;
 }
 
 struct Canvas {
@@ -168,28 +158,36 @@ struct Canvas {
   int32_t* fragments;
 };
 
+// One number per pixel of a block, from block order to rows of the image.
+template <class T>
+inline void paint_plane(T* plane, int width, int x0, int y0, int wide, int high, const T* from) {
+  if (!plane) return;
+  for (int y = 0; y < high; y++) {
+    T* to = plane + static_cast<size_t>(y0 + y) * width + x0;
+    if (wide == kBlockWidth)
+      std::memcpy(to, from + y * kBlockWidth, kBlockWidth * sizeof *to);
+    else
+      for (int x = 0; x < wide; x++) to[x] = from[y * kBlockWidth + x];
+  }
+}
+
 inline void paint_block(const Canvas& c, int x0, int y0, const BlockPixels& p) {
-  float planes[5][kLanes];
-  int32_t drawn[kLanes];
-  store(planes[0], fma(p.final_light, broadcast<Lanes>(c.background[0]), p.r));
-  store(planes[1], fma(p.final_light, broadcast<Lanes>(c.background[1]), p.g));
-  store(planes[2], fma(p.final_light, broadcast<Lanes>(c.background[2]), p.b));
-  store(planes[3], p.inv_z);
-  store(planes[4], broadcast<Lanes>(1.f) - p.final_light);
-  store(drawn, p.drawn);
   const int wide = std::min(kBlockWidth, c.width - x0);
   const int high = std::min(kBlockHeight, c.height - y0);
-  const size_t plane = static_cast<size_t>(c.width) * c.height;
-  for (int y = 0; y < high; y++) {
-    const size_t at = static_cast<size_t>(y0 + y) * c.width + x0;
-    const int from = y * kBlockWidth;
-    for (int x = 0; x < wide; x++) {
-      for (int k = 0; k < 3; k++) c.image[k * plane + at + x] = planes[k][from + x];
-      if (c.invdepth) c.invdepth[at + x] = planes[3][from + x];
-      if (c.alpha) c.alpha[at + x] = planes[4][from + x];
-      if (c.fragments) c.fragments[at + x] = drawn[from + x];
-    }
-  }
+  const size_t size = static_cast<size_t>(c.width) * c.height;
+  const auto paint = [&](float* plane, Lanes v) {
+    float values[kLanes];
+    store(values, v);
+    paint_plane(plane, c.width, x0, y0, wide, high, values);
+  };
+  paint(c.image, fma(p.final_light, broadcast<Lanes>(c.background[0]), p.r));
+  paint(c.image + size, fma(p.final_light, broadcast<Lanes>(c.background[1]), p.g));
+  paint(c.image + 2 * size, fma(p.final_light, broadcast<Lanes>(c.background[2]), p.b));
+  paint(c.invdepth, p.inv_z);
+  paint(c.alpha, broadcast<Lanes>(1.f) - p.final_light);
+  int32_t drawn[kLanes];
+  store(drawn, p.drawn);
+  paint_plane(c.fragments, c.width, x0, y0, wide, high, drawn);
 }
 
 // Lanes whose pixel lies in the image: all ones, the others 0.
@@ -214,20 +212,23 @@ inline TileCounts blend_tile(const Splat* splats, const Tile& tile, const Canvas
     alive += blocks[b].alive;
   }
   TileCounts counts;
-  Brush brushes[kWord];
-  EllipseRows rows;
-  uint64_t scratch[kBlocks];
-  for (int first = 0; first < tile.length && alive; first += kWord) {
-    const int count = std::min(kWord, tile.length - first);
-    uint64_t* word = reached ? reached + static_cast<size_t>(first) / kWord * kBlocks : scratch;
-    stage(splats, tile, first, count, rows, brushes);
-    find_blocks(rows, count, word);
+  LocalBrush brushes[kBatch];
+  BrushColumns columns;
+  uint64_t scratch[kBatch / kWord * kBlocks];
+  for (int first = 0; first < tile.length && alive; first += kBatch) {
+    const int count = std::min(kBatch, tile.length - first);
+    uint64_t* words = reached ? reached + static_cast<size_t>(first) / kWord * kBlocks : scratch;
+    for (int base = 0; base < count; base += kWord) {
+      const int here = std::min(kWord, count - base);
+      stage(splats, tile, first + base, here, columns, brushes + base);
+      find_blocks(columns, here, words + base / kWord * kBlocks);
+    }
     for (int b = 0; b < kBlocks; b++) {
-      if (!blocks[b].alive || !word[b]) continue;
+      if (!blocks[b].alive) continue;
       const Lanes px = lx + broadcast<Lanes>(static_cast<float>(block_x(b)));
       const Lanes py = ly + broadcast<Lanes>(static_cast<float>(block_y(b)));
       counts.evaluated +=
-          kLanes * blend_block<kCountEach>(brushes, word[b], first, px, py, blocks[b],
+          kLanes * blend_block<kCountEach>(brushes, words + b, count, first, px, py, blocks[b],
                                            kCountEach ? drawn_each + first : nullptr);
       alive -= !blocks[b].alive;
     }
@@ -267,20 +268,23 @@ struct RimLoss {
   float per_fragment;         // dL/d(fragment)
 };
 
+// What the backward pass needs to know of one Gaussian's rim.
+struct Rim {
+  float list_cut, threshold, inv_opacity, per_fragment;
+};
+
 // One fragment of each lane, back to front. Skipped fragments leave light and behind untouched.
 template <int kWant>
-inline void unblend_block(const Brush& brush, float threshold, float per_fragment, int position,
-                          Lanes px, Lanes py, const int32_t* stops, int at, LossPixels& loss,
-                          Lanes* sums) {
-  const Fragments f = meet(brush, px, py);
-  const Mask reached = both(ge(f.power, broadcast<Lanes>(brush.list_cut)),
+inline void unblend_block(const LocalBrush& brush, const Rim& rim, int position, Lanes px, Lanes py,
+                          const int32_t* stops, int at, LossPixels& loss, Lanes* sums) {
+  const Meeting<Lanes> m = meet(brush, px, py);
+  const Mask reached = both(ge(m.exponent, broadcast<Lanes>(rim.list_cut)),
                             gt(load(stops + at), broadcast_int(position)));
   if (!bits(reached)) return;
   const Mask drawn =
-      kWant & kThreshold ? both(reached, ge(f.power, broadcast<Lanes>(brush.cut))) : reached;
-  const Lanes opacity = broadcast<Lanes>(brush.opacity), one = broadcast<Lanes>(1.f);
-  const Lanes falloff = exp2(f.power);
-  const Lanes full = alpha_of(falloff, opacity);
+      kWant & kThreshold ? both(reached, ge(m.exponent, broadcast<Lanes>(brush.cut))) : reached;
+  const Lanes one = broadcast<Lanes>(1.f);
+  const Lanes uncapped = exp2(m.exponent), full = capped(uncapped);
   const Lanes alpha = where(drawn, full);
   const Lanes inv = one / (one - alpha);
   const Lanes light = load(loss.light + at) * inv;
@@ -294,30 +298,29 @@ inline void unblend_block(const Brush& brush, float threshold, float per_fragmen
     shade = fma(gz, broadcast<Lanes>(brush.inv_z), shade);
   }
   const Lanes weight = alpha * light;
-  const Lanes by_alpha = fma(light, shade, -(behind * inv));
+  const Lanes by_alpha = fnma(behind, inv, light * shade);
   store(loss.light + at, light);
   store(loss.behind + at, fma(weight, shade, behind));
-  const Lanes by_opacity = where(drawn, falloff * by_alpha);  // straight through the cap
+  const Lanes w = where(drawn, uncapped * by_alpha);  // straight through the cap
   int k = 0;
-  sums[k] = sums[k] + by_opacity, k++;
+  sums[k] = sums[k] + w, k++;
   if (kWant & kThreshold) {
-    const Lanes away = abs(falloff - broadcast<Lanes>(threshold));
+    const Lanes falloff = uncapped * broadcast<Lanes>(rim.inv_opacity);
+    const Lanes away = abs(falloff - broadcast<Lanes>(rim.threshold));
     const Mask near = both(reached, ge(broadcast<Lanes>(kRimHorizon), away));
     if (bits(near)) {
-      const Lanes density = rim_density(falloff, broadcast<Lanes>(threshold));
-      const Lanes gain = fma(full, by_alpha, broadcast<Lanes>(per_fragment));
-      sums[k] = sums[k] - where(near, gain * density);
+      const Lanes gain = fma(full, by_alpha, broadcast<Lanes>(rim.per_fragment));
+      sums[k] = sums[k] - where(near, gain * rim_density(away));
     }
     k++;
   }
   if (kWant & kGeometry) {
-    const Lanes v = by_opacity * opacity;
-    const Lanes vu = v * f.u, vy = v * f.dy;
-    sums[k] = sums[k] + vu, k++;
-    sums[k] = sums[k] + vy, k++;
-    sums[k] = fma(vu, f.u, sums[k]), k++;
-    sums[k] = fma(vu, f.dy, sums[k]), k++;
-    sums[k] = fma(vy, f.dy, sums[k]), k++;
+    const Lanes wu = w * m.u, wv = w * m.v;
+    sums[k] = sums[k] + wu, k++;
+    sums[k] = sums[k] + wv, k++;
+    sums[k] = fma(wu, m.u, sums[k]), k++;
+    sums[k] = fma(wu, m.v, sums[k]), k++;
+    sums[k] = fma(wv, m.v, sums[k]), k++;
   }
   if (kWant & kColour) {
     sums[k] = fma(weight, gr, sums[k]), k++;
@@ -366,21 +369,24 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
         continue;
       }
       const Splat& s = splats[tile.list[first + j]];
-      Brush brush = s.brush;
-      brush.x -= tile.x;
-      brush.y -= tile.y;
-      const float threshold = kWant & kThreshold ? rim.thresholds[s.id] : 0;
+      const LocalBrush brush =
+          localize(s.brush, static_cast<float>(tile.x), static_cast<float>(tile.y));
+      Rim at = {s.brush.list_cut, 0, 0, rim.per_fragment};
+      if (kWant & kThreshold) {
+        at.threshold = rim.thresholds[s.id];
+        at.inv_opacity = std::exp2(-s.brush.log_opacity);
+      }
       Lanes sums[n];
       for (Lanes& v : sums) v = broadcast<Lanes>(0.f);
       for (; todo; todo &= todo - 1) {
         const int b = __builtin_ctzll(todo);
-        unblend_block<kWant>(brush, threshold, rim.per_fragment, first + j,
+        unblend_block<kWant>(brush, at, first + j,
                              lx + broadcast<Lanes>(static_cast<float>(block_x(b))),
                              ly + broadcast<Lanes>(static_cast<float>(block_y(b))), kept.stop,
                              b * kLanes, loss, sums);
       }
       float* to = place(first + j);
-      for (int k = 0; k < n; k++) to[k] = sum(sums[k]);
+      sum_each<n>(sums, to);
     }
   }
 }

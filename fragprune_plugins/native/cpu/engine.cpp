@@ -26,7 +26,8 @@ constexpr size_t kGrain = 1024;  // Gaussians per piece of work
 
 // The whole way of one Gaussian to what blending needs; false: it cannot draw anything. Colour is
 // computed last, for those that are left.
-bool make_splat(const Camera& c, const fragprune_inputs& in, int64_t i, int32_t* radius, Splat& s) {
+bool make_splat(const Camera& c, const fragprune_inputs& in, int64_t i, int32_t* radius, Splat& s,
+                float* depth, std::vector<Run>& runs) {
   Projection p;
   *radius = 0;
   if (!project(c, in, i, p)) return false;
@@ -35,61 +36,71 @@ bool make_splat(const Camera& c, const fragprune_inputs& in, int64_t i, int32_t*
   const float threshold = in.thresholds ? in.thresholds[i] : 0.f;
   if (!(opacity > 0 && opacity < 1e30f && threshold >= 0)) return false;
   Brush& b = s.brush;
-  b.cut = cut_power(opacity, threshold);
-  b.list_cut = in.widen ? cut_power(opacity, rim_reach(threshold)) : b.cut;
-  if (!(b.list_cut <= 0)) return false;
-  s.ellipse = ellipse_of(p, b.list_cut);
-  const float half_width = std::sqrt(s.ellipse.reach * p.var_x) + kSpanMargin;
-  const float half_height = s.ellipse.half_height, tile = kTile;
-  if (!(p.x + half_width >= p.tile_x0 * tile && p.y + half_height >= p.tile_y0 * tile &&
-        p.x - half_width <= std::min(c.width, p.tile_x1 * tile) - 1 &&
-        p.y - half_height <= std::min(c.height, p.tile_y1 * tile) - 1))
-    return false;
-  const Vec3 colour = colour_of(c, in, i);
-  if (!(std::fabs(colour.x) + std::fabs(colour.y) + std::fabs(colour.z) < 1e30f)) return false;
+  b.log_opacity = std::log2(opacity);
+  b.cut = cut_of(b.log_opacity, threshold);
+  b.list_cut = in.widen ? cut_of(b.log_opacity, rim_reach(threshold)) : b.cut;
+  if (!(b.list_cut <= b.log_opacity)) return false;
   b.x = p.x;
   b.y = p.y;
-  b.slope = p.cov / p.var_y;
-  b.along = -0.5f * kLog2E * (p.var_y / p.det);
-  b.down = -0.5f * kLog2E / p.var_y;
-  b.opacity = opacity;
-  b.r = colour.x, b.g = colour.y, b.b = colour.z;
+  b.scale = std::sqrt(0.5f * kLog2E * (p.var_y / p.det));
+  b.skew = -b.scale * (p.cov / p.var_y);
+  b.down = std::sqrt(0.5f * kLog2E / p.var_y);
   b.inv_z = 1 / p.view.z;
-  s.tile_x0 = static_cast<uint16_t>(p.tile_x0);
-  s.tile_x1 = static_cast<uint16_t>(p.tile_x1);
-  s.tile_y0 = static_cast<uint16_t>(p.tile_y0);
-  s.tile_y1 = static_cast<uint16_t>(p.tile_y1);
+  const size_t before = runs.size();
+  reached_tiles(c, p, b, [&](Run run) { runs.push_back(run); });
+  if (runs.size() == before) return false;
+  const Vec3 colour = colour_of(c, in, i);
+  if (!(std::fabs(colour.x) + std::fabs(colour.y) + std::fabs(colour.z) < 1e30f)) {
+    runs.resize(before);
+    return false;
+  }
+  b.r = colour.x, b.g = colour.y, b.b = colour.z;
   s.id = static_cast<uint32_t>(i);
+  *depth = p.view.z;
   return true;
 }
 
-// Splats that can draw, in the order of the inputs, and their depths.
-struct Scene {
-  Buffer<Splat> splats;
-  Buffer<float> depth;
-};
-
 Scene project_all(Team& team, const Camera& c, const fragprune_inputs& in, int32_t* radii) {
+  struct Piece {
+    std::vector<Splat> splats;
+    std::vector<float> depth;
+    std::vector<uint32_t> run_end;
+    std::vector<Run> runs;
+  };
   const size_t n = static_cast<size_t>(in.count), pieces = (n + kGrain - 1) / kGrain;
-  std::vector<std::vector<Splat>> found(pieces);
+  std::vector<Piece> found(pieces);
   team.each(n, kGrain, [&](size_t begin, size_t end) {
-    std::vector<Splat>& mine = found[begin / kGrain];
-    mine.resize(end - begin);
-    size_t kept = 0;
-    for (size_t i = begin; i < end; i++)
-      kept += make_splat(c, in, static_cast<int64_t>(i), radii + i, mine[kept]);
-    mine.resize(kept);
-  });
-  std::vector<size_t> first(pieces + 1, 0);
-  for (size_t k = 0; k < pieces; k++) first[k + 1] = first[k] + found[k].size();
-  Scene scene{Buffer<Splat>(first[pieces]), Buffer<float>(first[pieces])};
-  team.each(pieces, 1, [&](size_t k, size_t) {
-    for (size_t j = 0; j < found[k].size(); j++) {
-      scene.splats[first[k] + j] = found[k][j];
-      const Vec3 mean = read3(in.means + 3 * static_cast<size_t>(found[k][j].id));
-      scene.depth[first[k] + j] = dot(c.to_z, mean) + c.shift.z;
+    Piece& mine = found[begin / kGrain];
+    mine.splats.reserve(end - begin);
+    mine.depth.reserve(end - begin);
+    mine.run_end.reserve(end - begin);
+    mine.runs.reserve(4 * (end - begin));
+    Splat splat;
+    float depth;
+    for (size_t i = begin; i < end; i++) {
+      if (!make_splat(c, in, static_cast<int64_t>(i), radii + i, splat, &depth, mine.runs)) continue;
+      mine.splats.push_back(splat);
+      mine.depth.push_back(depth);
+      mine.run_end.push_back(static_cast<uint32_t>(mine.runs.size()));
     }
-    std::vector<Splat>().swap(found[k]);
+  });
+  std::vector<size_t> first(pieces + 1, 0), first_run(pieces + 1, 0);
+  for (size_t k = 0; k < pieces; k++) {
+    first[k + 1] = first[k] + found[k].splats.size();
+    first_run[k + 1] = first_run[k] + found[k].runs.size();
+  }
+  if (first_run[pieces] > UINT32_MAX) throw std::length_error("runs of tiles");
+  Scene scene{Buffer<Splat>(first[pieces]), Buffer<float>(first[pieces]),
+              Buffer<uint32_t>(first[pieces] + 1), Buffer<Run>(first_run[pieces])};
+  scene.run_begin[0] = 0;
+  team.each(pieces, 1, [&](size_t k, size_t) {
+    Piece mine;
+    std::swap(mine, found[k]);  // freed as soon as it is copied
+    std::copy(mine.splats.begin(), mine.splats.end(), scene.splats.data() + first[k]);
+    std::copy(mine.depth.begin(), mine.depth.end(), scene.depth.data() + first[k]);
+    std::copy(mine.runs.begin(), mine.runs.end(), scene.runs.data() + first_run[k]);
+    for (size_t j = 0; j < mine.run_end.size(); j++)
+      scene.run_begin[first[k] + j + 1] = static_cast<uint32_t>(first_run[k]) + mine.run_end[j];
   });
   return scene;
 }
@@ -135,7 +146,7 @@ void forward(const fragprune_inputs& in, fragprune_outputs& out, fragprune_state
   const Camera camera = unpack_camera(in);
   Scene scene = project_all(team, camera, in, out.radii);
   const Buffer<uint32_t> order = order_by_depth(team, scene.depth, scene.depth.size());
-  TileLists lists = distribute(team, camera, scene.splats.data(), order, keep != nullptr);
+  TileLists lists = distribute(team, camera, scene, order, keep != nullptr);
   if (out.fragments_per_gaussian)
     std::fill_n(out.fragments_per_gaussian, static_cast<size_t>(in.count), 0);
   if (keep) {
@@ -166,30 +177,47 @@ struct Losses {
   size_t plane;
 };
 
+// One plane of the image into block order; pixels outside the image, and a plane of NULL, are 0.
+void load_plane(const Camera& c, const Tile& tile, const float* plane, float* to) {
+  const int width = static_cast<int>(c.width), height = static_cast<int>(c.height);
+  if (!plane || tile.x + kTile > width || tile.y + kTile > height) std::fill_n(to, kPixels, 0.f);
+  if (!plane) return;
+  const int wide = std::min(kTile, width - tile.x), high = std::min(kTile, height - tile.y);
+  for (int y = 0; y < high; y++) {
+    const float* from = plane + static_cast<size_t>(tile.y + y) * width + tile.x;
+    for (int x = 0; x < wide; x += kBlockWidth) {
+      const int block = y / kBlockHeight * 4 + x / kBlockWidth;
+      float* at = to + block * kLanes + y % kBlockHeight * kBlockWidth;
+      if (x + kBlockWidth <= wide)
+        std::memcpy(at, from + x, kBlockWidth * sizeof *at);
+      else
+        std::copy(from + x, from + wide, at);
+    }
+  }
+}
+
 // Brings a tile's loss gradients into block order and starts the walk from the last fragment.
 void load_losses(const Camera& c, const Losses& from, const Tile& tile, const TilePixels& kept,
                  LossPixels& to, double* by_background) {
-  const int width = static_cast<int>(c.width), height = static_cast<int>(c.height);
-  double background[3] = {0, 0, 0};
-  for (int i = 0; i < kPixels; i++) {
-    const int x = tile.x + block_x(i / kLanes) + i % kLanes % kBlockWidth;
-    const int y = tile.y + block_y(i / kLanes) + i % kLanes / kBlockWidth;
-    float g[3] = {0, 0, 0}, inv_z = 0, alpha = 0;
-    if (x < width && y < height) {
-      const size_t at = static_cast<size_t>(y) * width + x;
-      if (from.grads.image)
-        for (int k = 0; k < 3; k++) g[k] = from.grads.image[k * from.plane + at];
-      if (from.grads.invdepth) inv_z = from.grads.invdepth[at];
-      if (from.grads.alpha) alpha = from.grads.alpha[at];
-    }
-    const float light = kept.transmittance[i];
-    to.r[i] = g[0], to.g[i] = g[1], to.b[i] = g[2], to.inv_z[i] = inv_z;
-    to.light[i] = light;
-    to.behind[i] = light * (g[0] * from.background[0] + g[1] * from.background[1] +
-                            g[2] * from.background[2] - alpha);
-    for (int k = 0; k < 3; k++) background[k] += static_cast<double>(light) * g[k];
+  const float* image = from.grads.image;
+  float alpha[kPixels];
+  load_plane(c, tile, image, to.r);
+  load_plane(c, tile, image ? image + from.plane : nullptr, to.g);
+  load_plane(c, tile, image ? image + 2 * from.plane : nullptr, to.b);
+  load_plane(c, tile, from.grads.invdepth, to.inv_z);
+  load_plane(c, tile, from.grads.alpha, alpha);
+  Lanes sums[3] = {};
+  for (int i = 0; i < kPixels; i += kLanes) {
+    const Lanes light = load(kept.transmittance + i);
+    const Lanes r = load(to.r + i), g = load(to.g + i), b = load(to.b + i);
+    const Lanes seen = r * broadcast<Lanes>(from.background[0]) +
+                       g * broadcast<Lanes>(from.background[1]) +
+                       b * broadcast<Lanes>(from.background[2]) - load(alpha + i);
+    store(to.light + i, light);
+    store(to.behind + i, light * seen);
+    sums[0] = sums[0] + light * r, sums[1] = sums[1] + light * g, sums[2] = sums[2] + light * b;
   }
-  for (int k = 0; k < 3; k++) by_background[k] = background[k];
+  for (int k = 0; k < 3; k++) by_background[k] = sum(sums[k]);
 }
 
 using UnblendTile = void (*)(const Splat*, const Tile&, const TilePixels&, const uint64_t*,
@@ -202,9 +230,9 @@ constexpr std::array<UnblendTile, sizeof...(kWants)> unblenders(std::index_seque
 
 PixelSums unpack_sums(const float* v, int want) {
   PixelSums s{};
-  s.opacity = *v++;
+  s.w = *v++;
   if (want & kThreshold) s.threshold = *v++;
-  if (want & kGeometry) s.u = *v++, s.y = *v++, s.uu = *v++, s.uy = *v++, s.yy = *v++;
+  if (want & kGeometry) s.u = *v++, s.v = *v++, s.uu = *v++, s.uv = *v++, s.vv = *v++;
   if (want & kColour) s.r = *v++, s.g = *v++, s.b = *v++;
   if (want & kDepth && want & kGeometry) s.inv_z = *v++;
   return s;
@@ -216,22 +244,17 @@ void chain(const fragprune_state& state, const fragprune_input_grads& to, int wa
   const Camera& c = state.camera;
   const fragprune_inputs& in = state.in;
   if (to.thresholds) to.thresholds[i] = sums.threshold;
+  if (to.opacities) to.opacities[i] = sums.w / in.opacities[i];  // alpha is proportional to it
   if (to.colors) write3(to.colors + 3 * i, {sums.r, sums.g, sums.b});
   Vec3 by_mean = {0, 0, 0};
   if (in.sh && want & kColour) {
     float* by_sh = to.sh ? to.sh + static_cast<int64_t>(3) * in.sh_coefficients * i : nullptr;
     by_mean = sh_gradient(c, in, i, sums, by_sh, to.means != nullptr && in.sh_degree > 0);
   }
-  const bool geometry = want & kGeometry;
-  if (!geometry && !(to.opacities && c.antialiasing)) {
-    if (to.opacities) to.opacities[i] = sums.opacity;
-    return;
-  }
+  if (!(want & kGeometry)) return;
   Projection p;
   project(c, in, i, p);
-  const ImageGradient g = image_gradient(c, p, in.opacities[i], sums);
-  if (to.opacities) to.opacities[i] = g.opacity;
-  if (!geometry) return;
+  const ImageGradient g = image_gradient(c, p, sums);
   if (to.means2d) write3(to.means2d + 3 * i, {g.x * 0.5f * c.width, g.y * 0.5f * c.height, 0});
   const Shape shape = shape_of(c, in, i);
   Mat3 m;

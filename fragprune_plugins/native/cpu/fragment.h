@@ -17,36 +17,60 @@ constexpr float kTransmittanceMin = static_cast<float>(FRAGPRUNE_TRANSMITTANCE_M
 // What blending reads of one Gaussian in one view, and nothing else.
 //
 // The squared Mahalanobis distance is kept as a completed square,
-//     q = (dx - slope dy)^2 / var_x_given_y + dy^2 / var_y,
+//     q = (dx - slope dy)^2 / var_along + dy^2 / var_down,
 // a sum of two positive terms: the expanded form a dx^2 + 2 b dx dy + c dy^2 loses all digits far
-// out on a long thin splat. Exponents are in base 2, the sign and 1/2 of exp(-q/2) included.
+// out on a long thin splat. With u = scale (dx - slope dy) and v = down dy, scaled so that
+// u^2 + v^2 = q log2(e) / 2, alpha before the cap is 2^(log_opacity - u^2 - v^2).
 struct Brush {
-  float x, y;         // mean, pixels
-  float slope;        // cov_xy / var_y
-  float along, down;  // -log2(e)/2 over var_x_given_y, and over var_y
-  float opacity;      // compensated
-  float r, g, b;
-  float inv_z;
-  float cut;       // drawn iff power >= cut
-  float list_cut;  // lists reach to here: cut, or farther when the rim wants gradients
+  float x, y;             // mean, pixels
+  float scale;            // sqrt(log2(e) / 2 / var_along)
+  float skew;             // -scale * slope
+  float down;             // sqrt(log2(e) / 2 / var_down)
+  float log_opacity;      // log2 of the compensated opacity
+  float cut;              // drawn iff the exponent is at least this
+  float list_cut;         // lists reach to here: cut, or farther when the rim wants gradients
+  float r, g, b, inv_z;
 };
 
-// A fragment's exponent: falloff = 2^power, never positive.
+// A brush seen from a tile: u = scale px + skew py + u0, v = down py + v0.
+struct LocalBrush {
+  float scale, skew, u0, down, v0;
+  float log_opacity, cut;
+  float r, g, b, inv_z;
+};
+
+FP_HD inline LocalBrush localize(const Brush& b, float tile_x, float tile_y) {
+  const float x = b.x - tile_x, y = b.y - tile_y;
+  return {b.scale,       b.skew, -(b.scale * x + b.skew * y), b.down, -b.down * y,
+          b.log_opacity, b.cut,  b.r, b.g, b.b, b.inv_z};
+}
+
+// One Gaussian at the pixels px, py of the tile.
 template <class V>
-FP_HD inline V power_of(V u, V dy, V along, V down) {
-  return fma(u * u, along, (dy * dy) * down);
+struct Meeting {
+  V u, v;
+  V exponent;  // log2 of alpha before the cap
+};
+
+template <class V>
+FP_HD inline Meeting<V> meet(const LocalBrush& b, V px, V py) {
+  Meeting<V> m;
+  m.u = fma(broadcast<V>(b.scale), px, fma(broadcast<V>(b.skew), py, broadcast<V>(b.u0)));
+  m.v = fma(broadcast<V>(b.down), py, broadcast<V>(b.v0));
+  m.exponent = fnma(m.u, m.u, fnma(m.v, m.v, broadcast<V>(b.log_opacity)));
+  return m;
 }
 
 template <class V>
-FP_HD inline V alpha_of(V falloff, V opacity) {
-  return min(falloff * opacity, broadcast<V>(kAlphaMax));
+FP_HD inline V capped(V alpha) {
+  return min(alpha, broadcast<V>(kAlphaMax));
 }
 
-// Density of the logistic at the rim, s(1-s)/w with s = sigmoid((falloff - threshold)/w).
+// Density of the logistic at the rim, s(1-s)/w with s = sigmoid(away/w), away = |falloff - tau|.
 template <class V>
-FP_HD inline V rim_density(V falloff, V threshold) {
+FP_HD inline V rim_density(V away) {
   constexpr float scale = static_cast<float>(1.0 / FRAGPRUNE_RIM_WIDTH);
-  const V e = exp2(abs(falloff - threshold) * broadcast<V>(-kLog2E * scale));
+  const V e = exp2(away * broadcast<V>(-kLog2E * scale));
   const V one_e = broadcast<V>(1.0f) + e;
   return e * broadcast<V>(scale) / (one_e * one_e);
 }

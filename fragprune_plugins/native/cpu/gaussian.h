@@ -200,11 +200,11 @@ FP_HD inline float compensation(const Camera& c, const Projection& p) {
   return std::sqrt(ratio > floor ? ratio : floor);
 }
 
-// The cutoff as a power of two (falloff = 2^power, Q = -2 ln 2 power): a fragment is drawn iff its
-// power is at least this. `threshold` is the truncation's falloff, 0 for none.
-FP_HD inline float cut_power(float opacity, float threshold) {
-  const float host = -std::log2(opacity * static_cast<float>(1 / FRAGPRUNE_ALPHA_MIN));
-  const float ours = std::log2(threshold);  // -inf for 0
+// The cutoff, once for everything: a fragment is drawn iff log2 of its alpha is at least this, that
+// is, iff alpha >= 1/255 and falloff >= threshold (the truncation's falloff, 0 for none).
+FP_HD inline float cut_of(float log_opacity, float threshold) {
+  const float host = static_cast<float>(-7.99435343685885793);  // log2(1/255)
+  const float ours = log_opacity + std::log2(threshold);        // -inf for 0
   return host > ours ? host : ours;
 }
 
@@ -292,42 +292,42 @@ FP_HD inline Vec3 colour_of(const Camera& c, const fragprune_inputs& in, int64_t
 
 // ---- derivatives -----------------------------------------------------------------------------
 
-// What the pixels say about one Gaussian: sums over its fragments. u = dx - slope dy, v = alpha
-// before the cap times dL/dalpha, the weight of everything that acts through the falloff.
+// What the pixels say about one Gaussian: sums over its fragments of w, alpha before the cap times
+// dL/dalpha: the weight of everything that acts through the exponent. u and v as in Brush.
 struct PixelSums {
-  float opacity;            // sum of falloff dL/dalpha
+  float w;                  // sum of w
   float threshold;          // dL/dtau
-  float u, y, uu, uy, yy;   // sums of v u, v dy, v u^2, v u dy, v dy^2
+  float u, v, uu, uv, vv;   // sums of w u, w v, w u^2, w u v, w v^2
   float r, g, b;            // dL/dcolour
   float inv_z;              // dL/d(1/z)
 };
 
-// dL/d of the dilated covariance, and of what acts beside it.
+// dL/d of the image: its position and its dilated covariance.
 struct ImageGradient {
   float x, y;               // pixels
   float var_x, cov, var_y;
-  float opacity;            // of the opacity as given
 };
 
-FP_HD inline ImageGradient image_gradient(const Camera& c, const Projection& p, float opacity,
+FP_HD inline ImageGradient image_gradient(const Camera& c, const Projection& p,
                                           const PixelSums& s) {
   const float slope = p.cov / p.var_y, inv_down = 1 / p.var_y, inv_along = p.var_y / p.det;
+  // u = scale (dx - slope dy), v = down dy: back to pixels
+  const float per_u = 1 / std::sqrt(0.5f * kLog2E * inv_along);
+  const float per_v = 1 / std::sqrt(0.5f * kLog2E * inv_down);
   ImageGradient g;
-  // q = u^2 / along + dy^2 / down, dL/dq = -v/2, u = (px - x) - slope (py - y)
-  g.x = s.u * inv_along;
-  g.y = s.y * inv_down - slope * g.x;
-  const float along = 0.5f * s.uu * inv_along * inv_along;
-  const float by_slope = s.uy * inv_along;
-  const float down = 0.5f * s.yy * inv_down * inv_down;
+  // q = (dx - slope dy)^2 / along + dy^2 / down, dL/dq = -w/2
+  g.x = per_u * s.u * inv_along;
+  g.y = per_v * s.v * inv_down - slope * g.x;
+  const float along = 0.5f * per_u * per_u * s.uu * inv_along * inv_along;
+  const float by_slope = per_u * per_v * s.uv * inv_along;
+  const float down = 0.5f * per_v * per_v * s.vv * inv_down * inv_down;
   // along = var_x - cov^2 / var_y, slope = cov / var_y, down = var_y
   g.var_x = along;
   g.cov = by_slope * inv_down - 2 * slope * along;
   g.var_y = down + slope * (slope * along - by_slope * inv_down);
-  const float h = compensation(c, p);
-  g.opacity = s.opacity * h;
   const float ratio = p.det_before / p.det;
   if (c.antialiasing && ratio > static_cast<float>(FRAGPRUNE_ANTIALIASING_FLOOR)) {
-    const float by_ratio = s.opacity * opacity * 0.5f / h / p.det;
+    const float by_ratio = 0.5f * s.w / (ratio * p.det);  // alpha goes with its root
     g.var_x += by_ratio * (p.var_y - c.dilation - ratio * p.var_y);
     g.var_y += by_ratio * (p.var_x - c.dilation - ratio * p.var_x);
     g.cov += by_ratio * 2 * p.cov * (ratio - 1);
