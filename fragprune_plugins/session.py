@@ -482,7 +482,8 @@ class Session:
         camera, model = (arguments[name] for name in seam.needs[:2])
         state = self._models.get(model)
         again = partial(self._render, wrapped, model, id(camera), args, kwargs)
-        if state is not None and state.plan is not None and torch.is_grad_enabled():
+        measured = self.settings.target_speedup is not None  # keeps the model alive: only if needed
+        if measured and state is not None and state.plan is not None and torch.is_grad_enabled():
             state.views[id(camera)] = again
         return again()
 

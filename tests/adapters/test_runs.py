@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import random
 import runpy
 import signal
 import sys
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -229,6 +231,17 @@ def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path)
     assert torch.equal(capture[4].detach(), final.scaling)
     assert len(final.xyz) != 150
     assert summary.iterations == 8
+
+
+def test_a_model_that_the_host_drops_is_not_kept_alive():
+    with running() as host:
+        model = host.model(5)
+        host.step(model, host.camera(), 1)
+        reference = weakref.ref(model)
+        del model
+        gc.collect()
+        assert reference() is None
+        assert host.finish().gaussians == 5
 
 
 def test_two_sessions_never_share_a_store():
