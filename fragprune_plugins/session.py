@@ -7,6 +7,7 @@ steps ourselves: hosts pass offset iterations. One store per model object.
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import sys
 import weakref
@@ -40,6 +41,8 @@ from fragprune_plugins.pressure import (
 from fragprune_plugins.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.seams import Role, Seam
 from fragprune_plugins.thresholds import ThresholdStore
+
+log = logging.getLogger("fragprune")
 
 
 @dataclass(frozen=True)
@@ -265,7 +268,13 @@ class Session:
         """The engine, created at its first use."""
         if self._engine is None:
             self._engine = self.hook.fragprune_create_engine(name=self._engine_name, device=device)
-        assert self._engine is not None  # the built-in plugin always answers
+            assert self._engine is not None  # the built-in plugin always answers
+            if self._engine.name == "reference":
+                log.warning(
+                    "drawing on %s with the reference engine: exact, and slow; "
+                    "fragprune doctor says why no faster one is used",
+                    device,
+                )
         return self._engine
 
     def finish(self) -> Summary:
