@@ -4,9 +4,7 @@
 
 #include <algorithm>
 #include <cstring>
-#include <limits>
 #include <memory>
-#include <stdexcept>
 #include <utility>
 #include <vector>
 
@@ -153,21 +151,20 @@ inline Buffer<uint32_t> order_by_depth(Team& team, const Buffer<float>& depth, s
 }
 
 // Tile t holds entries [first[t], first[t + 1]) of `splat`, front to back. Each entry also has a
-// slot: the entries of one splat have consecutive slots, so that what the tiles find out about it
-// can be gathered in a fixed order without atomics.
+// slot: those of splat k are slot_begin[k] to slot_begin[k + 1], so that what the tiles find out
+// about it can be gathered in a fixed order, from memory in order, without atomics.
 struct TileLists {
   std::vector<uint32_t> first;   // per tile, one more at the end
   Buffer<uint32_t> splat;        // per entry
   Buffer<uint32_t> slot;         // per entry; empty unless asked for
-  Buffer<uint32_t> slot_begin;   // per splat
-  Buffer<uint32_t> slot_count;   // per splat
 };
 
 // What projection leaves: splats that can draw, in the order of the inputs.
 struct Scene {
   Buffer<Splat> splats;
   Buffer<float> depth;         // per splat
-  Buffer<uint32_t> run_begin;  // per splat, one more at the end
+  Buffer<uint32_t> run_begin;   // per splat, one more at the end
+  Buffer<uint32_t> slot_begin;  // the same for its tiles
   Buffer<Run> runs;
 };
 
@@ -183,23 +180,14 @@ inline TileLists distribute(Team& team, const Camera& c, const Scene& scene,
       for (size_t t = run.row * across + run.x0; t <= run.row * across + run.x1; t++) visit(t);
     }
   };
-  std::vector<uint64_t> total(parts, 0);
   Buffer<uint32_t> cursor(parts * tiles);
   TileLists lists;
-  if (with_slots) {
-    lists.slot_begin = Buffer<uint32_t>(n);
-    lists.slot_count = Buffer<uint32_t>(n);
-  }
   team.each(parts, 1, [&](size_t part, size_t) {
     uint32_t* mine = &cursor[part * tiles];
     std::memset(mine, 0, tiles * sizeof *mine);
     for (size_t i = part * grain; i < std::min(n, (part + 1) * grain); i++)
       each_tile(order[i], [&](size_t t) { mine[t]++; });
-    for (size_t t = 0; t < tiles; t++) total[part] += mine[t];
   });
-  uint64_t entries = 0;
-  for (uint64_t& t : total) entries += std::exchange(t, entries);
-  if (entries > std::numeric_limits<uint32_t>::max()) throw std::length_error("tile lists");
   lists.first.resize(tiles + 1);
   uint32_t position = 0;
   for (size_t t = 0; t < tiles; t++) {
@@ -208,13 +196,13 @@ inline TileLists distribute(Team& team, const Camera& c, const Scene& scene,
       position += std::exchange(cursor[part * tiles + t], position);
   }
   lists.first[tiles] = position;
-  lists.splat = Buffer<uint32_t>(entries);
-  if (with_slots) lists.slot = Buffer<uint32_t>(entries);
+  lists.splat = Buffer<uint32_t>(position);
+  if (with_slots) lists.slot = Buffer<uint32_t>(position);
   team.each(parts, 1, [&](size_t part, size_t) {
     uint32_t* mine = &cursor[part * tiles];
-    uint32_t slot = static_cast<uint32_t>(total[part]);
     for (size_t i = part * grain; i < std::min(n, (part + 1) * grain); i++) {
-      const uint32_t k = order[i], before = slot;
+      const uint32_t k = order[i];
+      uint32_t slot = scene.slot_begin[k];
       if (with_slots)
         each_tile(k, [&](size_t t) {
           lists.splat[mine[t]] = k;
@@ -222,10 +210,6 @@ inline TileLists distribute(Team& team, const Camera& c, const Scene& scene,
         });
       else
         each_tile(k, [&](size_t t) { lists.splat[mine[t]++] = k; });
-      if (with_slots) {
-        lists.slot_begin[k] = before;
-        lists.slot_count[k] = slot - before;
-      }
     }
   });
   return lists;

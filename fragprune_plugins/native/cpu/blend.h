@@ -15,6 +15,7 @@ constexpr int kBlockRows = kTile / kBlockHeight, kBlocks = kBlockRows * 4;
 constexpr int kPixels = kTile * kTile;
 constexpr int kWord = 64;    // Gaussians per word of bits
 constexpr int kBatch = 256;  // Gaussians staged at once
+constexpr int kAhead = 16;   // Gaussians; far enough to hide a miss of the caches
 
 // What the forward pass leaves for the backward pass, pixels in block order.
 struct TilePixels {
@@ -77,10 +78,9 @@ inline void find_blocks(const BrushColumns& columns, int count, uint64_t* reache
 // Copies a word's worth of Gaussians out of the scene, in coordinates of the tile.
 inline void stage(const Splat* splats, const Tile& tile, int first, int count,
                   BrushColumns& columns, LocalBrush* brushes) {
-  constexpr int ahead = 16;  // entries; long enough to hide a miss of the caches
   for (int j = 0; j < count; j++) {
-    if (first + j + ahead < tile.length)
-      __builtin_prefetch(&splats[tile.list[first + j + ahead]]);
+    if (first + j + kAhead < tile.length)
+      __builtin_prefetch(&splats[tile.list[first + j + kAhead]]);
     const Brush& b = splats[tile.list[first + j]].brush;
     brushes[j] = localize(b, static_cast<float>(tile.x), static_cast<float>(tile.y));
     columns.x[j] = b.x - tile.x;
@@ -368,6 +368,7 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
         std::fill_n(place(first + j), n, 0.f);
         continue;
       }
+      if (first + j >= kAhead) __builtin_prefetch(&splats[tile.list[first + j - kAhead]]);
       const Splat& s = splats[tile.list[first + j]];
       const LocalBrush brush =
           localize(s.brush, static_cast<float>(tile.x), static_cast<float>(tile.y));

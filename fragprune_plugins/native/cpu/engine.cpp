@@ -3,6 +3,7 @@
 #include <array>
 #include <cstdio>
 #include <new>
+#include <stdexcept>
 #include <utility>
 
 #include "blend.h"
@@ -11,6 +12,7 @@ struct fragprune_state {
   fragprune_inputs in;
   fp::Camera camera;
   fp::Buffer<fp::Splat> splats;
+  fp::Buffer<uint32_t> slot_begin;   // per splat, one more at the end
   fp::TileLists lists;
   fp::Buffer<size_t> words;          // per tile: where its bits begin
   fp::Buffer<uint64_t> reached;      // see find_blocks
@@ -64,7 +66,7 @@ Scene project_all(Team& team, const Camera& c, const fragprune_inputs& in, int32
   struct Piece {
     std::vector<Splat> splats;
     std::vector<float> depth;
-    std::vector<uint32_t> run_end;
+    std::vector<uint32_t> run_end, slot_end;
     std::vector<Run> runs;
   };
   const size_t n = static_cast<size_t>(in.count), pieces = (n + kGrain - 1) / kGrain;
@@ -72,35 +74,48 @@ Scene project_all(Team& team, const Camera& c, const fragprune_inputs& in, int32
   team.each(n, kGrain, [&](size_t begin, size_t end) {
     Piece& mine = found[begin / kGrain];
     mine.splats.reserve(end - begin);
-    mine.depth.reserve(end - begin);
-    mine.run_end.reserve(end - begin);
     mine.runs.reserve(4 * (end - begin));
     Splat splat;
     float depth;
+    uint64_t slots = 0;
     for (size_t i = begin; i < end; i++) {
+      const size_t runs = mine.runs.size();
       if (!make_splat(c, in, static_cast<int64_t>(i), radii + i, splat, &depth, mine.runs)) continue;
+      for (size_t r = runs; r < mine.runs.size(); r++)
+        slots += mine.runs[r].x1 - mine.runs[r].x0 + 1;
+      if (slots > UINT32_MAX) throw std::length_error("tile lists");
       mine.splats.push_back(splat);
       mine.depth.push_back(depth);
       mine.run_end.push_back(static_cast<uint32_t>(mine.runs.size()));
+      mine.slot_end.push_back(static_cast<uint32_t>(slots));
     }
   });
-  std::vector<size_t> first(pieces + 1, 0), first_run(pieces + 1, 0);
+  struct Place {
+    size_t splat, run, slot;
+  };
+  std::vector<Place> place(pieces + 1, Place{0, 0, 0});
   for (size_t k = 0; k < pieces; k++) {
-    first[k + 1] = first[k] + found[k].splats.size();
-    first_run[k + 1] = first_run[k] + found[k].runs.size();
+    const Piece& p = found[k];
+    place[k + 1] = {place[k].splat + p.splats.size(), place[k].run + p.runs.size(),
+                    place[k].slot + (p.slot_end.empty() ? 0 : p.slot_end.back())};
   }
-  if (first_run[pieces] > UINT32_MAX) throw std::length_error("runs of tiles");
-  Scene scene{Buffer<Splat>(first[pieces]), Buffer<float>(first[pieces]),
-              Buffer<uint32_t>(first[pieces] + 1), Buffer<Run>(first_run[pieces])};
-  scene.run_begin[0] = 0;
+  const Place total = place[pieces];  // runs are fewer than slots
+  if (total.slot > UINT32_MAX) throw std::length_error("tile lists");
+  Scene scene{Buffer<Splat>(total.splat), Buffer<float>(total.splat),
+              Buffer<uint32_t>(total.splat + 1), Buffer<uint32_t>(total.splat + 1),
+              Buffer<Run>(total.run)};
+  scene.run_begin[0] = scene.slot_begin[0] = 0;
   team.each(pieces, 1, [&](size_t k, size_t) {
     Piece mine;
     std::swap(mine, found[k]);  // freed as soon as it is copied
-    std::copy(mine.splats.begin(), mine.splats.end(), scene.splats.data() + first[k]);
-    std::copy(mine.depth.begin(), mine.depth.end(), scene.depth.data() + first[k]);
-    std::copy(mine.runs.begin(), mine.runs.end(), scene.runs.data() + first_run[k]);
-    for (size_t j = 0; j < mine.run_end.size(); j++)
-      scene.run_begin[first[k] + j + 1] = static_cast<uint32_t>(first_run[k]) + mine.run_end[j];
+    const Place at = place[k];
+    std::copy(mine.splats.begin(), mine.splats.end(), scene.splats.data() + at.splat);
+    std::copy(mine.depth.begin(), mine.depth.end(), scene.depth.data() + at.splat);
+    std::copy(mine.runs.begin(), mine.runs.end(), scene.runs.data() + at.run);
+    for (size_t j = 0; j < mine.run_end.size(); j++) {
+      scene.run_begin[at.splat + j + 1] = static_cast<uint32_t>(at.run) + mine.run_end[j];
+      scene.slot_begin[at.splat + j + 1] = static_cast<uint32_t>(at.slot) + mine.slot_end[j];
+    }
   });
   return scene;
 }
@@ -165,6 +180,7 @@ void forward(const fragprune_inputs& in, fragprune_outputs& out, fragprune_state
     keep->in = in;
     keep->camera = camera;
     keep->splats = std::move(scene.splats);
+    keep->slot_begin = std::move(scene.slot_begin);
     keep->lists = std::move(lists);
   }
 }
@@ -286,9 +302,11 @@ void chain(const fragprune_state& state, const fragprune_input_grads& to, int wa
   }
 }
 
-void clear(Team& team, float* p, size_t n) {
-  if (p) team.each(n, size_t{1} << 18, [&](size_t a, size_t b) { std::fill(p + a, p + b, 0.f); });
-}
+// A gradient array and its numbers per Gaussian.
+struct GradientRows {
+  float* data;
+  size_t width;
+};
 
 void backward(const fragprune_state& state, const fragprune_output_grads& grads,
               const fragprune_input_grads& to, int threads) {
@@ -301,14 +319,16 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
   if (to.thresholds) want |= kThreshold;
   if (grads.invdepth) want |= kDepth;
   const size_t n = static_cast<size_t>(in.count), sh_size = 3 * size_t(in.sh_coefficients);
-  const std::pair<float*, size_t> arrays[] = {
-      {to.means, 3},  {to.means2d, 3}, {to.opacities, 1}, {to.scales, 3},    {to.rotations, 4},
-      {to.cov3d, 6},  {to.sh, sh_size}, {to.colors, 3},   {to.thresholds, 1}};
+  const GradientRows arrays[] = {
+      {to.means, 3}, {to.means2d, 3},  {to.opacities, 1}, {to.scales, 3},    {to.rotations, 4},
+      {to.cov3d, 6}, {to.sh, sh_size}, {to.colors, 3},    {to.thresholds, 1}};
   bool per_gaussian = false;
-  for (const auto& [array, width] : arrays) {
-    clear(team, array, n * width);
-    per_gaussian |= array != nullptr;
-  }
+  for (const GradientRows& rows : arrays) per_gaussian |= rows.data != nullptr;
+  const auto clear = [&](size_t begin, size_t end) {  // of Gaussians that draw nothing
+    for (const GradientRows& rows : arrays)
+      if (rows.data && begin < end)
+        std::fill(rows.data + begin * rows.width, rows.data + end * rows.width, 0.f);
+  };
 
   static constexpr auto table = unblenders(std::make_index_sequence<16>());
   const int size = sums_of(want);
@@ -336,15 +356,19 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
       to.background[k] = static_cast<float>(total);
     }
   if (!per_gaussian) return;
-  team.each(state.splats.size(), kGrain, [&](size_t begin, size_t end) {
+  const size_t splats = state.splats.size();
+  if (splats == 0) clear(0, n);
+  team.each(splats, kGrain, [&](size_t begin, size_t end) {
     for (size_t k = begin; k < end; k++) {
-      if (lists.slot_count[k] == 0) continue;
-      float total[16] = {};
-      const float* v = sums.data() + static_cast<size_t>(lists.slot_begin[k]) * size;
-      for (uint32_t e = 0; e < lists.slot_count[k]; e++)
+      const size_t i = state.splats[k].id;
+      clear(k ? state.splats[k - 1].id + size_t{1} : 0, i);
+      float total[sums_of(15)] = {};
+      const float* v = sums.data() + static_cast<size_t>(state.slot_begin[k]) * size;
+      for (uint32_t slot = state.slot_begin[k]; slot < state.slot_begin[k + 1]; slot++)
         for (int s = 0; s < size; s++) total[s] += *v++;
-      chain(state, to, want, state.splats[k].id, unpack_sums(total, want));
+      chain(state, to, want, static_cast<int64_t>(i), unpack_sums(total, want));
     }
+    if (end == splats) clear(state.splats[splats - 1].id + size_t{1}, n);
   });
 }
 

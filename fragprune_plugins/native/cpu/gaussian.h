@@ -15,7 +15,10 @@ struct Vec3 {
 FP_HD inline Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 FP_HD inline Vec3 operator-(Vec3 a, Vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 FP_HD inline Vec3 operator*(float s, Vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
-FP_HD inline float dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+FP_HD inline Vec3 add_scaled(Vec3 a, float s, Vec3 b) {
+  return {fma(s, b.x, a.x), fma(s, b.y, a.y), fma(s, b.z, a.z)};
+}
+FP_HD inline float dot(Vec3 a, Vec3 b) { return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z)); }
 FP_HD inline Vec3 cross(Vec3 a, Vec3 b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
@@ -73,7 +76,7 @@ FP_HD inline Vec3 operator*(const Mat3& m, Vec3 v) {
   return {dot(m.row[0], v), dot(m.row[1], v), dot(m.row[2], v)};
 }
 FP_HD inline Vec3 row_times(Vec3 v, const Mat3& m) {
-  return v.x * m.row[0] + v.y * m.row[1] + v.z * m.row[2];
+  return add_scaled(add_scaled(v.x * m.row[0], v.y, m.row[1]), v.z, m.row[2]);
 }
 
 // Rotation matrix of a quaternion w, x, y, z, used as given (the host normalises).
@@ -276,7 +279,7 @@ FP_HD inline int harmonics(int degree, Vec3 d, Harmonics& h, bool with_slope) {
 // Colour before the clamp at zero, from the direction in which the camera sees the mean.
 FP_HD inline Vec3 raw_colour(const float* sh, const Harmonics& h, int terms) {
   Vec3 colour = {0.5f, 0.5f, 0.5f};
-  for (int k = 0; k < terms; k++) colour = colour + h.value[k] * read3(sh + 3 * k);
+  for (int k = 0; k < terms; k++) colour = add_scaled(colour, h.value[k], read3(sh + 3 * k));
   return colour;
 }
 
@@ -400,7 +403,7 @@ FP_HD inline Vec3 sh_gradient(const Camera& c, const fragprune_inputs& in, int64
   }
   if (!by_direction) return {0, 0, 0};
   Vec3 d = {0, 0, 0};
-  for (int k = 0; k < terms; k++) d = d + dot(g, read3(sh + 3 * k)) * h.slope[k];
+  for (int k = 0; k < terms; k++) d = add_scaled(d, dot(g, read3(sh + 3 * k)), h.slope[k]);
   return inv_length * (d - dot(d, direction) * direction);
 }
 

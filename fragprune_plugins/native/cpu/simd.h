@@ -38,6 +38,13 @@ inline float broadcast<float>(float x) {
 inline float min(float a, float b) { return a < b ? a : b; }
 inline float max(float a, float b) { return a > b ? a : b; }
 inline float sqrt(float a) { return std::sqrt(a); }
+inline float fma(float a, float b, float c) {
+#ifdef FP_FAST_FMAF
+  return __builtin_fmaf(a, b, c);
+#else
+  return a * b + c;  // without the instruction a true fused multiply-add is a slow library call
+#endif
+}
 
 template <class To, class From>
 inline To bits_as(From from) {
