@@ -47,13 +47,18 @@ def draw_pair(
     return truth, ours, truth.fragments == ours.fragments
 
 
-def check_images(truth: RasterOutputs, ours: RasterOutputs, same: torch.Tensor) -> None:
+def check_images(
+    truth: RasterOutputs,
+    ours: RasterOutputs,
+    same: torch.Tensor,
+    tolerance: float = IMAGE_TOLERANCE,
+) -> None:
     assert (~same).sum() <= 1 + same.numel() // 500
     for name in ("image", "invdepth", "alpha"):
         expected = getattr(truth, name)
         difference = (expected - getattr(ours, name))[:, same].abs()
         scale = max(1.0, expected.abs().max().item())
-        assert difference.numel() == 0 or difference.max() < IMAGE_TOLERANCE * scale, name
+        assert difference.numel() == 0 or difference.max() < tolerance * scale, name
     assert ours.fragments is not None
     assert ours.fragments.sum() == ours.fragments_per_gaussian.sum()
     mean = ours.fragments.double().mean()
@@ -179,8 +184,10 @@ def test_awkward_scenes_equal_the_oracle(
     assert (away <= 1 + 1e-6 * truth.radii).all()
     if away.any():
         return  # 3 sigma within rounding of an integer: a whole tile more or less, rightly
-    check_images(truth, ours, same)
-    # A needle thousands of pixels long and one wide has a nearly singular covariance: the gradient
-    # of its rotation is a difference of large numbers, and float32 leaves two digits of it.
-    longest = max([0, *truth.radii.tolist()])
-    check_gradients(engine, inputs, thresholds, same, tolerance=2e-3 if longest < 500 else 3e-2)
+    check_images(truth, ours, same, 1e-4)
+    # Rounding of a mean far off the image moves a giant splat by 1e-4 pixels and more. A needle's
+    # covariance has a condition number of (length / width)^2, the width at least the dilation's
+    # 0.55 pixels: that many times 2^-24 is lost from the gradients of its shape. And in images of
+    # a pixel or two the terms of a gradient may cancel, with nothing to average over.
+    sigma = max([0, *truth.radii.tolist()]) / 3
+    check_gradients(engine, inputs, thresholds, same, 1e-2 + (sigma / 0.55) ** 2 * 2.0**-24)

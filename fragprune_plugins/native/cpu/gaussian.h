@@ -139,8 +139,16 @@ FP_HD inline void project_axes(const Camera& c, Projection& p) {
   p.axis_y = (c.focal_y * inv_z) * (c.to_y - clamp(slope_y, -c.limit_y, c.limit_y) * c.to_z);
 }
 
-// The image's covariance. Determinants of factored shapes are squared areas (Lagrange's identity):
-// var_x var_y - cov^2 would lose every digit on a long thin splat.
+// a . (m b) in double precision, for a symmetric m.
+FP_HD inline double wide_form(Vec3 a, const Mat3& m, Vec3 b) {
+  const double x = b.x, y = b.y, z = b.z;
+  return a.x * (m.row[0].x * x + m.row[0].y * y + m.row[0].z * z) +
+         a.y * (m.row[1].x * x + m.row[1].y * y + m.row[1].z * z) +
+         a.z * (m.row[2].x * x + m.row[2].y * y + m.row[2].z * z);
+}
+
+// The image's covariance. var_x var_y - cov^2 loses every digit on a long thin splat: determinants
+// of factored shapes are squared areas (Lagrange's identity), the others need double precision.
 FP_HD inline void project_shape(const Camera& c, const Shape& s, Projection& p) {
   p.image_x = row_times(p.axis_x, s.matrix);
   p.image_y = row_times(p.axis_y, s.matrix);
@@ -151,11 +159,13 @@ FP_HD inline void project_shape(const Camera& c, const Shape& s, Projection& p) 
     const Vec3 area = cross(p.image_x, p.image_y);
     p.det_before = dot(area, area);
   } else {
-    p.var_x = dot(p.image_x, p.axis_x);
-    p.cov = dot(p.image_x, p.axis_y);
-    p.var_y = dot(p.image_y, p.axis_y);
-    p.det_before = static_cast<float>(static_cast<double>(p.var_x) * p.var_y -
-                                      static_cast<double>(p.cov) * p.cov);
+    const double xx = wide_form(p.axis_x, s.matrix, p.axis_x);
+    const double xy = wide_form(p.axis_x, s.matrix, p.axis_y);
+    const double yy = wide_form(p.axis_y, s.matrix, p.axis_y);
+    p.var_x = static_cast<float>(xx);
+    p.cov = static_cast<float>(xy);
+    p.var_y = static_cast<float>(yy);
+    p.det_before = static_cast<float>(xx * yy - xy * xy);
   }
   p.det = p.det_before + c.dilation * (p.var_x + p.var_y + c.dilation);
   p.var_x += c.dilation;
