@@ -95,6 +95,8 @@ class CommandLine:
         save_checkpoints: flag listing iterations to checkpoint at.
         resume: flag naming the checkpoint to resume from.
         default_iterations: of the host, read from its source.
+        config: flag naming a JSON file whose values the host puts over its command line; "" for
+            none.
     """
 
     scripts: tuple[str, ...]
@@ -104,6 +106,7 @@ class CommandLine:
     save_checkpoints: str
     resume: str
     default_iterations: int
+    config: str = ""
 
 
 class HostAdapter(ABC):
@@ -177,6 +180,10 @@ class HostAdapter(ABC):
     def before_restore(self, model: Any, capture: Any) -> Any:
         """A chance to complete a checkpoint that lacks something; returns it."""
         return capture
+
+    def still_rate(self, rate: Any) -> Any:
+        """What the STEP seam tells the host in stage 2; a host that makes noise of it gets none."""
+        return rate
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
         """A chance to bring back state that the host's own resume loses."""

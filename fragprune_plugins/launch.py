@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
+import json
 import logging
 import runpy
 import sys
@@ -201,6 +202,14 @@ class _Runner:
         checkpoints = sorted({*(self.host.flags.save_checkpoints or []), total})
         log.info("stage 1: the host's own training, %d iterations", total)
         self._execute(self.host.with_flags(save_checkpoints=checkpoints), learn=False)
+        saved = self.adapter.saved_iterations(self.output) if self.output else []
+        if total not in (iteration for iteration, _ in saved):  # hosts refuse with exit code 0 too
+            raise HostFailed(
+                self.host.script.name,
+                f"ended without a checkpoint of iteration {total}",
+                "its own training to come to its end",
+                "Read the host's own message above.",
+            )
         self.finetune()
 
     def finetune(self) -> None:
@@ -373,8 +382,30 @@ def _parse(script: Path, arguments: list[str], line: CommandLine) -> _Invocation
     parser.add_argument(*line.source, dest="source")
     parser.add_argument(line.save_checkpoints, dest="save_checkpoints", type=int, nargs="*")
     parser.add_argument(line.resume, dest="resume")
+    if line.config:
+        parser.add_argument(line.config, dest="config")
     flags, _ = parser.parse_known_args(arguments)
+    if line.config and flags.config:
+        _refuse_overrides(Path(flags.config), line)
     return _Invocation(script, arguments, flags, line)
+
+
+def _refuse_overrides(config: Path, line: CommandLine) -> None:
+    """A configuration file wins over the command line: it must leave alone what we put there."""
+    ours = (*line.output, line.iterations, line.save_checkpoints, line.resume)
+    try:
+        values = json.loads(config.read_text())
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"{line.config} {config}", str(error), "a readable JSON file", "Correct the command."
+        ) from error
+    if taken := sorted({flag.lstrip("-") for flag in ours} & set(values)):
+        raise UsageError(
+            f"{line.config} {config}",
+            f"sets {', '.join(taken)}, over whatever the command says",
+            "these on the command line, where stage 2 can change them",
+            "Move them there.",
+        )
 
 
 def _device(wanted: str) -> str:

@@ -445,6 +445,7 @@ class Session:
                 self.adapter.prepare_stage2(model, self.output)
                 state.prepared = True
             self._freeze(model)
+            result = self.adapter.still_rate(result)
         if state.plan and state.plan.learn and self.settings.truncate:
             state.store.open(self.adapter.opacities(model))
             self._meet_target(state)
@@ -596,6 +597,51 @@ class Session:
         self._changed(state.store, "append", before)
         return result
 
+    def _on_choice(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        state = self._models.get(model)
+        if state is not None:
+            chosen = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
+            state.pending_parents = chosen.detach().clone()
+        return result
+
+    def _on_copy(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        if self._standing_still(model):
+            return None
+        state = self._models.get(model)
+        if state is None:
+            return wrapped(*args, **kwargs)
+        mask = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
+        target = mask.nonzero()[:, 0]
+        state.pending_parents = None
+        try:
+            result = wrapped(*args, **kwargs)
+        finally:
+            source, state.pending_parents = state.pending_parents, None
+        if source is None:  # nothing to overwrite, or nothing to copy
+            return result
+        groups = self.adapter.optimizers(model)[0].param_groups
+        rows = {group["name"]: group["params"][0].detach()[target] for group in groups}
+        if len(source) != len(target) or not self.adapter.check_children(model, rows, source):
+            raise AlignmentError(
+                str(seam),
+                f"{len(target)} overwritten rows that are not copies of the {len(source)} drawn",
+                "one copy per overwritten row, in the host's order",
+                "Report this with the host's commit: its relocation differs.",
+            )
+        state.store.copy(source, target)
+        self._changed(state.store, "copy", len(state.store))
+        return result
+
+    def _on_forget(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        state = self._models.get(model)
+        if state is not None:
+            bound = signature(wrapped).bind(*args, **kwargs)
+            bound.apply_defaults()
+            state.store.forget(bound.arguments[seam.needs[0]])
+        return result
+
     def _on_keep(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         result = wrapped(*args, **kwargs)
         state = self._models.get(model)
@@ -690,6 +736,9 @@ _HANDLERS: dict[Role, Callable[..., Any]] = {
     Role.PARENTS: Session._on_parents,
     Role.KEEP: Session._on_keep,
     Role.APPEND: Session._on_append,
+    Role.CHOICE: Session._on_choice,
+    Role.COPY: Session._on_copy,
+    Role.FORGET: Session._on_forget,
     Role.STILL: Session._on_still,
     Role.SAVE: Session._on_save,
     Role.LOAD: Session._on_load,

@@ -116,6 +116,14 @@ class ThresholdStore:
 
         self._resize(moved)
 
+    def forget(self, rows: Tensor | None = None) -> None:
+        """Zero the moments of rows (M,) int64, repeats allowed; of all when None."""
+        chosen = slice(None) if rows is None else self._rows(rows, len(rows), "forget")
+        state = self.optimizer.state.get(self.logits)
+        if state:
+            state["exp_avg"][chosen] = 0
+            state["exp_avg_sq"][chosen] = 0
+
     def replace(self, count: int) -> None:
         """Another population altogether: count neutral rows, fresh moments."""
         lr = self.optimizer.param_groups[0]["lr"]

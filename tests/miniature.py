@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from fragprune_plugins import demo
+from fragprune_plugins.adapter import HostAdapter
 from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.device import cpu_only
 from fragprune_plugins.plugins import load_plugins
@@ -110,7 +111,13 @@ def imported(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def running(
-    settings: Settings | None = None, *, plugins: Any = None, active: bool = True, **options: Any
+    settings: Settings | None = None,
+    *,
+    plugins: Any = None,
+    active: bool = True,
+    path: Path = HOST,
+    adapter: HostAdapter | None = None,
+    **options: Any,
 ) -> Iterator[Running]:
     """The host, imported under a session (activated unless told otherwise)."""
     loaded = load_plugins()
@@ -118,8 +125,8 @@ def running(
         loaded.manager.register(plugin, f"test-{index}")
     settings = settings or Settings(iterations=20)
     options = {"drop_in": True} | options
-    session = Session(Vanilla3DGS(), HostRepo(HOST), loaded, settings, **options)
-    with imported(HOST), cpu_only():
+    session = Session(adapter or Vanilla3DGS(), HostRepo(path), loaded, settings, **options)
+    with imported(path), cpu_only():
         if active:
             session.activate()
         try:
@@ -137,6 +144,41 @@ def joint(settings: Settings | None = None, **options: Any) -> Any:
     settings = settings or Settings(iterations=20)
     schedule = JointSchedule(settings, 1)
     return running(settings, freeze=False, schedule=schedule, **options)
+
+
+def identity(model: Any) -> torch.Tensor:
+    """(N,) the number each row carries in its red coefficient, which hosts copy to children."""
+    numbers: torch.Tensor = model._features_dc.detach()[:, 0, 0].round().long()
+    return numbers
+
+
+def label(host: Running, model: Any) -> None:
+    """Give row i the identity i, and a threshold and moments that only i has."""
+    numbers = torch.arange(len(model.get_xyz)).float()
+    with torch.no_grad():
+        model._features_dc[:, 0, 0] = numbers
+    store = host.store(model)
+    store.load_state_dict(
+        {
+            "logits": -3 + numbers / 8,
+            "exp_avg": numbers + 1,
+            "exp_avg_sq": numbers + 1,
+            "adam_step": 2.0,
+            "steps": 2,
+        }
+    )
+
+
+def expect_ancestors(host: Running, model: Any) -> None:
+    """Every row has the threshold of the row it descends from, and its moments or none."""
+    store, state = host.store(model), host.store(model).state_dict()
+    assert len(store) == len(model.get_xyz) == len(identity(model))
+    expected = -3 + identity(model).float() / 8
+    assert torch.equal(state["logits"], expected)
+    moments = state["exp_avg"]
+    old = moments != 0  # children start without moments, as the hosts' do
+    assert torch.equal(moments[old], identity(model).float()[old] + 1)
+    assert torch.equal(state["exp_avg_sq"], moments)
 
 
 def tensors(model: Any) -> dict[str, torch.Tensor]:

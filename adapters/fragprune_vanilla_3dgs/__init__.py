@@ -60,21 +60,9 @@ class Vanilla3DGS(GraphdecoAdapter):
             )
             for name, where in mentioned.items()
         ]
-        settings = self.dialect(repo).settings
-        if not settings:
-            findings.append(
-                Finding(
-                    "error",
-                    "no-rasterizer-call",
-                    "gaussian_renderer",
-                    "no call of GaussianRasterizationSettings with keywords",
-                    "one inside render()",
-                    "Check that this is the folder train.py lies in.",
-                )
-            )
-        else:
-            findings.append(Finding("info", "revision", str(repo.root), self.revision(repo)))
-        return findings
+        missing = super().fingerprint(repo)
+        revision = Finding("info", "revision", str(repo.root), self.revision(repo))
+        return [*findings, *(missing or [revision])]
 
     def revision(self, repo: HostRepo) -> str:
         """Which of the public states the source is."""

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapter import CommandLine, Dialect, HostAdapter, HostCall
-from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.seams import Role, Seam
 
 if TYPE_CHECKING:
@@ -127,6 +127,21 @@ class GraphdecoAdapter(HostAdapter):
             external=True,
         ),
     )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """What every descendant has: a rasterizer called with named settings."""
+        if self.dialect(repo).settings:
+            return []
+        return [
+            Finding(
+                "error",
+                "no-rasterizer-call",
+                "gaussian_renderer",
+                "no call of GaussianRasterizationSettings with keywords",
+                "one inside render()",
+                "Check that this is the folder train.py lies in.",
+            )
+        ]
 
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
         """Read from the source of ``render``: what it passes and how many values it unpacks."""

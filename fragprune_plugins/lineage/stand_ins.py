@@ -6,6 +6,7 @@ contract, our engine.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -107,6 +108,41 @@ def mean_squared_neighbour_distance(points: Tensor) -> Tensor:
     distances, _ = cKDTree(cloud).query(cloud, k=neighbours)
     mean = np.square(distances[:, 1:]).mean(axis=1)
     return torch.from_numpy(mean).float().to(points.device)
+
+
+def compute_relocation(
+    opacity_old: Tensor, scale_old: Tensor, N: Tensor, binoms: Tensor, n_max: int
+) -> tuple[Tensor, Tensor]:
+    """N equal Gaussians in place of one, such that together they look like it (3DGS-MCMC, eq. 9).
+
+    At the centre ``1 - (1 - o)^N`` must be the old opacity, which gives o. The widths then make the
+    integrals of ``1 - (1 - o g)^N`` and of ``o_old g_old`` along a line agree; expanded, the former
+    is the width times the sum over j of ``C(N, j) (-1)^(j-1) o^j / sqrt(j)``.
+
+    Args:
+        opacity_old: (P,) activated.
+        scale_old: (P, 3) activated.
+        N: (P,) integers in [1, n_max).
+        binoms: the caller's table of binomials, unused: in single precision it is too coarse.
+        n_max: bound of N.
+
+    Returns:
+        New opacity (P,) and scales, flat (3 P,), of each of the N.
+    """
+    total, old = N.long(), opacity_old.double()
+    opacity = -torch.expm1(torch.log1p(-old) / total)
+    j = torch.arange(1, n_max, device=old.device)
+    table = torch.tensor(
+        [
+            [math.comb(n, k) * (-1) ** (k - 1) / math.sqrt(k) for k in range(1, n_max)]
+            for n in range(n_max)
+        ],
+        dtype=torch.float64,
+        device=old.device,
+    )
+    width = (table[total] * opacity[:, None] ** j).sum(dim=1)
+    scale = scale_old.double() * (old / width)[:, None]
+    return opacity.to(opacity_old), scale.to(scale_old).reshape(-1)
 
 
 class SparseGaussianAdam(torch.optim.Adam):

@@ -12,43 +12,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from miniature import joint
+from miniature import expect_ancestors, joint, label
 
 from fragprune_plugins.errors import AlignmentError
 
 COUNT = 16
-
-
-def identity(model):
-    return model._features_dc.detach()[:, 0, 0].round().long()
-
-
-def label(host, model):
-    """Give row i the identity i, and a threshold and moments that only i has."""
-    numbers = torch.arange(len(model.get_xyz)).float()
-    with torch.no_grad():
-        model._features_dc[:, 0, 0] = numbers
-    store = host.store(model)
-    store.load_state_dict(
-        {
-            "logits": -3 + numbers / 8,
-            "exp_avg": numbers + 1,
-            "exp_avg_sq": numbers + 1,
-            "adam_step": 2.0,
-            "steps": 2,
-        }
-    )
-
-
-def expect_ancestors(host, model):
-    store, state = host.store(model), host.store(model).state_dict()
-    assert len(store) == len(model.get_xyz) == len(identity(model))
-    expected = -3 + identity(model).float() / 8
-    assert torch.equal(state["logits"], expected)
-    moments = state["exp_avg"]
-    old = moments != 0  # children start without moments, as the hosts' do
-    assert torch.equal(moments[old], identity(model).float()[old] + 1)
-    assert torch.equal(state["exp_avg_sq"], moments)
 
 
 def act(model, arguments, action, seed, share):

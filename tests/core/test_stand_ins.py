@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from fragprune_plugins.lineage import stand_ins
 from fragprune_plugins.lineage.stand_ins import (
     SparseGaussianAdam,
+    compute_relocation,
     mean_squared_neighbour_distance,
 )
 
@@ -63,6 +64,46 @@ def test_sparse_adam_moves_visible_rows_by_the_formula_without_bias_correction(v
                     x -= 0.1 * m / (math.sqrt(v) + 1e-15)
             assert parameter[row, column].item() == pytest.approx(x, rel=1e-4, abs=1e-5)
     assert torch.equal(untouched, start)
+
+
+@given(st.floats(0.005, 0.999), st.integers(1, 50), st.floats(0.01, 10.0))
+def test_relocated_copies_look_like_the_one_they_replace(old, count, scale):
+    """At the centre, and integrated along a line: by quadrature, where the formula is a sum."""
+    opacity, scales = compute_relocation(
+        torch.tensor([old], dtype=torch.float64),
+        torch.full((1, 3), scale, dtype=torch.float64),
+        torch.tensor([count]),
+        torch.empty(0),
+        51,
+    )
+    assert 1 - (1 - opacity.item()) ** count == pytest.approx(old, rel=1e-9)
+    t = torch.linspace(-9, 9, 20_001, dtype=torch.float64)  # in standard deviations
+    falloff = torch.exp(-t.square() / 2)
+    together = 1 - (1 - opacity * falloff) ** count
+    old_area = scale * old * math.sqrt(2 * math.pi)
+    for width in scales:
+        assert (width * torch.trapezoid(together, t)).item() == pytest.approx(old_area, rel=1e-8)
+
+
+def test_relocation_is_the_papers_sum_and_keeps_what_stands_alone():
+    """Equation 9 as printed, in double; one Gaussian in place of one is itself."""
+    old = torch.tensor([0.1, 0.5, 0.5, 0.95, 0.005])
+    scales = torch.tensor([0.2, 1.0, 3.0]).expand(5, 3).contiguous()
+    counts = torch.tensor([1, 2, 3, 7, 20], dtype=torch.int32)
+    opacity, flat = compute_relocation(old, scales, counts, torch.zeros(51, 51), 51)
+    assert (opacity.dtype, flat.dtype, flat.shape) == (torch.float32, torch.float32, (15,))
+    for row, (o, n) in enumerate(zip(old.double().tolist(), counts.tolist(), strict=True)):
+        new = 1 - (1 - o) ** (1 / n)
+        total = sum(
+            math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
+            for i in range(1, n + 1)
+            for k in range(i)
+        )
+        assert opacity[row].item() == pytest.approx(new, rel=1e-6)
+        expected = scales[row].double() * o / total
+        torch.testing.assert_close(flat.reshape(5, 3)[row].double(), expected, rtol=1e-6, atol=0)
+    assert opacity[0] == pytest.approx(0.1)
+    torch.testing.assert_close(flat[:3], scales[0])
 
 
 def rasterizer(sparse_adam=False, draw=lambda call: call):

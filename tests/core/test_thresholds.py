@@ -43,6 +43,9 @@ operations = st.lists(
         st.tuples(st.just("append"), st.lists(st.integers(0, 99), max_size=4)),
         st.tuples(st.just("orphans"), st.integers(0, 3)),
         st.tuples(st.just("copy"), st.tuples(st.integers(0, 99), st.integers(0, 99))),
+        st.tuples(
+            st.just("forget"), st.one_of(st.none(), st.lists(st.integers(0, 99), max_size=4))
+        ),
         st.tuples(st.just("replace"), st.integers(0, 6)),
         st.tuples(st.just("step"), st.integers(1, 1000)),
     ),
@@ -67,6 +70,11 @@ def apply(store: ThresholdStore, shadow: Shadow, operation: str, argument) -> No
         source, target = (i % n for i in argument)
         store.copy(torch.tensor([source]), torch.tensor([target]))
         shadow.rows[target] = list(shadow.rows[source])
+    elif operation == "forget":
+        rows = None if argument is None else [i % n for i in argument if n]
+        store.forget(None if rows is None else torch.tensor(rows, dtype=torch.int64))
+        for i in range(n) if rows is None else rows:
+            shadow.rows[i][1:] = [0.0, 0.0]
     elif operation == "replace":
         store.replace(argument)
         shadow.replace(argument)
@@ -178,6 +186,7 @@ def test_state_dict_is_a_copy():
         ("negative parent", lambda s: s.append(1, torch.tensor([-1]))),
         ("too few parents", lambda s: s.append(2, torch.tensor([0]))),
         ("source beyond the end", lambda s: s.copy(torch.tensor([9]), torch.tensor([0]))),
+        ("forgetting a row beyond the end", lambda s: s.forget(torch.tensor([3]))),
         ("unequal copy", lambda s: s.copy(torch.tensor([0, 1]), torch.tensor([0]))),
         ("opacities of another model", lambda s: s.open(torch.ones(4))),
     ],

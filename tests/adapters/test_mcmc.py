@@ -1,0 +1,343 @@
+"""3DGS-MCMC: relocation, addition and noise, on a miniature of the host."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from dataclasses import replace
+from importlib import import_module
+
+import mcmc_host
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from miniature import (
+    HOST,
+    TINY,
+    expect_ancestors,
+    identity,
+    joint,
+    label,
+    running,
+    tensors,
+)
+
+from fragprune_mcmc import MCMC
+from fragprune_plugins import sidecar
+from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.errors import AlignmentError, UnknownHostError, UsageError
+from fragprune_plugins.launch import HostFailed, RunOptions, run
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.schedule import Schedule, Settings
+
+COUNT = 24
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    return mcmc_host.make(tmp_path_factory.mktemp("mcmc"))
+
+
+def of(mini, **options):
+    return {"path": mini, "adapter": MCMC()} | options
+
+
+# -- which host ----------------------------------------------------------------------------------
+
+
+def test_each_host_has_its_adapter_and_no_other(mini):
+    adapters = load_plugins().adapters
+    assert choose(HostRepo(mini), adapters).name == "mcmc"
+    assert choose(HostRepo(HOST), adapters).name == "vanilla-3dgs"
+    with pytest.raises(UnknownHostError, match="3DGS-MCMC"):
+        choose(HostRepo(mini), adapters, "vanilla-3dgs")
+    with pytest.raises(UnknownHostError, match="compute_relocation"):
+        choose(HostRepo(HOST), adapters, "mcmc")
+
+
+MODEL = "scene/gaussian_model.py"
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "code"),
+    [
+        (MODEL, "relocate_gs(self, dead_mask", "relocate_gs(self, mask", "seam-signature"),
+        (MODEL, "_update_params(self, idxs", "_update_params(self, rows", "seam-signature"),
+        (MODEL, "add_new_gs(self, cap_max", "add_new_gs(self, most", "seam-signature"),
+        (MODEL, "_to_optimizer(self, inds", "_to_optimizer(self, rows", "seam-signature"),
+        (MODEL, "def relocate_gs", "def relocate", "seam-missing"),
+        ("utils/reloc_utils.py", "compute_relocation", "another", "no-relocation"),
+        ("gaussian_renderer/__init__.py", "radii, is_used =", "radii =", "rasterizer-outputs"),
+        (
+            "gaussian_renderer/__init__.py",
+            "GaussianRasterizationSettings(",
+            "S(",
+            "no-rasterizer-call",
+        ),
+    ],
+)
+def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, code):
+    path = mcmc_host.make(tmp_path) / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    match = MCMC().match(HostRepo(tmp_path))
+    assert [f.code for f in match.findings if f.level == "error"] == [code]
+
+
+# -- rows ----------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def act(model, arguments, action, seed, share):
+    n = len(model.get_xyz)
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)  # the host draws parents from the global stream
+    if action == "relocate":
+        dead = torch.rand(n, generator=generator) < share
+        model.relocate_gs(dead_mask=dead)
+    elif action == "add":
+        model.add_new_gs(cap_max=n + int(share * 10))
+    elif action == "prune":
+        model.max_radii2D = model.denom = model.xyz_gradient_accum = torch.zeros(n, 1)
+        model.prune_points(torch.rand(n, generator=generator) < share / 2)
+    elif action == "restore":
+        file = io.BytesIO()
+        torch.save((model.capture(), 7), file)
+        file.seek(0)
+        model.restore(torch.load(file, weights_only=False)[0], arguments)
+
+
+actions = st.tuples(
+    st.sampled_from(["relocate", "relocate", "add", "add", "prune", "restore"]),
+    st.integers(0, 99),
+    st.sampled_from([0.0, 0.1, 0.4, 0.9, 1.0]),
+)
+
+
+@settings(max_examples=40)
+@given(st.lists(actions, min_size=1, max_size=7))
+def test_every_row_has_its_ancestors_threshold(mini, sequence):
+    with joint(**of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera(16, 12)
+        host.step(model, camera, 1)  # so that the host's optimizer has moments to move
+        label(host, model)
+        for action, seed, share in sequence:
+            act(model, host.arguments, action, seed, share)
+            expect_ancestors(host, model)
+            if not len(model.get_xyz):
+                return
+        assert host.render(camera, model)["render"].isfinite().all()
+
+
+def test_relocated_rows_and_their_parents_start_without_moments(mini):
+    """The host empties its parents' moments; ours of the row that is no more go as well."""
+    with joint(**of(mini)) as host:
+        model = host.model(COUNT)
+        host.step(model, host.camera(), 1)
+        label(host, model)
+        dead = torch.arange(COUNT) % 3 == 0
+        with torch.no_grad():
+            model.relocate_gs(dead_mask=dead)
+        touched = torch.isin(torch.arange(COUNT), identity(model)[dead]) | dead
+        moments = host.store(model).state_dict()["exp_avg"]
+        assert (identity(model)[dead] % 3 != 0).all()
+        assert torch.equal(moments != 0, ~touched)
+        assert torch.equal(identity(model)[~dead], torch.arange(COUNT)[~dead])
+
+
+def test_a_relocation_that_copies_otherwise_is_refused(mini, monkeypatch):
+    with joint(**of(mini)) as host:
+        model = host.model(COUNT)
+        host.step(model, host.camera(), 1)
+        label(host, model)
+        kind = type(model)
+        params = kind._update_params
+
+        def shuffled(self, idxs, ratio):
+            xyz, colours, *rest = params(self, idxs, ratio)
+            return xyz, colours.flip(0), *rest
+
+        monkeypatch.setattr(kind, "_update_params", shuffled)
+        before = host.store(model).state_dict()["logits"]
+        with torch.no_grad(), pytest.raises(AlignmentError, match="its relocation differs"):
+            model.relocate_gs(dead_mask=torch.arange(COUNT) < 9)
+        assert torch.equal(host.store(model).state_dict()["logits"], before)
+        label(host, model)
+        with torch.no_grad():
+            monkeypatch.undo()
+            model.relocate_gs(dead_mask=torch.arange(COUNT) < 9)  # nothing was left pending
+        expect_ancestors(host, model)
+
+
+def lifetime(host):
+    """Steps, relocation, addition and noise, as the training loop has them; what came of it."""
+    torch.manual_seed(3)
+    model, camera = host.model(COUNT), host.camera()
+    rates = []
+    for iteration in (1, 2, 3, 4):
+        rates.append(model.update_learning_rate(iteration))
+        host.render(camera, model)["render"].square().mean().backward()
+        with torch.no_grad():
+            model.relocate_gs(dead_mask=(model.get_opacity < 0.9).squeeze(-1))
+            model.add_new_gs(cap_max=COUNT + 3)
+            model.optimizer.step()
+            model.optimizer.zero_grad(set_to_none=True)
+            model._xyz.add_(torch.randn_like(model._xyz) * rates[-1])
+    return model, rates
+
+
+class Never(Schedule):
+    def at(self, step):
+        return replace(super().at(step), learn=False)
+
+
+def test_followed_but_not_learning_the_host_is_its_own_to_the_bit(mini):
+    """Sampled parents and noise included: no random number is taken."""
+    never = Never(Settings(iterations=9))
+    with running(**of(mini), active=False) as host:
+        host.session._install_stand_ins()
+        alone, rates = lifetime(host)
+        stream = torch.get_rng_state()
+        plain = tensors(alone)
+    with running(**of(mini), schedule=never, freeze=False) as host:
+        followed, ours = lifetime(host)
+        assert len(host.store(followed)) == COUNT + 3
+        assert (ours, rates) == (rates, ours)
+        assert torch.equal(torch.get_rng_state(), stream)
+        for name, value in tensors(followed).items():
+            assert torch.equal(value, plain[name])
+
+
+def test_the_dialect_gives_three_outputs_and_thresholds_leave_radii_and_use_alone(mini):
+    with joint(**of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera()
+        host.step(model, camera, 1)
+        with_thresholds = host.render(camera, model)
+        with host.paused():
+            without = host.render(camera, model)
+    for package in (with_thresholds, without):
+        assert package["is_used"].dtype == torch.int32
+        assert torch.equal(package["is_used"] > 0, package["visibility_filter"])
+    assert torch.equal(with_thresholds["radii"], without["radii"])
+
+
+# -- stage 2 -------------------------------------------------------------------------------------
+
+MOVES = {
+    "opacity": {"opacity"},
+    "appearance": {"opacity", "f_dc", "f_rest"},
+    "all": {"xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"},
+}
+
+
+@pytest.mark.parametrize("train", MOVES)
+def test_noise_relocation_addition_and_regularisers_stand_still(mini, train):
+    with running(Settings(iterations=9, train=train), **of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera()
+        model.active_sh_degree = 1
+        script = import_module("train")
+        host.arguments.cap_max = 99
+        script.args = host.arguments
+        moments = []
+        before = tensors(model)
+        for iteration in range(1, 6):
+            rate = model.update_learning_rate(iteration)
+            assert rate == 0.0
+            loss = host.render(camera, model)["render"].mean() + script.regularisers(model)
+            loss.backward()
+            with torch.no_grad():
+                model.relocate_gs(dead_mask=torch.arange(COUNT) < 5)
+                assert not model.add_new_gs(cap_max=99)
+                model.optimizer.step()
+                model.optimizer.zero_grad(set_to_none=True)
+                stepped = model._xyz.detach().clone()
+                model._opacity.data[0] = -7.0  # where the host's noise is loudest
+                script.wander(model, rate)
+                assert torch.equal(model._xyz, stepped)
+            moments.append(len(model.optimizer.state))
+        moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
+        assert moved == MOVES[train]
+        assert moments[-1] == len(MOVES[train])  # what is frozen has no moments either
+        assert len(model.get_xyz) == COUNT == len(host.store(model))
+
+
+def command(mini, scene, out, iterations, *more):
+    flags = ["-s", scene, "-m", out, "--iterations", iterations, *TINY, "--noise_lr", 5e7]
+    return [str(mini / "train.py"), *map(str, flags), *map(str, more)]
+
+
+CAP = ("--cap_max", 170)
+OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
+FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
+
+
+def frozen_differences(before, after):
+    one, other = read_ply(before), read_ply(after)
+    return [name for name in FROZEN if not torch.equal(getattr(one, name), getattr(other, name))]
+
+
+def test_train_then_finetune_moves_no_frozen_bit(mini, photographs, tmp_path):
+    """The schedule of relocation lasts into stage 2, and the noise would go on for ever."""
+    more = (*CAP, "--densify_until_iter", 99)
+    summary = run(command(mini, photographs, tmp_path / "out", 12, *more), OPTIONS)
+    assert (summary.adapter, summary.iterations) == ("mcmc", 8)
+    assert 150 < summary.gaussians <= 170
+    assert frozen_differences(summary.model_before, summary.model_after) == []
+    store, info = sidecar.load(summary.model_after)
+    assert len(store) == summary.gaussians == len(read_ply(summary.model_after).xyz)
+    assert info.adapter == "mcmc"
+    assert summary.fragments_after < summary.fragments_before
+
+
+def test_without_that_seam_the_noise_would_move_positions(mini, photographs, tmp_path, monkeypatch):
+    monkeypatch.setattr(MCMC, "still_rate", lambda self, rate: rate)
+    summary = run(command(mini, photographs, tmp_path / "out", 12, *CAP), OPTIONS)
+    assert frozen_differences(summary.model_before, summary.model_after) == ["xyz"]
+
+
+def test_joint_learning_through_relocation_and_addition(mini, photographs, tmp_path):
+    options = replace(OPTIONS, stage="joint", from_iter=3)
+    summary = run(command(mini, photographs, tmp_path / "out", 20, *CAP), options)
+    store, _ = sidecar.load(summary.model_after)
+    assert len(store) == len(read_ply(summary.model_after).xyz) > 150
+    assert not store.neutral
+
+
+def test_frozen_from_an_iteration_on(mini, photographs, tmp_path):
+    options = replace(OPTIONS, stage="finetune", from_iter=12)
+    more = (*CAP, "--checkpoint_iterations", 12, "--densify_until_iter", 99)
+    out = tmp_path / "out"
+    summary = run(command(mini, photographs, out, 20, *more), options)
+    capture, _ = torch.load(out / "chkpnt12.pth", weights_only=False)
+    assert torch.equal(capture[1].detach(), read_ply(summary.model_after).xyz)
+
+
+# -- the host's own refusals, and files over the command line --------------------------------------
+
+
+def test_a_host_that_ends_early_with_success_is_a_stated_failure(mini, photographs, tmp_path):
+    with pytest.raises(HostFailed, match="without a checkpoint of iteration 12"):
+        run(command(mini, photographs, tmp_path / "out", 12), OPTIONS)
+    assert "scene" not in sys.modules
+
+
+@pytest.mark.parametrize("key", ["iterations", "checkpoint_iterations", "start_checkpoint"])
+def test_a_configuration_file_may_not_overrule_what_we_set(mini, photographs, tmp_path, key):
+    config = tmp_path / "scene.json"
+    config.write_text(json.dumps({"cap_max": 170, key: 5}))
+    flags = ("--config", config)
+    with pytest.raises(UsageError, match=f"sets {key}, over whatever the command says"):
+        run(command(mini, photographs, tmp_path / "out", 12, *flags), OPTIONS)
+    config.write_text("{")
+    with pytest.raises(UsageError, match="a readable JSON file"):
+        run(command(mini, photographs, tmp_path / "out", 12, *flags), OPTIONS)
+
+
+def test_a_configuration_file_of_other_values_is_the_hosts_affair(mini, photographs, tmp_path):
+    config = tmp_path / "scene.json"
+    config.write_text(json.dumps({"cap_max": 170, "noise_lr": 1.0}))
+    summary = run(command(mini, photographs, tmp_path / "out", 12, "--config", config), OPTIONS)
+    assert 150 < summary.gaussians <= 170

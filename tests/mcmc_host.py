@@ -1,0 +1,214 @@
+"""A miniature 3DGS-MCMC: the demo's host with what the method adds, from its public interface."""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+
+from fragprune_plugins import demo
+
+args = SimpleNamespace()  # the host's training loop reads its own script's global of this name
+
+RELOCATION_MODULE = '''"""The rasterizer package's relocation, with its table made at import."""
+
+import math
+
+import torch
+from diff_gaussian_rasterization import compute_relocation
+
+N_max = 51
+binoms = torch.zeros((N_max, N_max)).float().cuda()
+for n in range(N_max):
+    for k in range(n + 1):
+        binoms[n, k] = math.comb(n, k)
+
+
+def compute_relocation_cuda(opacity_old, scale_old, N):
+    """New opacities and scales of N copies."""
+    N.clamp_(min=1, max=N_max - 1)
+    return compute_relocation(opacity_old, scale_old, N, binoms, N_max)
+'''
+
+
+class Added:
+    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
+
+    def densification_postfix(
+        self,
+        new_xyz,
+        new_features_dc,
+        new_features_rest,
+        new_opacities,
+        new_scaling,
+        new_rotation,
+        reset_params=True,
+    ):
+        new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling)
+        names = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+        tensors = dict(zip(names, (*new, new_rotation), strict=True))
+        self._adopt(self.cat_tensors_to_optimizer(tensors))
+        if reset_params:
+            self._reset_statistics()
+            self.max_radii2D = torch.zeros(self.get_xyz.shape[0], device="cuda")
+
+    def replace_tensors_to_optimizer(self, inds=None):
+        tensors = {
+            "xyz": self._xyz,
+            "f_dc": self._features_dc,
+            "f_rest": self._features_rest,
+            "opacity": self._opacity,
+            "scaling": self._scaling,
+            "rotation": self._rotation,
+        }
+
+        def emptied(moment):
+            moment[slice(None) if inds is None else inds] = 0
+            return moment
+
+        groups = self.optimizer.param_groups
+        renewed = {
+            g["name"]: self._replace(g, tensors[g["name"]].detach(), emptied) for g in groups
+        }
+        self._adopt(renewed)
+        return renewed
+
+    def _update_params(self, idxs, ratio):
+        opacity, scale = compute_relocation_cuda(  # noqa: F821 - imported where this is put
+            opacity_old=self.get_opacity[idxs, 0],
+            scale_old=self.get_scaling[idxs],
+            N=ratio[idxs, 0] + 1,
+        )
+        opacity = opacity[:, None].clamp(0.005, 1 - 1e-7)
+        return (
+            self._xyz[idxs],
+            self._features_dc[idxs],
+            self._features_rest[idxs],
+            self.inverse_opacity_activation(opacity),
+            self.scaling_inverse_activation(scale.reshape(-1, 3)),
+            self._rotation[idxs],
+        )
+
+    def _sample_alives(self, probs, num, alive_indices=None):
+        drawn = torch.multinomial(probs / probs.sum(), num, replacement=True)
+        drawn = drawn if alive_indices is None else alive_indices[drawn]
+        return drawn, torch.bincount(drawn)[:, None]
+
+    def relocate_gs(self, dead_mask=None):
+        dead, alive = dead_mask.nonzero()[:, 0], (~dead_mask).nonzero()[:, 0]
+        if not len(dead) or not len(alive):
+            return
+        parents, ratio = self._sample_alives(self.get_opacity[alive, 0], len(dead), alive)
+        own = (self._xyz, self._features_dc, self._features_rest)
+        own = (*own, self._opacity, self._scaling, self._rotation)
+        for tensor, new in zip(own, self._update_params(parents, ratio), strict=True):
+            tensor[dead] = new
+        for tensor in (self._opacity, self._scaling):
+            tensor[parents] = tensor[dead]
+        self.replace_tensors_to_optimizer(inds=parents)
+
+    def add_new_gs(self, cap_max):
+        count = self._opacity.shape[0]
+        more = min(cap_max, int(1.05 * count)) - count
+        if more <= 0:
+            return 0
+        parents, ratio = self._sample_alives(self.get_opacity[:, 0], more)
+        new = self._update_params(parents, ratio)
+        self._opacity[parents], self._scaling[parents] = new[3], new[4]
+        self.densification_postfix(*new, reset_params=False)
+        self.replace_tensors_to_optimizer(inds=parents)
+        return more
+
+
+def regularisers(gaussians):
+    """Means of the opacities and scales, weighed by the command line's global options."""
+    opacity, scale = gaussians.get_opacity.abs().mean(), gaussians.get_scaling.abs().mean()
+    return args.opacity_reg * opacity + args.scale_reg * scale
+
+
+def move_in(iteration, opt, dataset, gaussians, *_):
+    """Relocation and addition, where vanilla densifies."""
+    if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+        gaussians.relocate_gs(dead_mask=(gaussians.get_opacity <= 0.005).squeeze(-1))
+        gaussians.add_new_gs(cap_max=args.cap_max)
+
+
+def wander(gaussians, xyz_lr):
+    """Noise on the positions, in place and outside the optimizer."""
+    faint = torch.sigmoid(100 * (1 - gaussians.get_opacity - 0.995))
+    noise = torch.randn_like(gaussians._xyz) * faint * args.noise_lr * xyz_lr
+    gaussians._xyz.add_(noise * gaussians.get_scaling.square())
+
+
+CHANGES = {
+    "arguments/__init__.py": [
+        ("        self.eval = False\n", "        self.eval = False\n        self.cap_max = -1\n"),
+        (
+            "        self.random_background = False\n",
+            "        self.random_background = False\n"
+            "        self.noise_lr = 5e5\n"
+            "        self.scale_reg = 0.01\n"
+            "        self.opacity_reg = 0.01\n",
+        ),
+    ],
+    "gaussian_renderer/__init__.py": [
+        (
+            "    image, radii = GaussianRasterizer(raster_settings=settings)(\n",
+            "    rasterizer = GaussianRasterizer(raster_settings=settings)\n"
+            "    image, radii, is_used = rasterizer(\n",
+        ),
+        ('        "radii": radii,\n', '        "radii": radii,\n        "is_used": is_used,\n'),
+    ],
+    "scene/gaussian_model.py": [
+        (
+            "from utils.sh_utils import RGB2SH\n",
+            "from utils.reloc_utils import compute_relocation_cuda\n"
+            "from utils.sh_utils import RGB2SH\n",
+        ),
+    ],
+    "train.py": [
+        (
+            "    first_iter = 0\n",
+            "    if dataset.cap_max == -1:\n        sys.exit()\n    first_iter = 0\n",
+        ),
+        ("        gaussians.update_learning", "        xyz_lr = gaussians.update_learning"),
+        (
+            "        loss.backward()\n",
+            "        loss = loss + regularisers(gaussians)\n        loss.backward()\n",
+        ),
+        ("                densify(iteration", "                move_in(iteration"),
+        (
+            "zero_grad(set_to_none=True)\n",
+            "zero_grad(set_to_none=True)\n                wander(gaussians, xyz_lr)\n",
+        ),
+        (
+            "    args = parser.parse_args()\n",
+            '    parser.add_argument("--config")\n'
+            "    args = parser.parse_args()\n"
+            "    if args.config:\n"
+            "        vars(args).update(json.loads(Path(args.config).read_text()))\n",
+        ),
+        ("import random\n", "import json\nimport random\n"),
+    ],
+}
+
+
+def make(root: Path) -> Path:
+    """Write the host into a folder; returns it."""
+    shutil.copytree(Path(demo.__file__).with_name("host"), root, dirs_exist_ok=True)
+    for name, changes in CHANGES.items():
+        text = (root / name).read_text()
+        for old, new in changes:
+            assert text.count(old) == 1, (name, old)
+            text = text.replace(old, new)
+        (root / name).write_text(text)
+    (root / "utils" / "reloc_utils.py").write_text(RELOCATION_MODULE)
+    with (root / "scene" / "gaussian_model.py").open("a") as file:
+        file.write("\n" + "".join(inspect.getsourcelines(Added)[0][2:]))
+    added = "\n\n".join(inspect.getsource(f) for f in (regularisers, move_in, wander))
+    text = (root / "train.py").read_text()
+    (root / "train.py").write_text(text.replace("if __name__", added + "\n\nif __name__"))
+    return root
