@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from skeleton import STATES
 
+from fragprune_mcmc import MCMC
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
 from fragprune_plugins.detect import HostRepo
 from fragprune_vanilla_3dgs import Vanilla3DGS
@@ -23,23 +24,31 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 FOLDER = os.environ.get("FRAGPRUNE_HOSTS")
 
 
-def checkouts() -> list[Path]:
-    """Folders with a training script that vanilla's adapter is for."""
+def checkouts(*adapters) -> list[Path]:
+    """Folders with a training script that one of the adapters is for."""
     if not FOLDER:
         return []
     found = sorted(path.parent for path in Path(FOLDER).glob("*/train.py"))
-    return [path for path in found if Vanilla3DGS().match(HostRepo(path)).fits]
+    return [p for p in found if any(adapter.match(HostRepo(p)).fits for adapter in adapters)]
 
 
-HOSTS = checkouts() or [
-    pytest.param(
-        None,
-        marks=pytest.mark.skip(
-            reason="FRAGPRUNE_HOSTS names no folder with a checkout of vanilla 3DGS in it"
-        ),
-    )
-]
-every_host = pytest.mark.parametrize("host", HOSTS, ids=lambda path: path.name if path else "none")
+def each_of(*adapters):
+    """A test for every checkout that one of the adapters is for."""
+    titles = " or ".join(adapter.info.title for adapter in adapters)
+    reason = f"FRAGPRUNE_HOSTS names no folder with a checkout of {titles} in it"
+    hosts = checkouts(*adapters) or [pytest.param(None, marks=pytest.mark.skip(reason=reason))]
+    return pytest.mark.parametrize("host", hosts, ids=lambda path: path.name if path else "none")
+
+
+every_vanilla = each_of(Vanilla3DGS())
+every_mcmc = each_of(MCMC())
+every_host = each_of(Vanilla3DGS(), MCMC())
+
+
+def flags(host: Path) -> list[str]:
+    """What a host needs, or refuses, beyond the flags that all have."""
+    mcmc = MCMC().match(HostRepo(host)).fits
+    return ["--cap_max", "3100", "--init_type", "sfm"] if mcmc else ["--port", "0"]
 
 
 @pytest.fixture(scope="session")
@@ -55,7 +64,7 @@ def dataset(tmp_path_factory):
     return target
 
 
-@every_host
+@every_vanilla
 def test_every_seam_is_found_and_the_state_is_a_known_one(host):
     adapter, repo = Vanilla3DGS(), HostRepo(host)
     match = adapter.match(repo)
@@ -67,6 +76,15 @@ def test_every_seam_is_found_and_the_state_is_a_known_one(host):
     assert dialect.outputs == (2 if state == "2023" else 3)
     assert dialect.sparse_adam == (state == "October 2024")
     assert adapter.command_line(repo).default_iterations == 30_000
+
+
+@every_mcmc
+def test_mcmcs_dialect_is_read_and_vanillas_adapter_keeps_out(host):
+    adapter, repo = MCMC(), HostRepo(host)
+    dialect = adapter.dialect(repo)
+    assert (len(dialect.settings), dialect.outputs, dialect.sparse_adam) == (12, 3, False)
+    assert adapter.command_line(repo).default_iterations == 30_000
+    assert not Vanilla3DGS().match(repo).fits
 
 
 RUN = """
@@ -85,7 +103,7 @@ train = sys.argv[4]
 words = [str(host / "train.py"), "-s", str(data), "-m", str(out), "--eval", "-r", "1"]
 words += "--iterations 30 --sh_degree 1 --densify_from_iter 5 --densification_interval 10".split()
 words += "--densify_until_iter 25 --densify_grad_threshold 0.002 --test_iterations -1".split()
-words += ["--port", "0"] + sys.argv[5:]
+words += sys.argv[5:]
 options = RunOptions(
     device="cpu", settings=Settings(iterations=10, train=train, threshold_lr=0.3)
 )
@@ -118,7 +136,7 @@ MOVES = {  # f_rest is not drawn yet: hosts use a second band from iteration 100
 @every_host
 @pytest.mark.parametrize("train", MOVES)
 def test_training_then_fine_tuning_moves_only_what_is_named(host, dataset, tmp_path, python, train):
-    report = python(RUN, host, dataset, tmp_path / "out", train)
+    report = python(RUN, host, dataset, tmp_path / "out", train, *flags(host))
     assert report["moved"] == MOVES[train]
     assert len(set(report["rows"])) == 1
     assert report["steps"] == [10, 9]  # hosts take no step in their last iteration
@@ -185,10 +203,69 @@ print(json.dumps(checked))
 """
 
 
-@every_host
+@every_vanilla
 def test_rows_follow_the_hosts_own_densification(host, python):
     """With seven arguments to densification_postfix, or six: thresholds are the ancestors'."""
     assert python(PARENTS, host) >= 3
+
+
+RELOCATION = """
+import json, sys
+from pathlib import Path
+from types import SimpleNamespace
+from importlib import import_module
+import numpy as np, torch
+torch.set_num_threads(1)
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.device import cpu_only
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.schedule import JointSchedule, Settings
+from fragprune_plugins.session import Session
+from fragprune_mcmc import MCMC
+
+root, settings = Path(sys.argv[1]), Settings(iterations=9)
+sys.path.insert(0, str(root))
+session = Session(
+    MCMC(), HostRepo(root), load_plugins(), settings,
+    schedule=JointSchedule(settings, 1), freeze=False, drop_in=True,
+)
+moved = 0
+with cpu_only(), session:
+    from argparse import ArgumentParser
+    parser = ArgumentParser()
+    group = import_module("arguments").OptimizationParams(parser)
+    model = import_module("scene.gaussian_model").GaussianModel(1)
+    rng = np.random.default_rng(0)
+    cloud = SimpleNamespace(points=rng.uniform(-1, 1, (60, 3)), colors=rng.uniform(0, 1, (60, 3)))
+    model.create_from_pcd(cloud, 1.0)
+    model.training_setup(group.extract(parser.parse_args([])))
+    store = session.store(model)
+    sum(group["params"][0].sum() for group in model.optimizer.param_groups).backward()
+    model.optimizer.step()  # the host's relocation needs moments
+    with torch.no_grad():
+        numbers = torch.arange(60).float()
+        model._features_dc[:, 0, 0] = numbers
+        store.logits.copy_(-3 + numbers / 16)
+        for round in range(6):
+            n = len(model.get_xyz)
+            dead = torch.rand(n, generator=torch.Generator().manual_seed(round)) < 0.3
+            before = model._features_dc[:, 0, 0].clone()
+            model.relocate_gs(dead_mask=dead)
+            moved += int((model._features_dc[:, 0, 0] != before).sum())
+            grown = model.add_new_gs(cap_max=70)
+            identity = model._features_dc[:, 0, 0].round()
+            assert len(store) == len(model.get_xyz) == n + grown
+            assert torch.equal(store.logits.detach(), -3 + identity / 16), round
+    assert len(store) == 70
+    assert all(torch.isfinite(g["params"][0]).all() for g in model.optimizer.param_groups)
+print(json.dumps(moved))
+"""
+
+
+@every_mcmc
+def test_rows_follow_the_hosts_own_relocation_and_addition(host, python):
+    """Parents are the ones it drew at random; relocation leaves the count as it is."""
+    assert python(RELOCATION, host) > 30
 
 
 RENDER = """
@@ -227,7 +304,7 @@ print(json.dumps([len(with_thresholds), with_thresholds != without]))
 
 @every_host
 def test_the_hosts_own_render_script_applies_thresholds(host, dataset, tmp_path, python):
-    python(RUN, host, dataset, tmp_path / "out", "opacity")
+    python(RUN, host, dataset, tmp_path / "out", "opacity", *flags(host))
     count, differ = python(RENDER, host, tmp_path / "out")
     assert count > 0
     assert differ
@@ -236,16 +313,16 @@ def test_the_hosts_own_render_script_applies_thresholds(host, dataset, tmp_path,
 FINETUNE = RUN.replace("replace(options)", 'replace(options, stage="finetune")')
 
 
-@every_host
+@every_vanilla
 def test_exposures_of_a_late_host_come_through_stage_two_unchanged(host, dataset, tmp_path, python):
     if Vanilla3DGS().revision(HostRepo(host)) == "2023":
         pytest.skip("this state has no exposures")
     out = tmp_path / "out"
-    python(RUN, host, dataset, out, "opacity", "--train_test_exp")
+    python(RUN, host, dataset, out, "opacity", *flags(host), "--train_test_exp")
     final = json.loads((out / "exposure.json").read_text())
     identity = [[float(i == j) for j in range(4)] for i in range(3)]
     assert any(value != identity for value in final.values())
     second = tmp_path / "second"
     shutil.copytree(out, second)
-    python(FINETUNE, host, dataset, second, "opacity", "--train_test_exp")
+    python(FINETUNE, host, dataset, second, "opacity", *flags(host), "--train_test_exp")
     assert json.loads((second / "exposure.json").read_text()) == final
