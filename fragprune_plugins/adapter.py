@@ -95,6 +95,8 @@ class CommandLine:
         save_checkpoints: flag listing iterations to checkpoint at.
         resume: flag naming the checkpoint to resume from.
         default_iterations: of the host, read from its source.
+        continues: those of the scripts that work on a checkpoint they are given: where ``resume``
+            names one it is stage 1's, not ours to start stage 2 from.
         config: flag naming a JSON file whose values the host puts over its command line; "" for
             none.
     """
@@ -106,6 +108,7 @@ class CommandLine:
     save_checkpoints: str
     resume: str
     default_iterations: int
+    continues: tuple[str, ...] = ()
     config: str = ""
 
 
@@ -140,6 +143,14 @@ class HostAdapter(ABC):
     @abstractmethod
     def command_line(self, repo: HostRepo) -> CommandLine:
         """How to drive the host's training script."""
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """The command that can resume what a training script left; the same one by default."""
+        return script, arguments
+
+    def view(self, camera: Any) -> int:
+        """Tells training views apart; by the object, unless a host draws through copies."""
+        return id(camera)
 
     @abstractmethod
     def rows(self, model: Any) -> int:

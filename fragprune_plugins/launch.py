@@ -174,6 +174,7 @@ class _Runner:
         self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
         self.options, self.device = options, device
         self.output = Path(host.flags.output) if host.flags.output else None
+        self.trained: int | None = None  # iterations of stage 1, once it is over
         self.before: Path | None = None
         self.after: Path | None = None
         self.learned: Any = None
@@ -196,7 +197,7 @@ class _Runner:
 
     def train_then_finetune(self) -> None:
         """Stage 1 with a checkpoint at its end, then stage 2 from there."""
-        if self.host.flags.resume:
+        if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
             return self.finetune()
         total = self._iterations()
         checkpoints = sorted({*(self.host.flags.save_checkpoints or []), total})
@@ -210,6 +211,7 @@ class _Runner:
                 "its own training to come to its end",
                 "Read the host's own message above.",
             )
+        self.trained = total
         self.finetune()
 
     def finetune(self) -> None:
@@ -221,6 +223,8 @@ class _Runner:
             self._execute(self.host.arguments, learn=True, from_step=start, settings=settings)
             self._note_after(total)
             return
+        resumed = self.adapter.resumed_by(self.host.script, self.host.arguments)
+        self.host = _parse(*resumed, self.host.line)
         with self._checkpoint() as (iteration, checkpoint):
             self._note_before(iteration)
             total = iteration + settings.iterations
@@ -234,11 +238,13 @@ class _Runner:
     @contextlib.contextmanager
     def _checkpoint(self) -> Iterator[tuple[int, Path]]:
         """The checkpoint to resume from; one made from a PLY is removed afterwards."""
-        if self.host.flags.resume:
+        if self.host.flags.resume and self.trained is None:
             path = Path(self.host.flags.resume)
             yield _iteration_of(path), path
             return
         saved = self.adapter.saved_iterations(self.output) if self.output else []
+        if self.trained is not None:  # the folder may hold later ones of another run
+            saved = [each for each in saved if each[0] == self.trained]
         if not saved:
             raise UsageError(
                 "--stage finetune",

@@ -114,6 +114,7 @@ class _ModelState:
     views: dict[int, Callable[[], Any]] = field(default_factory=dict)  # view -> its last render
     last_drawn: float = 0.0
     held: bool = False  # thresholds met their target and stay
+    loaded: weakref.ReferenceType[Any] | None = None  # the means a sidecar's thresholds came with
     stats: StepStats | None = None
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
@@ -360,17 +361,18 @@ class Session:
         return result
 
     def _on_attach(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        state = self._models.get(model)
+        kept = state is not None and self._is_followed(model, state)  # before a new optimizer
         result = wrapped(*args, **kwargs)
         if not self.learn:
             return result
         rows = self.adapter.rows(model)
-        state = self._models.get(model)
         if state is None:
             store = ThresholdStore(
                 rows, self.adapter.means(model).device, self.settings.threshold_lr
             )
             state = self._models[model] = _ModelState(store)
-        else:
+        elif not kept:
             before = len(state.store)
             state.store.replace(rows)
             self._changed(state.store, "training_setup", before)
@@ -383,6 +385,15 @@ class Session:
         self._hook_optimizers(model, state)
         self.hook.fragprune_attached(model=model, store=state.store)
         return result
+
+    def _is_followed(self, model: Any, state: _ModelState) -> bool:
+        """Whether the means are the very tensor that was loaded, or trained until now."""
+        means = self.adapter.means(model)
+        optimizers = [each for each in self.adapter.optimizers(model) if each is not None]
+        groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+        known = [state.loaded() if state.loaded else None]
+        known += [parameter for group in groups for parameter in group["params"]]
+        return any(each is means for each in known)
 
     def _follow(self, model: Any, state: _ModelState) -> None:
         self._last, self._last_state = weakref.ref(model), state
@@ -490,11 +501,11 @@ class Session:
     def _on_view(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         arguments = signature(wrapped).bind(*args, **kwargs).arguments
         camera, model = (arguments[name] for name in seam.needs[:2])
-        state = self._models.get(model)
-        again = partial(self._render, wrapped, model, id(camera), args, kwargs)
+        state, view = self._models.get(model), self.adapter.view(camera)
+        again = partial(self._render, wrapped, model, view, args, kwargs)
         measured = self.settings.target_speedup is not None  # keeps the model alive: only if needed
         if measured and state is not None and state.plan is not None and torch.is_grad_enabled():
-            state.views[id(camera)] = again
+            state.views[view] = again
         return again()
 
     def _render(self, render: Any, model: Any, view: int, args: Any, kwargs: Any) -> Any:
@@ -685,7 +696,8 @@ class Session:
         if sidecar.path_beside(path).exists():
             store = ThresholdStore(self.adapter.rows(model), self.adapter.means(model).device)
             sidecar.load(path, store)
-            self._models[model] = _ModelState(store)
+            means = weakref.ref(self.adapter.means(model))
+            self._models[model] = _ModelState(store, loaded=means)
             self._follow(model, self._models[model])
             self.hook.fragprune_attached(model=model, store=store)
         else:

@@ -115,6 +115,8 @@ class GraphdecoAdapter(HostAdapter):
 
     package = "diff_gaussian_rasterization"
     scripts: tuple[str, ...] = ("train.py",)
+    optimizer = "Adam"
+    """The host's, by its name in ``torch.optim``."""
     seams = (
         *MODEL_SEAMS,
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
@@ -261,7 +263,7 @@ class GraphdecoAdapter(HostAdapter):
             )
         )
         parameters = {name: torch.nn.Parameter(tensor) for name, tensor in tensors.items()}
-        optimizer = torch.optim.Adam(
+        optimizer = getattr(torch.optim, self.optimizer)(
             [{"params": [p], "lr": 0.0, "name": name} for name, p in parameters.items()],
             lr=0.0,
             eps=1e-15,

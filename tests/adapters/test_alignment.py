@@ -123,9 +123,19 @@ def test_children_that_are_not_copies_are_refused_before_the_host_appends(monkey
         assert len(model.get_xyz) == COUNT
 
 
-def test_a_new_training_setup_starts_over():
+def test_a_new_optimizer_for_the_same_rows_leaves_their_thresholds():
     with joint() as host:
         model = host.model(COUNT)
         label(host, model)
+        model.prune_points(torch.arange(COUNT) < 3)
+        model.training_setup(host.arguments)
+        expect_ancestors(host, model)
+
+
+def test_other_rows_start_over():
+    with joint() as host:
+        model = host.model(COUNT)
+        label(host, model)
+        model._xyz = torch.nn.Parameter(model._xyz.detach().clone())  # as re-initialising does
         model.training_setup(host.arguments)
         assert host.store(model).neutral

@@ -186,6 +186,8 @@ def test_hook_fragprune_population_changed():
         model = host.model(20)
         model.prune_points(torch.arange(20) < 5)
         model.densify_and_clone(torch.ones(15, 1), 0.5, 1e9)
+        model.training_setup(host.arguments)  # a new optimizer for the same rows
+        model._xyz = torch.nn.Parameter(model._xyz.detach().clone())
         model.training_setup(host.arguments)
     changes = recorder.of("changed")
     assert [(c.operation, c.before, c.after) for _, c in changes] == [
