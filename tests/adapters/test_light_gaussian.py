@@ -1,0 +1,466 @@
+"""LightGaussian: counts, pruning and distillation, on a miniature of the host."""
+
+from __future__ import annotations
+
+import copy
+import io
+import shutil
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+
+import light_gaussian_host
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from miniature import HOST, TINY, expect_ancestors, joint, label, running, tensors
+from oracle import naive
+
+from fragprune_light_gaussian import LightGaussian
+from fragprune_plugins import sidecar
+from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.errors import UnknownHostError, UsageError
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.launch import RunOptions, run
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.schedule import Settings
+
+COUNT = 16
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    return light_gaussian_host.make(tmp_path_factory.mktemp("light"))
+
+
+def of(mini, **options):
+    return {"path": mini, "adapter": LightGaussian()} | options
+
+
+# -- which host ----------------------------------------------------------------------------------
+
+
+def test_each_host_has_its_adapter_and_no_other(mini):
+    adapters = load_plugins().adapters
+    assert choose(HostRepo(mini), adapters).name == "light-gaussian"
+    assert choose(HostRepo(HOST), adapters).name == "vanilla-3dgs"
+    with pytest.raises(UnknownHostError, match="LightGaussian"):
+        choose(HostRepo(mini), adapters, "vanilla-3dgs")
+    with pytest.raises(UnknownHostError, match="as vanilla 3DGS has it"):
+        choose(HostRepo(HOST), adapters, "light-gaussian")
+
+
+RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "code"),
+    [
+        (RENDERER, "def count_render", "def counting", "seam-missing"),
+        (RENDERER, "f_count", "f_counts", "other-host"),
+        (RENDERER, "GaussianRasterizationSettings(", "S(", "no-rasterizer-call"),
+        (MODEL, "def prune_gaussians", "def prune", "seam-missing"),
+        (MODEL, "def load_ply_sh(self, path", "def load_ply_sh(self, file", "seam-signature"),
+    ],
+)
+def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, code):
+    path = light_gaussian_host.make(tmp_path) / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    match = LightGaussian().match(HostRepo(tmp_path))
+    assert code in [f.code for f in match.findings if f.level == "error"]
+
+
+@pytest.mark.parametrize("script", ["train_densify_prune", "prune_finetune", "distill_train"])
+def test_a_missing_script_is_named(tmp_path, script):
+    (light_gaussian_host.make(tmp_path) / f"{script}.py").unlink()
+    (error,) = [f for f in LightGaussian().match(HostRepo(tmp_path)).findings if f.level == "error"]
+    assert (error.code, error.found) == ("other-host", f"no {script}.py")
+
+
+# -- the counting call ---------------------------------------------------------------------------
+
+
+class Notes:
+    """Remembers what was rasterized."""
+
+    @hookimpl(tryfirst=True)
+    def fragprune_truncate(self, inputs, store):
+        self.inputs = inputs
+
+
+def brute_force(inputs, thresholds):
+    """(N,) fragments of each Gaussian, by loops over floats."""
+    splats, counts = naive.splats_of(inputs, thresholds), [0] * len(inputs.splats)
+    for y in range(inputs.view.height):
+        for x in range(inputs.view.width):
+            for record in naive.records_at(splats, x, y)[0]:
+                counts[record.row] += record.drawn
+    return counts
+
+
+@pytest.mark.parametrize("truncated", [False, True], ids=["whole", "truncated"])
+@pytest.mark.parametrize("size", [(24, 18), (33, 17)])
+def test_both_forms_of_the_call_against_brute_force(mini, truncated, size):
+    notes = Notes()
+    with joint(**of(mini, plugins=[notes])) as host:
+        model, camera = host.model(COUNT), host.camera(*size)
+        host.step(model, camera, 1)
+        store = host.store(model)
+        with torch.no_grad():
+            store.logits.copy_(torch.linspace(-4, -0.5, COUNT))
+        plain = host.render(camera, model)
+        pipe = SimpleNamespace(debug=False, compute_cov3D_python=False, convert_SHs_python=False)
+        count = import_module("gaussian_renderer").count_render
+        if truncated:
+            package = count(camera, model, pipe, torch.zeros(3))
+        else:
+            with host.paused():
+                package = count(camera, model, pipe, torch.zeros(3))
+                plain = host.render(camera, model)
+        expected = brute_force(notes.inputs, store.values.detach() if truncated else None)
+    counts, scores = package["gaussians_count"], package["important_score"]
+    assert counts.dtype == torch.int32
+    assert counts.tolist() == expected
+    assert sum(expected) > 100
+    opacities = notes.inputs.splats.opacities.tolist()
+    by_fragment = [sum([o] * n) for o, n in zip(opacities, expected, strict=True)]
+    assert scores.tolist() == pytest.approx(by_fragment, rel=1e-5)
+    assert scores.dtype == torch.float32
+    assert not any(package[name].requires_grad for name in ("render", "important_score"))
+    assert plain["render"].requires_grad
+    torch.testing.assert_close(package["render"], plain["render"].detach(), rtol=1e-6, atol=1e-6)
+    assert torch.equal(package["radii"], plain["radii"])
+    counts += counts  # as the host adds views up, in place
+    scores += scores
+
+
+def test_pruning_counts_what_is_left_after_truncation(mini, monkeypatch):
+    with joint(**of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera()
+        host.step(model, camera, 1)
+        with torch.no_grad():
+            host.store(model).logits.copy_(torch.where(torch.arange(COUNT) < 5, 4.0, -9.0))
+        pipe = SimpleNamespace(debug=False, compute_cov3D_python=False, convert_SHs_python=False)
+        count = import_module("gaussian_renderer").count_render
+        scene = SimpleNamespace(getTrainCameras=lambda: [camera, host.camera(side=0.3)])
+        monkeypatch.setattr(light_gaussian_host, "count_render", count, raising=False)
+        prune_list = light_gaussian_host.prune_list
+        with torch.no_grad():
+            counts, _ = prune_list(model, scene, pipe, torch.zeros(3))
+            with host.paused():
+                whole, _ = prune_list(model, scene, pipe, torch.zeros(3))
+        assert (counts[:5] < whole[:5]).all()
+        assert (counts[5:] >= whole[5:]).all()  # those behind show through
+
+
+# -- rows ----------------------------------------------------------------------------------------
+
+
+def act(model, arguments, action, seed, share):
+    generator = torch.Generator().manual_seed(seed)
+    n = len(model.get_xyz)
+    if action == "prune":
+        model.prune_gaussians(share, torch.rand(n, generator=generator))
+    elif action == "prune by opacity":
+        model.prune_opacity(share)
+    elif action == "densify":
+        model.xyz_gradient_accum = torch.rand(n, 1, generator=generator)
+        model.denom = (torch.rand(n, 1, generator=generator) < 0.8).float()
+        model.densify(1 - share, 3.0 if seed % 2 else 100.0)
+    elif action == "training setup":
+        model.training_setup(arguments)
+    elif action == "restore":
+        file = io.BytesIO()
+        torch.save((model.capture(), 7), file)
+        file.seek(0)
+        model.restore(torch.load(file, weights_only=False)[0], arguments)
+        if seed % 2:  # as distillation does, with a band less
+            model.training_setup(arguments)
+
+
+actions = st.tuples(
+    st.sampled_from(["prune", "prune by opacity", "densify", "training setup", "restore"]),
+    st.integers(0, 99),
+    st.floats(0.05, 0.5),
+)
+
+
+@settings(max_examples=40)
+@given(st.lists(actions, min_size=1, max_size=7))
+def test_every_row_has_its_ancestors_threshold(mini, sequence):
+    with joint(**of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera(16, 12)
+        host.step(model, camera, 1)
+        label(host, model)
+        for action, seed, share in sequence:
+            act(model, host.arguments, action, seed, share)
+            expect_ancestors(host, model)
+            if len(model.get_xyz) in (0, *range(400, 10_000)):
+                return
+        assert host.render(camera, model)["render"].isfinite().all()
+
+
+def test_a_point_cloud_brings_its_thresholds_into_training(mini, tmp_path):
+    path = tmp_path / "point_cloud.ply"
+    with joint(**of(mini)) as host:
+        model = host.model(COUNT)
+        host.step(model, host.camera(), 1)
+        label(host, model)
+        model.save_ply(str(path))
+    with joint(**of(mini)) as host:
+        model = host.model(5, setup=False)
+        model.load_ply(str(path))
+        model.training_setup(host.arguments)
+        model.max_radii2D = torch.zeros(COUNT)
+        expect_ancestors(host, model)
+        model.prune_gaussians(0.4, torch.rand(COUNT))
+        expect_ancestors(host, model)
+        host.step(model, host.camera(), 2)
+        assert host.store(model).steps == 3  # it goes on where it stood
+
+
+@pytest.mark.parametrize("bands", [0, 1])
+def test_a_point_cloud_read_with_fewer_bands_has_its_thresholds(mini, tmp_path, bands):
+    path = tmp_path / "point_cloud.ply"
+    with joint(**of(mini)) as host:
+        model = host.model(COUNT)
+        label(host, model)
+        model.save_ply(str(path))
+    with running(**of(mini), learn=False) as host:
+        model = host.model(5, setup=False)
+        model.load_ply_sh(str(path), bands)
+        expect_ancestors(host, model)
+        assert host.render(host.camera(), model)["render"].isfinite().all()
+
+
+# -- stage 2 -------------------------------------------------------------------------------------
+
+MOVES = {
+    "opacity": {"opacity"},
+    "appearance": {"opacity", "f_dc", "f_rest"},
+    "all": {"xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"},
+}
+
+
+@pytest.mark.parametrize("train", MOVES)
+def test_decay_schedulers_and_pruning_move_nothing_frozen(mini, train):
+    rates = torch.optim.lr_scheduler.ExponentialLR
+    options = Settings(iterations=9, train=train, opacity_lr=0.02)
+    with running(options, **of(mini), from_step=2) as host:
+        model, camera = host.model(COUNT), host.camera()
+        model.active_sh_degree = 1
+        model.scheduler = rates(model.optimizer, gamma=0.5)
+        for iteration in (1, 2):
+            host.step(model, camera, iteration)  # moments, so that a step without a gradient drifts
+        assert all(group["weight_decay"] for group in model.optimizer.param_groups)
+        before = tensors(model)
+        for iteration in (3, 4, 5, 6):
+            model.update_learning_rate(iteration)
+            model.scheduler.step()
+            host.render(camera, model)["render"].mean().backward()
+            with torch.no_grad():
+                model.prune_gaussians(0.5, torch.rand(COUNT))
+                model.prune_opacity(0.5)
+                model.densify(1e-9, 1.0)
+                model.optimizer.step()
+                model.optimizer.zero_grad(set_to_none=True)
+        assert len(model.get_xyz) == COUNT
+        moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
+        assert moved == MOVES[train]
+        (rate,) = [g["lr"] for g in model.optimizer.param_groups if g["name"] == "opacity"]
+        assert rate == host.schedule.at(4).opacity_lr  # stage 2's, not the scheduler's
+
+
+def command(mini, script, scene, out, iterations, *more):
+    flags = ["-s", scene, "-m", out, "--iterations", iterations, *TINY]
+    return [str(mini / script), *map(str, flags), *map(str, more)]
+
+
+OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
+FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
+
+
+def frozen_differences(before, after):
+    one, other = read_ply(before), read_ply(after)
+    return [name for name in FROZEN if not torch.equal(getattr(one, name), getattr(other, name))]
+
+
+@pytest.fixture(scope="module")
+def trained(mini, photographs, tmp_path_factory):
+    """Trained with pruning, then fine-tuned; a checkpoint of each stage."""
+    out = tmp_path_factory.mktemp("trained")
+    words = command(mini, "train_densify_prune.py", photographs, out, 20, "--sh_degree", 2)
+    words += ["--prune_iterations", "15", "18", "22", "--checkpoint_iterations", "28"]
+    return run(words, OPTIONS), out
+
+
+def test_training_resumes_itself_and_pruning_stands_still(trained):
+    summary, out = trained
+    assert (summary.adapter, summary.iterations) == ("light-gaussian", 8)
+    before, after = summary.model_before, summary.model_after
+    assert (before.parent.name, after.parent.name) == ("iteration_20", "iteration_28")
+    assert frozen_differences(before, after) == []  # though --prune_iterations names 22
+    store, info = sidecar.load(after)
+    assert len(store) == info.rows == summary.gaussians
+    assert not store.neutral
+    assert summary.fragments_after < summary.fragments_before
+    assert info.adapter == "light-gaussian"
+    assert np.load(out / "imp_score.npz")["arr_0"].shape == (summary.gaussians,)
+
+
+def survivors(before, after):
+    """Which row of one PLY each row of another is, by its position."""
+    one, other = read_ply(before).xyz, read_ply(after).xyz
+    rows = (other[:, None] == one[None]).all(dim=2).int()
+    assert (rows.sum(dim=1) == 1).all()
+    return rows.argmax(dim=1)
+
+
+@pytest.mark.parametrize("start", ["checkpoint", "point cloud"])
+def test_pruning_keeps_the_survivors_thresholds(mini, photographs, trained, tmp_path, start):
+    """Saved one iteration after pruning: no parameter has moved yet."""
+    summary, out = trained
+    at = 28 if start == "checkpoint" else 0
+    given = {
+        "checkpoint": ("--start_checkpoint", out / "chkpnt28.pth"),
+        "point cloud": ("--start_pointcloud", summary.model_after),
+    }[start]
+    words = command(mini, "prune_finetune.py", photographs, tmp_path, at + 2, "--sh_degree", 2)
+    words += [*map(str, given), "--prune_percent", "0.3", "--prune_iterations", str(at + 1)]
+    done = run(words, RunOptions(device="cpu", stage="off"))
+    assert (done.iterations, done.adapter) == (0, "light-gaussian")
+    after = tmp_path / "point_cloud" / f"iteration_{at + 2}" / "point_cloud.ply"
+    old, new = sidecar.load(summary.model_after)[0], sidecar.load(after)[0]
+    rows = survivors(summary.model_after, after)
+    assert len(new) == len(rows) < 0.75 * len(old)
+    for name, value in new.state_dict().items():
+        kept = old.state_dict()[name]
+        assert torch.equal(value, kept[rows]) if torch.is_tensor(value) else value == kept
+
+
+@pytest.mark.parametrize("given", ["checkpoint", "point cloud"])
+def test_pruning_is_stage_one_of_its_own_script(mini, photographs, trained, tmp_path, given):
+    summary, out = trained
+    at = 28 if given == "checkpoint" else 0
+    words = command(mini, "prune_finetune.py", photographs, tmp_path, at + 6, "--sh_degree", 2)
+    words += ["--prune_percent", "0.3", "--prune_iterations", str(at + 1)]
+    if given == "checkpoint":
+        words += ["--start_checkpoint", str(out / "chkpnt28.pth")]
+    else:
+        words += ["--start_pointcloud", str(summary.model_after)]
+        shutil.copy(out / "chkpnt28.pth", tmp_path)  # of another run, and later
+    again = run(words, OPTIONS)
+    assert again.gaussians < 0.75 * summary.gaussians
+    assert again.iterations == 8
+    names = [path.parent.name for path in (again.model_before, again.model_after)]
+    assert names == [f"iteration_{at + 6}", f"iteration_{at + 14}"]
+    assert frozen_differences(again.model_before, again.model_after) == []
+    stage1, stage2 = (sidecar.load(path)[0] for path in (again.model_before, again.model_after))
+    assert (stage1.steps, stage2.steps) == (7, 14)  # thresholds came along and learned on
+
+
+def test_finetune_alone_resumes_the_checkpoint_that_pruning_was_given(
+    mini, photographs, trained, tmp_path
+):
+    """Asked for stage 2 only, the host's pruning is what has to wait."""
+    summary, out = trained
+    words = command(mini, "prune_finetune.py", photographs, tmp_path, 40, "--sh_degree", 2)
+    words += ["--prune_iterations", "29", "--start_checkpoint", str(out / "chkpnt28.pth")]
+    again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
+    assert (again.gaussians, again.iterations) == (summary.gaussians, 8)
+    assert frozen_differences(summary.model_after, again.model_after) == []
+
+
+def distilling(mini, photographs, out, trained, iterations, *more):
+    checkpoint = trained[1] / "chkpnt28.pth"
+    words = command(mini, "distill_train.py", photographs, out, iterations, "--sh_degree", 2)
+    words += ["--start_checkpoint", str(checkpoint), "--teacher_model", str(checkpoint)]
+    return [*words, "--new_max_sh", "1", *more]
+
+
+def degree_two(out):
+    """Checkpoints of short runs stand at band 0; distillation takes a band away."""
+    capture, iteration = torch.load(out / "chkpnt28.pth", weights_only=False)
+    torch.save(((2, *capture[1:]), iteration), out / "chkpnt28.pth")
+
+
+def test_distillation_is_resumed_by_the_training_script(mini, photographs, trained, tmp_path):
+    degree_two(trained[1])
+    words = distilling(mini, photographs, tmp_path, trained, 33, "--augmented_view")
+    summary = run(words, OPTIONS)
+    assert summary.iterations == 8
+    assert [read_ply(p).sh_degree for p in (summary.model_before, summary.model_after)] == [1, 1]
+    assert summary.model_after.parent.name == "iteration_41"
+    assert frozen_differences(summary.model_before, summary.model_after) == []
+    student, teacher = (
+        sidecar.load(summary.model_before)[0],
+        sidecar.load(trained[0].model_after)[0],
+    )
+    assert torch.equal(student.logits, teacher.logits)  # applied while distilling, not learned
+
+
+class Teachers:
+    """Keeps every store that is attached."""
+
+    def __init__(self):
+        self.stores = []
+
+    @hookimpl
+    def fragprune_attached(self, model, store):
+        if not any(store is each for each in self.stores):
+            self.stores.append(store)
+
+
+def test_a_teacher_is_drawn_with_its_own_thresholds_and_never_trained(mini):
+    notes = Teachers()
+    with joint(**of(mini, plugins=[notes])) as host:
+        teacher, student = host.model(COUNT), host.model(COUNT)
+        label(host, teacher)
+        for model in (teacher, student):
+            model.restore(copy.deepcopy(model.capture()), host.arguments)
+        student.training_setup(host.arguments)
+        teacher.optimizer = None
+        taught = host.store(teacher).logits.detach().clone()
+        before = teacher._opacity.detach().clone()
+        camera, pictures = host.camera(), []
+        for iteration in (1, 2, 3):
+            student.update_learning_rate(iteration)
+            view = copy.deepcopy(camera)
+            image = host.render(view, student)["render"]
+            pictures.append(host.render(view, teacher)["render"].detach())
+            (image - pictures[-1]).abs().mean().backward()
+            student.optimizer.step()
+            student.optimizer.zero_grad(set_to_none=True)
+        assert torch.equal(host.store(teacher).logits, taught)
+        assert torch.equal(teacher._opacity, before)
+        assert torch.equal(pictures[0], pictures[2])
+        assert (host.store(student).steps, host.store(teacher).steps) == (3, 2)
+        assert not torch.equal(host.store(student).logits, taught)
+        with host.paused():
+            assert not torch.equal(host.render(camera, teacher)["render"], pictures[0])
+        state = host._last_state
+        assert state.store is host.store(student)
+        assert list(state.baseline) == [camera.uid]  # copies of a camera are one view
+
+
+def test_flags_of_distillation_are_left_out_of_what_resumes_it():
+    shared = ["-s", "a", "-m", "b", "--eval", "--test_iterations", "-1"]
+    own = ["--new_max_sh", "1", "--teacher_model", "t", "--enable_opacity", "--opacity_prune", "0"]
+    words = [*shared, *own]
+    script, arguments = LightGaussian().resumed_by(Path("x/distill_train.py"), words)
+    assert script == Path("x/train_densify_prune.py")
+    assert arguments == [*shared, "--sh_degree", "1"]
+    for name in ("x/train_densify_prune.py", "x/prune_finetune.py"):
+        assert LightGaussian().resumed_by(Path(name), words) == (Path(name), words)
+
+
+def test_nothing_to_start_from_is_said(mini, photographs, tmp_path):
+    words = command(mini, "prune_finetune.py", photographs, tmp_path, 5)
+    with pytest.raises(UsageError, match="nothing to start from"):
+        run(words, RunOptions(device="cpu", stage="finetune"))
+    assert "train_densify_prune" not in sys.modules
