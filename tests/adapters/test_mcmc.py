@@ -148,6 +148,20 @@ def test_relocated_rows_and_their_parents_start_without_moments(mini):
         assert torch.equal(identity(model)[~dead], torch.arange(COUNT)[~dead])
 
 
+def test_parents_of_a_relocation_are_not_taken_for_those_of_a_later_append(mini):
+    with joint(**of(mini)) as host:
+        model = host.model(COUNT)
+        host.step(model, host.camera(), 1)
+        with torch.no_grad():
+            model.relocate_gs(dead_mask=torch.arange(COUNT) < 2)
+            groups = model.optimizer.param_groups
+            strangers = [torch.rand_like(group["params"][0][:2]) for group in groups]
+            model.densification_postfix(*strangers)  # the groups' order is its parameters'
+        values = host.store(model).values.detach()
+        assert len(values) == COUNT + 2
+        assert (values[-2:] < 1e-12).all()  # neutral: nobody's children
+
+
 def test_a_relocation_that_copies_otherwise_is_refused(mini, monkeypatch):
     with joint(**of(mini)) as host:
         model = host.model(COUNT)
