@@ -15,7 +15,6 @@ import pytest
 from skeleton import STATES
 
 from fragprune_mcmc import MCMC
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
 from fragprune_plugins.detect import HostRepo
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -49,19 +48,6 @@ def flags(host: Path) -> list[str]:
     """What a host needs, or refuses, beyond the flags that all have."""
     mcmc = MCMC().match(HostRepo(host)).fits
     return ["--cap_max", "3100", "--init_type", "sfm"] if mcmc else ["--port", "0"]
-
-
-@pytest.fixture(scope="session")
-def dataset(tmp_path_factory):
-    """A copy: hosts write into the data they are given."""
-    given, target = os.environ.get("FRAGPRUNE_TEST_DATA"), tmp_path_factory.mktemp("data") / "scene"
-    candidates = [Path(given) / "fox" / "colmap160", Path(given)] if given else []
-    for candidate in candidates:
-        if (candidate / "sparse").is_dir():
-            shutil.copytree(candidate, target)
-            return target
-    make_scene(target, SceneSettings(views=12, width=80, height=60, supersample=1, points=600))
-    return target
 
 
 @every_vanilla
