@@ -364,6 +364,34 @@ def test_pruning_is_stage_one_of_its_own_script(mini, photographs, trained, tmp_
     assert (stage1.steps, stage2.steps) == (7, 14)  # thresholds came along and learned on
 
 
+def test_thresholds_learn_on_while_the_host_prunes(mini, photographs, trained, tmp_path):
+    summary, _ = trained
+    words = command(mini, "prune_finetune.py", photographs, tmp_path, 6, "--sh_degree", 2)
+    words += ["--start_pointcloud", str(summary.model_after)]
+    words += ["--prune_percent", "0.3", "--prune_iterations", "4"]
+    run(words, RunOptions(device="cpu", stage="joint", from_iter=1, settings=OPTIONS.settings))
+    file = tmp_path / "point_cloud" / "iteration_6" / "point_cloud.ply"
+    store, before = sidecar.load(file)[0], sidecar.load(summary.model_after)[0]
+    assert len(store) == len(read_ply(file).xyz) < 0.75 * len(before)
+    assert store.steps > before.steps > 0
+
+
+def test_a_point_cloud_alone_is_resumed_with_the_hosts_weight_decay(
+    mini, photographs, trained, tmp_path
+):
+    summary, _ = trained
+    made = tmp_path / "made.pth"
+    LightGaussian().checkpoint_from_ply(summary.model_after, 28, made)
+    (capture, _) = torch.load(made, weights_only=False)
+    state = LightGaussian().checkpoint_state(capture)
+    assert {group["weight_decay"] for group in state["param_groups"]} == {0.01}
+    shutil.copytree(summary.model_after.parent, tmp_path / "point_cloud" / "iteration_28")
+    words = command(mini, "train_densify_prune.py", photographs, tmp_path, 20, "--sh_degree", 2)
+    again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
+    assert again.model_after.parent.name == "iteration_36"
+    assert frozen_differences(again.model_before, again.model_after) == []
+
+
 def test_finetune_alone_resumes_the_checkpoint_that_pruning_was_given(
     mini, photographs, trained, tmp_path
 ):
