@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
@@ -33,9 +35,26 @@ _NAMES = (
 )
 
 
+_SMALL = 1 << 16
+"""Bytes below which the C library has memory at hand itself."""
+
+_STAGES = ("projection", "binning", "blend")
+
+
 def _plain(tensor: Tensor) -> Tensor:
     """The values as the C side wants them: contiguous float32 in ordinary memory."""
     return tensor.detach().to("cpu", torch.float32).contiguous()
+
+
+def _empty(workspace: loader.Workspace, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """As torch.empty, for four bytes a number; large ones in memory that the engine used before.
+
+    Fresh memory costs more than filling it: the system clears it page by page.
+    """
+    size = 4 * math.prod(shape)
+    if size < _SMALL:
+        return torch.empty(shape, dtype=dtype)
+    return torch.frombuffer(workspace.take(size), dtype=dtype).view(shape)
 
 
 def _address(tensor: Tensor | None) -> int | None:
@@ -58,18 +77,22 @@ class _Drawing:
     Attributes:
         inputs: as the engine got them.
         library: the build that draws.
+        workspace: the engine's.
         arrays: what the C side reads, kept alive as long as its state.
         state: what backward needs; None when nothing wants gradients.
         evaluated: lanes spent.
+        stages: milliseconds by stage.
         fragments: (H, W) int32, when asked for.
         fragments_per_gaussian: (N,) int32, when asked for.
     """
 
     inputs: RasterInputs
     library: loader.Library
+    workspace: loader.Workspace
     arrays: dict[str, Tensor]
     state: loader.State | None = None
     evaluated: int = 0
+    stages: dict[str, float] = field(default_factory=dict)
     fragments: Tensor | None = None
     fragments_per_gaussian: Tensor | None = None
 
@@ -89,6 +112,7 @@ class _Drawing:
             sh_coefficients=0 if splats.sh is None else splats.sh.shape[1],
             widen=widen,
             count=len(splats),
+            workspace=self.workspace.handle,
             **{name: _address(array) for name, array in self.arrays.items()},
         )
 
@@ -96,11 +120,12 @@ class _Drawing:
         """Run the forward pass; image, invdepth, alpha, radii, fragments per pixel."""
         view, n = self.inputs.view, len(self.inputs.splats)
         size = (view.height, view.width)
-        image, invdepth, alpha = torch.empty(3, *size), torch.empty(size), torch.empty(size)
-        radii = torch.empty(n, dtype=torch.int32)
+        empty = partial(_empty, self.workspace)
+        image, invdepth, alpha = empty(3, *size), empty(1, *size), empty(1, *size)
+        radii = empty(n, dtype=torch.int32)
         if self.inputs.counts:
-            self.fragments = torch.empty(size, dtype=torch.int32)
-            self.fragments_per_gaussian = torch.empty(n, dtype=torch.int32)
+            self.fragments = empty(*size, dtype=torch.int32)
+            self.fragments_per_gaussian = empty(n, dtype=torch.int32)
         outputs = loader.Outputs(
             image=_address(image),
             invdepth=_address(invdepth),
@@ -126,8 +151,9 @@ class _Drawing:
         else:
             self.arrays = {}
         self.evaluated = outputs.evaluated
+        self.stages = {name: getattr(outputs, f"{name}_ms") for name in _STAGES}
         drawn = torch.tensor(outputs.drawn / (view.width * view.height), dtype=torch.float32)
-        return image, invdepth[None], alpha[None], radii, drawn
+        return image, invdepth, alpha, radii, drawn
 
     def undraw(self, upstream: tuple[Tensor | None, ...], wants: dict[str, bool]) -> dict[str, Any]:
         """Run the backward pass; gradients by name, float32 on the CPU."""
@@ -143,7 +169,7 @@ class _Drawing:
         n = len(self.inputs.splats)
         shapes = {name: array.shape for name, array in self.arrays.items()}
         shapes["means2d"] = torch.Size((n, 3))
-        grads = {name: torch.empty(shapes[name]) for name, wanted in wants.items() if wanted}
+        grads = {k: _empty(self.workspace, *shapes[k]) for k, wanted in wants.items() if wanted}
         error = loader.Error()
         status = self.library.calls.fragprune_backward(
             self.state.handle,
@@ -200,6 +226,7 @@ class CpuEngine:
 
     def __init__(self, library: loader.Library | None = None) -> None:
         self._library = loader.library() if library is None else library
+        self._workspace = loader.Workspace(self._library)
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
@@ -219,7 +246,7 @@ class CpuEngine:
         read = {k: t for k, t in tensors.items() if t is not None and k != "means2d"}
         cameras = {k: getattr(view, k) for k in ("viewmatrix", "projmatrix", "campos")}
         arrays = {name: _plain(tensor) for name, tensor in {**read, **cameras}.items()}
-        drawing = _Drawing(inputs, self._library, arrays)
+        drawing = _Drawing(inputs, self._library, self._workspace, arrays)
         image, invdepth, alpha, radii, per_pixel = _Rasterize.apply(  # type: ignore[no-untyped-call]
             drawing, *(tensors[name] for name in _NAMES)
         )
@@ -233,6 +260,7 @@ class CpuEngine:
             evaluated_per_pixel=drawing.evaluated / (view.width * view.height),
             fragments=_on(device, drawing.fragments),
             fragments_per_gaussian=_on(device, drawing.fragments_per_gaussian),
+            stages=drawing.stages,
         )
 
 

@@ -6,10 +6,11 @@ import ctypes
 import importlib.util
 import os
 import threading
+import weakref
 from dataclasses import dataclass
 from typing import Any, Final
 
-API_VERSION: Final = 1
+API_VERSION: Final = 2
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -59,7 +60,7 @@ class Inputs(_Sized):
         ("widen", ctypes.c_int32),
         ("count", ctypes.c_int64),
         *_pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
-        *_pointers("cov3d sh colors thresholds"),
+        *_pointers("cov3d sh colors thresholds workspace"),
     )
 
 
@@ -71,6 +72,9 @@ class Outputs(_Sized):
         *_pointers("image invdepth alpha radii fragments fragments_per_gaussian"),
         ("drawn", ctypes.c_int64),
         ("evaluated", ctypes.c_int64),
+        ("projection_ms", ctypes.c_float),
+        ("binning_ms", ctypes.c_float),
+        ("blend_ms", ctypes.c_float),
     )
 
 
@@ -152,6 +156,14 @@ def open_build(build: str) -> Library:
     ]
     calls.fragprune_free.argtypes = [_POINTER]
     calls.fragprune_free.restype = None
+    calls.fragprune_workspace_new.argtypes = []
+    calls.fragprune_workspace_new.restype = _POINTER
+    calls.fragprune_workspace_free.argtypes = [_POINTER]
+    calls.fragprune_workspace_free.restype = None
+    calls.fragprune_workspace_take.argtypes = [_POINTER, ctypes.c_uint64]
+    calls.fragprune_workspace_take.restype = _POINTER
+    calls.fragprune_workspace_give.argtypes = [_POINTER, _POINTER, ctypes.c_uint64]
+    calls.fragprune_workspace_give.restype = None
     return Library(build, path, int(calls.fragprune_lanes()), calls)
 
 
@@ -286,4 +298,37 @@ class State:
     def __del__(self) -> None:
         if self.handle is not None:
             self._free(self.handle)
+            self.handle = None
+
+
+class Workspace:
+    """Owns a fragprune_workspace: memory that one call hands on to the next; for any threads.
+
+    Attributes:
+        handle: the C pointer, or None where there was no memory for it.
+    """
+
+    def __init__(self, opened: Library) -> None:
+        self._calls = opened.calls
+        self.handle: int | None = opened.calls.fragprune_workspace_new()
+
+    def take(self, size: int) -> ctypes.Array[ctypes.c_char]:
+        """A buffer of `size` bytes; its memory comes back when the last reference goes.
+
+        Raises:
+            MemoryError: there is none.
+        """
+        address = self._calls.fragprune_workspace_take(self.handle, size) if self.handle else None
+        if address is None:
+            raise MemoryError("fragprune's cpu engine: out of memory")
+        buffer = (ctypes.c_char * size).from_address(address)
+        weakref.finalize(buffer, self._give, address, size).atexit = False
+        return buffer
+
+    def _give(self, address: int, size: int) -> None:
+        self._calls.fragprune_workspace_give(self.handle, address, size)
+
+    def __del__(self) -> None:
+        if self.handle is not None:
+            self._calls.fragprune_workspace_free(self.handle)
             self.handle = None

@@ -6,7 +6,9 @@
 // and keeps the Gaussian's sums in registers.
 #pragma once
 
-#include "binning.h"
+#include <cstring>
+
+#include "projection.h"
 
 namespace fp {
 
@@ -42,54 +44,74 @@ inline Lanes lane_y() {
 inline int block_x(int block) { return block % 4 * kBlockWidth; }
 inline int block_y(int block) { return block / 4 * kBlockHeight; }
 
-// Up to kWord brushes, one array per number that finding blocks needs.
-struct BrushColumns {
-  alignas(64) float x[kWord], y[kWord], scale[kWord], skew[kWord], down[kWord], power[kWord];
+// Up to kBatch Gaussians in coordinates of a tile, one array per number.
+struct Batch {
+  alignas(64) float scale[kBatch], skew[kBatch], u0[kBatch], down[kBatch], v0[kBatch],
+      log_opacity[kBatch], cut[kBatch], r[kBatch], g[kBatch], b[kBatch], inv_z[kBatch];
+
+  LocalBrush<float> operator[](int j) const {
+    return {scale[j], skew[j], u0[j], down[j], v0[j], log_opacity[j],
+            cut[j],   r[j],    g[j],  b[j],    inv_z[j]};
+  }
 };
 
-// For each block, the bits of the Gaussians that reach it; only the first `count` are meant.
-inline void find_blocks(const BrushColumns& columns, int count, uint64_t* reached) {
-  const Lanes one = broadcast<Lanes>(1.f);
-  std::memset(reached, 0, kBlocks * sizeof *reached);
-  for (int i = 0; i < count; i += kLanes) {
-    const Lanes x = load(columns.x + i), y = load(columns.y + i);
-    const Ellipse<Lanes> e = ellipse_of(load(columns.scale + i), load(columns.skew + i),
-                                        load(columns.down + i), load(columns.power + i));
-    for (int row = 0; row < kBlockRows; row++) {
-      const float first = static_cast<float>(row * kBlockHeight);
-      const Lanes low = max(broadcast<Lanes>(first) - y, -e.half_height);
-      const Lanes high = min(broadcast<Lanes>(first + (kBlockHeight - 1)) - y, e.half_height);
-      const Mask crosses = ge(high, low);
-      if (!bits(crosses)) continue;
-      const Lanes right = x + span_end(e, low, high, one);
-      const Lanes left = x + span_end(e, low, high, -one);
-      for (int column = 0; column < 4; column++) {
-        const float from = static_cast<float>(column * kBlockWidth);
-        const Mask hit = both(crosses, both(ge(right, broadcast<Lanes>(from)),
-                                            ge(broadcast<Lanes>(from + kBlockWidth - 1), left)));
-        reached[row * 4 + column] |= static_cast<uint64_t>(bits(hit)) << i;
-      }
-    }
-  }
-  if (count < kWord)
-    for (int b = 0; b < kBlocks; b++) reached[b] &= (uint64_t{1} << count) - 1;
+// Copies kLanes Gaussians of the list out of the scene; beyond its end, the last one again.
+// `list_cut` is as in Brush; returns the mean in coordinates of the tile, too.
+inline Brush<Lanes> stage(const Splat* splats, const Tile& tile, int first, int at, Batch& to) {
+  const int last = tile.length - 1;
+  const auto splat = [&](int i) {
+    return reinterpret_cast<const float*>(splats + tile.list[std::min(first + i, last)]);
+  };
+  for (int i = 0; i < kLanes; i++) __builtin_prefetch(splat(i + kAhead));
+  Lanes v[12];
+  load_columns(splat, v);
+  load_columns([&](int i) { return splat(i) + 4; }, v + 4);
+  load_columns([&](int i) { return splat(i) + 8; }, v + 8);
+  Brush<Lanes> b = {v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11]};
+  const Lanes x = broadcast<Lanes>(static_cast<float>(tile.x));
+  const Lanes y = broadcast<Lanes>(static_cast<float>(tile.y));
+  const LocalBrush<Lanes> local = localize(b, x, y);
+  store(to.scale + at, local.scale), store(to.skew + at, local.skew), store(to.u0 + at, local.u0);
+  store(to.down + at, local.down), store(to.v0 + at, local.v0);
+  store(to.log_opacity + at, local.log_opacity), store(to.cut + at, local.cut);
+  store(to.r + at, local.r), store(to.g + at, local.g), store(to.b + at, local.b);
+  store(to.inv_z + at, local.inv_z);
+  b.x = b.x - x, b.y = b.y - y;
+  return b;
 }
 
-// Copies a word's worth of Gaussians out of the scene, in coordinates of the tile.
-inline void stage(const Splat* splats, const Tile& tile, int first, int count,
-                  BrushColumns& columns, LocalBrush* brushes) {
-  for (int j = 0; j < count; j++) {
-    if (first + j + kAhead < tile.length)
-      __builtin_prefetch(&splats[tile.list[first + j + kAhead]]);
-    const Brush& b = splats[tile.list[first + j]].brush;
-    brushes[j] = localize(b, static_cast<float>(tile.x), static_cast<float>(tile.y));
-    columns.x[j] = b.x - tile.x;
-    columns.y[j] = b.y - tile.y;
-    columns.scale[j] = b.scale;
-    columns.skew[j] = b.skew;
-    columns.down[j] = b.down;
-    columns.power[j] = b.log_opacity - b.list_cut;
+// Sets bit i + lane of each block that a lane's Gaussian reaches.
+inline void find_blocks(const Brush<Lanes>& b, int i, uint64_t* reached) {
+  const Lanes one = broadcast<Lanes>(1.f);
+  const Ellipse<Lanes> e = ellipse_of(b.scale, b.skew, b.down, b.log_opacity - b.list_cut);
+  const Lanes top = ceil(b.y - e.half_height), bottom = floor(b.y + e.half_height);
+  for (int row = 0; row < kBlockRows; row++) {
+    const float first = static_cast<float>(row * kBlockHeight);
+    const Lanes low = max(broadcast<Lanes>(first), top);
+    const Lanes high = min(broadcast<Lanes>(first + (kBlockHeight - 1)), bottom);
+    const Mask crosses = ge(high, low);
+    if (!bits(crosses)) continue;
+    const Lanes right = floor(b.x + span_end(e, low - b.y, high - b.y, one));
+    const Lanes left = ceil(b.x + span_end(e, low - b.y, high - b.y, -one));
+    const Mask some = both(crosses, ge(right, left));
+    for (int column = 0; column < 4; column++) {
+      const float from = static_cast<float>(column * kBlockWidth);
+      const Mask hit = both(some, both(ge(right, broadcast<Lanes>(from)),
+                                       ge(broadcast<Lanes>(from + kBlockWidth - 1), left)));
+      reached[row * 4 + column] |= static_cast<uint64_t>(bits(hit)) << i;
+    }
   }
+}
+
+// Stages a word's worth of the list and finds its blocks' bits.
+inline void stage_word(const Splat* splats, const Tile& tile, int first, int at, Batch& batch,
+                       uint64_t* reached) {
+  std::memset(reached, 0, kBlocks * sizeof *reached);
+  const int count = std::min(kWord, tile.length - first);
+  for (int i = 0; i < count; i += kLanes)
+    find_blocks(stage(splats, tile, first + i, at + i, batch), i, reached);
+  if (count < kWord)
+    for (int b = 0; b < kBlocks; b++) reached[b] &= (uint64_t{1} << count) - 1;
 }
 
 // ---- forward ---------------------------------------------------------------------------------
@@ -110,7 +132,7 @@ struct TileCounts {
 // words[kBlocks], ... Returns how many it met. (Local copies of the pixels, one by one: a struct
 // would be copied in small pieces, which stalls the loads that follow.)
 template <bool kCountEach>
-inline int blend_block(const LocalBrush* brushes, const uint64_t* words, int count, int first, Lanes px,
+inline int blend_block(const Batch& batch, const uint64_t* words, int count, int first, Lanes px,
                        Lanes py, BlockPixels& pixels, int32_t* drawn_each) {
   const Lanes floor = broadcast<Lanes>(kTransmittanceMin);
   const Lanes tiny = broadcast<Lanes>(1e-30f);  // no denormal numbers: they are slow
@@ -121,7 +143,7 @@ inline int blend_block(const LocalBrush* brushes, const uint64_t* words, int cou
   for (int base = 0; base < count && pixels.alive; base += kWord, words += kBlocks) {
     for (uint64_t todo = *words; todo; todo &= todo - 1) {
       const int j = base + __builtin_ctzll(todo);
-      const LocalBrush& b = brushes[j];
+      const LocalBrush<float> b = batch[j];
       met++;
       const Lanes exponent = meet(b, px, py).exponent;
       const Mask inside = ge(exponent, broadcast<Lanes>(b.cut));
@@ -212,23 +234,19 @@ inline TileCounts blend_tile(const Splat* splats, const Tile& tile, const Canvas
     alive += blocks[b].alive;
   }
   TileCounts counts;
-  LocalBrush brushes[kBatch];
-  BrushColumns columns;
+  Batch batch;
   uint64_t scratch[kBatch / kWord * kBlocks];
   for (int first = 0; first < tile.length && alive; first += kBatch) {
     const int count = std::min(kBatch, tile.length - first);
     uint64_t* words = reached ? reached + static_cast<size_t>(first) / kWord * kBlocks : scratch;
-    for (int base = 0; base < count; base += kWord) {
-      const int here = std::min(kWord, count - base);
-      stage(splats, tile, first + base, here, columns, brushes + base);
-      find_blocks(columns, here, words + base / kWord * kBlocks);
-    }
+    for (int base = 0; base < count; base += kWord)
+      stage_word(splats, tile, first + base, base, batch, words + base / kWord * kBlocks);
     for (int b = 0; b < kBlocks; b++) {
       if (!blocks[b].alive) continue;
       const Lanes px = lx + broadcast<Lanes>(static_cast<float>(block_x(b)));
       const Lanes py = ly + broadcast<Lanes>(static_cast<float>(block_y(b)));
       counts.evaluated +=
-          kLanes * blend_block<kCountEach>(brushes, words + b, count, first, px, py, blocks[b],
+          kLanes * blend_block<kCountEach>(batch, words + b, count, first, px, py, blocks[b],
                                            kCountEach ? drawn_each + first : nullptr);
       alive -= !blocks[b].alive;
     }
@@ -263,20 +281,16 @@ struct LossPixels {  // block order
   alignas(64) float behind[kPixels];  // gradient of all that lies behind it, weighted
 };
 
-struct RimLoss {
-  const float* thresholds;    // per row of the inputs
-  float per_fragment;         // dL/d(fragment)
-};
-
 // What the backward pass needs to know of one Gaussian's rim.
 struct Rim {
-  float list_cut, threshold, inv_opacity, per_fragment;
+  float list_cut, threshold, inv_opacity;
+  float per_fragment;  // dL/d(fragment)
 };
 
 // One fragment of each lane, back to front. Skipped fragments leave light and behind untouched.
 template <int kWant>
-inline void unblend_block(const LocalBrush& brush, const Rim& rim, int position, Lanes px, Lanes py,
-                          const int32_t* stops, int at, LossPixels& loss, Lanes* sums) {
+inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, int position, Lanes px,
+                          Lanes py, const int32_t* stops, int at, LossPixels& loss, Lanes* sums) {
   const Meeting<Lanes> m = meet(brush, px, py);
   const Mask reached = both(ge(m.exponent, broadcast<Lanes>(rim.list_cut)),
                             gt(load(stops + at), broadcast_int(position)));
@@ -347,7 +361,7 @@ inline void transpose_bits(const uint64_t* reached, const int32_t* last_stop, in
 // Writes sums_of(kWant) numbers per entry of the list at `out + slot * sums_of(kWant)`.
 template <int kWant>
 inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels& kept,
-                         const uint64_t* reached, const uint32_t* slots, const RimLoss& rim,
+                         const uint64_t* reached, const uint32_t* slots, float per_fragment,
                          LossPixels& loss, float* out) {
   constexpr int n = sums_of(kWant);
   const Lanes lx = lane_x(), ly = lane_y();
@@ -370,13 +384,9 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
       }
       if (first + j >= kAhead) __builtin_prefetch(&splats[tile.list[first + j - kAhead]]);
       const Splat& s = splats[tile.list[first + j]];
-      const LocalBrush brush =
+      const LocalBrush<float> brush =
           localize(s.brush, static_cast<float>(tile.x), static_cast<float>(tile.y));
-      Rim at = {s.brush.list_cut, 0, 0, rim.per_fragment};
-      if (kWant & kThreshold) {
-        at.threshold = rim.thresholds[s.id];
-        at.inv_opacity = std::exp2(-s.brush.log_opacity);
-      }
+      const Rim at = {s.brush.list_cut, s.threshold, s.inv_opacity, per_fragment};
       Lanes sums[n];
       for (Lanes& v : sums) v = broadcast<Lanes>(0.f);
       for (; todo; todo &= todo - 1) {

@@ -1,138 +1,48 @@
 // The C interface on a CPU: project, sort, bin, blend; and back.
 
 #include <array>
+#include <chrono>
 #include <cstdio>
 #include <new>
 #include <stdexcept>
 #include <utility>
 
+#include "binning.h"
 #include "blend.h"
 
+struct fragprune_workspace {
+  fp::Memory memory = std::make_shared<fp::Pool>();
+};
+
 struct fragprune_state {
+  fp::Memory memory;
   fragprune_inputs in;
-  fp::Camera camera;
-  fp::Buffer<fp::Splat> splats;
-  fp::Buffer<uint32_t> slot_begin;   // per splat, one more at the end
+  fp::Camera<float> camera;
+  fp::Scene scene;  // what backward needs of it
   fp::TileLists lists;
-  fp::Buffer<size_t> words;          // per tile: where its bits begin
-  fp::Buffer<uint64_t> reached;      // see find_blocks
+  fp::Buffer<size_t> words;           // per tile: where its bits begin
+  fp::Buffer<uint64_t> reached;       // see find_blocks
   fp::Buffer<fp::TilePixels> pixels;  // per tile
 };
 
 namespace fp {
 namespace {
 
-constexpr size_t kGrain = 1024;  // Gaussians per piece of work
-
-// ---- projection ------------------------------------------------------------------------------
-
-// The whole way of one Gaussian to what blending needs; false: it cannot draw anything. Colour is
-// computed last, for those that are left.
-bool make_splat(const Camera& c, const fragprune_inputs& in, int64_t i, int32_t* radius, Splat& s,
-                float* depth, std::vector<Run>& runs) {
-  Projection p;
-  *radius = 0;
-  if (!project(c, in, i, p)) return false;
-  *radius = p.radius;
-  const float opacity = in.opacities[i] * compensation(c, p);
-  const float threshold = in.thresholds ? in.thresholds[i] : 0.f;
-  if (!(opacity > 0 && opacity < 1e30f && threshold >= 0)) return false;
-  Brush& b = s.brush;
-  b.log_opacity = std::log2(opacity);
-  b.cut = cut_of(b.log_opacity, threshold);
-  b.list_cut = in.widen ? cut_of(b.log_opacity, rim_reach(threshold)) : b.cut;
-  if (!(b.list_cut <= b.log_opacity)) return false;
-  b.x = p.x;
-  b.y = p.y;
-  b.scale = std::sqrt(0.5f * kLog2E * (p.var_y / p.det));
-  b.skew = -b.scale * (p.cov / p.var_y);
-  b.down = std::sqrt(0.5f * kLog2E / p.var_y);
-  b.inv_z = 1 / p.view.z;
-  const size_t before = runs.size();
-  reached_tiles(c, p, b, [&](Run run) { runs.push_back(run); });
-  if (runs.size() == before) return false;
-  const Vec3 colour = colour_of(c, in, i);
-  if (!(std::fabs(colour.x) + std::fabs(colour.y) + std::fabs(colour.z) < 1e30f)) {
-    runs.resize(before);
-    return false;
-  }
-  b.r = colour.x, b.g = colour.y, b.b = colour.z;
-  s.id = static_cast<uint32_t>(i);
-  *depth = p.view.z;
-  return true;
-}
-
-Scene project_all(Team& team, const Camera& c, const fragprune_inputs& in, int32_t* radii) {
-  struct Piece {
-    std::vector<Splat> splats;
-    std::vector<float> depth;
-    std::vector<uint32_t> run_end, slot_end;
-    std::vector<Run> runs;
-  };
-  const size_t n = static_cast<size_t>(in.count), pieces = (n + kGrain - 1) / kGrain;
-  std::vector<Piece> found(pieces);
-  team.each(n, kGrain, [&](size_t begin, size_t end) {
-    Piece& mine = found[begin / kGrain];
-    mine.splats.reserve(end - begin);
-    mine.runs.reserve(4 * (end - begin));
-    Splat splat;
-    float depth;
-    uint64_t slots = 0;
-    for (size_t i = begin; i < end; i++) {
-      const size_t runs = mine.runs.size();
-      if (!make_splat(c, in, static_cast<int64_t>(i), radii + i, splat, &depth, mine.runs)) continue;
-      for (size_t r = runs; r < mine.runs.size(); r++)
-        slots += mine.runs[r].x1 - mine.runs[r].x0 + 1;
-      if (slots > UINT32_MAX) throw std::length_error("tile lists");
-      mine.splats.push_back(splat);
-      mine.depth.push_back(depth);
-      mine.run_end.push_back(static_cast<uint32_t>(mine.runs.size()));
-      mine.slot_end.push_back(static_cast<uint32_t>(slots));
-    }
-  });
-  struct Place {
-    size_t splat, run, slot;
-  };
-  std::vector<Place> place(pieces + 1, Place{0, 0, 0});
-  for (size_t k = 0; k < pieces; k++) {
-    const Piece& p = found[k];
-    place[k + 1] = {place[k].splat + p.splats.size(), place[k].run + p.runs.size(),
-                    place[k].slot + (p.slot_end.empty() ? 0 : p.slot_end.back())};
-  }
-  const Place total = place[pieces];  // runs are fewer than slots
-  if (total.slot > UINT32_MAX) throw std::length_error("tile lists");
-  Scene scene{Buffer<Splat>(total.splat), Buffer<float>(total.splat),
-              Buffer<uint32_t>(total.splat + 1), Buffer<uint32_t>(total.splat + 1),
-              Buffer<Run>(total.run)};
-  scene.run_begin[0] = scene.slot_begin[0] = 0;
-  team.each(pieces, 1, [&](size_t k, size_t) {
-    Piece mine;
-    std::swap(mine, found[k]);  // freed as soon as it is copied
-    const Place at = place[k];
-    std::copy(mine.splats.begin(), mine.splats.end(), scene.splats.data() + at.splat);
-    std::copy(mine.depth.begin(), mine.depth.end(), scene.depth.data() + at.splat);
-    std::copy(mine.runs.begin(), mine.runs.end(), scene.runs.data() + at.run);
-    for (size_t j = 0; j < mine.run_end.size(); j++) {
-      scene.run_begin[at.splat + j + 1] = static_cast<uint32_t>(at.run) + mine.run_end[j];
-      scene.slot_begin[at.splat + j + 1] = static_cast<uint32_t>(at.slot) + mine.slot_end[j];
-    }
-  });
-  return scene;
-}
-
 // ---- forward ---------------------------------------------------------------------------------
 
-Tile tile_at(const Camera& c, const TileLists& lists, size_t t) {
+Tile tile_at(const Camera<float>& c, const TileLists& lists, size_t t) {
   const uint32_t first = lists.first[t];
-  return {static_cast<int>(t % c.tiles_x) * kTile, static_cast<int>(t / c.tiles_x) * kTile,
+  const size_t across = static_cast<size_t>(c.tiles_x);
+  return {static_cast<int>(t % across) * kTile, static_cast<int>(t / across) * kTile,
           lists.splat.data() + first, static_cast<int>(lists.first[t + 1] - first)};
 }
 
-void draw(Team& team, const Camera& c, const fragprune_inputs& in, const Buffer<Splat>& splats,
-          const TileLists& lists, fragprune_outputs& out, fragprune_state* keep) {
-  const Canvas canvas{in.width,  in.height,    {in.background[0], in.background[1], in.background[2]},
+void draw(Team& team, const Camera<float>& c, const fragprune_inputs& in,
+          const Buffer<Splat>& splats, const TileLists& lists, fragprune_outputs& out, fragprune_state* keep) {
+  const float* back = in.background;
+  const Canvas canvas{in.width,  in.height,    {back[0], back[1], back[2]},
                       out.image, out.invdepth, out.alpha, out.fragments};
-  const size_t tiles = lists.first.size() - 1;
+  const size_t tiles = lists.tiles();
   std::atomic<int64_t> drawn{0}, evaluated{0};
   team.each(tiles, 1, [&](size_t t, size_t) {
     const Tile tile = tile_at(c, lists, t);
@@ -156,33 +66,57 @@ void draw(Team& team, const Camera& c, const fragprune_inputs& in, const Buffer<
   out.evaluated = evaluated;
 }
 
-void forward(const fragprune_inputs& in, fragprune_outputs& out, fragprune_state* keep) {
+// Milliseconds since the last call.
+class Clock {
+ public:
+  float lap() {
+    const auto now = std::chrono::steady_clock::now();
+    const std::chrono::duration<float, std::milli> spent = now - last_;
+    last_ = now;
+    return spent.count();
+  }
+
+ private:
+  std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
+};
+
+// Room for what the tiles keep for the backward pass.
+void prepare(fragprune_state& keep, const TileLists& lists) {
+  const size_t tiles = lists.tiles();
+  keep.words = Buffer<size_t>(keep.memory, tiles);
+  size_t words = 0;
+  for (size_t t = 0; t < tiles; t++) {
+    keep.words[t] = words;
+    words += (lists.first[t + 1] - lists.first[t] + kWord - 1) / kWord * kBlocks;
+  }
+  keep.reached = Buffer<uint64_t>(keep.memory, words);
+  keep.pixels = Buffer<TilePixels>(keep.memory, tiles);
+}
+
+void forward(const fragprune_inputs& in, fragprune_outputs& out, const Memory& memory,
+             fragprune_state* keep) {
+  Clock clock;
   Team team(in.threads);
-  const Camera camera = unpack_camera(in);
-  Scene scene = project_all(team, camera, in, out.radii);
-  const Buffer<uint32_t> order = order_by_depth(team, scene.depth, scene.depth.size());
-  TileLists lists = distribute(team, camera, scene, order, keep != nullptr);
+  const Camera<float> camera = unpack_camera(in);
+  Scene scene = project_all(team, memory, camera, in, out.radii);
+  out.projection_ms = clock.lap();
+  const size_t across = static_cast<size_t>(camera.tiles_x);
+  TileLists lists = distribute(team, memory, across, scene, keep != nullptr);
+  out.binning_ms = clock.lap();
   if (out.fragments_per_gaussian)
     std::fill_n(out.fragments_per_gaussian, static_cast<size_t>(in.count), 0);
-  if (keep) {
-    const size_t tiles = lists.first.size() - 1;
-    keep->words = Buffer<size_t>(tiles);
-    size_t words = 0;
-    for (size_t t = 0; t < tiles; t++) {
-      keep->words[t] = words;
-      words += (lists.first[t + 1] - lists.first[t] + kWord - 1) / kWord * kBlocks;
-    }
-    keep->reached = Buffer<uint64_t>(words);
-    keep->pixels = Buffer<TilePixels>(tiles);
-  }
+  if (keep) prepare(*keep, lists);
   draw(team, camera, in, scene.splats, lists, out, keep);
   if (keep) {
     keep->in = in;
     keep->camera = camera;
-    keep->splats = std::move(scene.splats);
-    keep->slot_begin = std::move(scene.slot_begin);
+    scene.depth = Buffer<float>();
+    scene.reach = Buffer<Reach>();
+    scene.spans.clear();
+    keep->scene = std::move(scene);
     keep->lists = std::move(lists);
   }
+  out.blend_ms = clock.lap();
 }
 
 // ---- backward --------------------------------------------------------------------------------
@@ -194,7 +128,7 @@ struct Losses {
 };
 
 // One plane of the image into block order; pixels outside the image, and a plane of NULL, are 0.
-void load_plane(const Camera& c, const Tile& tile, const float* plane, float* to) {
+void load_plane(const Camera<float>& c, const Tile& tile, const float* plane, float* to) {
   const int width = static_cast<int>(c.width), height = static_cast<int>(c.height);
   if (!plane || tile.x + kTile > width || tile.y + kTile > height) std::fill_n(to, kPixels, 0.f);
   if (!plane) return;
@@ -213,8 +147,8 @@ void load_plane(const Camera& c, const Tile& tile, const float* plane, float* to
 }
 
 // Brings a tile's loss gradients into block order and starts the walk from the last fragment.
-void load_losses(const Camera& c, const Losses& from, const Tile& tile, const TilePixels& kept,
-                 LossPixels& to, double* by_background) {
+void load_losses(const Camera<float>& c, const Losses& from, const Tile& tile,
+                 const TilePixels& kept, LossPixels& to, double* by_background) {
   const float* image = from.grads.image;
   float alpha[kPixels];
   load_plane(c, tile, image, to.r);
@@ -237,15 +171,15 @@ void load_losses(const Camera& c, const Losses& from, const Tile& tile, const Ti
 }
 
 using UnblendTile = void (*)(const Splat*, const Tile&, const TilePixels&, const uint64_t*,
-                             const uint32_t*, const RimLoss&, LossPixels&, float*);
+                             const uint32_t*, float, LossPixels&, float*);
 
 template <size_t... kWants>
 constexpr std::array<UnblendTile, sizeof...(kWants)> unblenders(std::index_sequence<kWants...>) {
   return {unblend_tile<static_cast<int>(kWants)>...};
 }
 
-PixelSums unpack_sums(const float* v, int want) {
-  PixelSums s{};
+PixelSums<Lanes> unpack_sums(const Lanes* v, int want) {
+  PixelSums<Lanes> s{};
   s.w = *v++;
   if (want & kThreshold) s.threshold = *v++;
   if (want & kGeometry) s.u = *v++, s.v = *v++, s.uu = *v++, s.uv = *v++, s.vv = *v++;
@@ -254,53 +188,138 @@ PixelSums unpack_sums(const float* v, int want) {
   return s;
 }
 
-// From the sums over pixels to the inputs of one Gaussian.
-void chain(const fragprune_state& state, const fragprune_input_grads& to, int want, int64_t i,
-           const PixelSums& sums) {
-  const Camera& c = state.camera;
-  const fragprune_inputs& in = state.in;
-  if (to.thresholds) to.thresholds[i] = sums.threshold;
-  if (to.opacities) to.opacities[i] = sums.w / in.opacities[i];  // alpha is proportional to it
-  if (to.colors) write3(to.colors + 3 * i, {sums.r, sums.g, sums.b});
-  Vec3 by_mean = {0, 0, 0};
-  if (in.sh && want & kColour) {
-    float* by_sh = to.sh ? to.sh + static_cast<int64_t>(3) * in.sh_coefficients * i : nullptr;
-    by_mean = sh_gradient(c, in, i, sums, by_sh, to.means != nullptr && in.sh_degree > 0);
+// kLanes Gaussians by their rows of the inputs. `count` are meant; the others repeat the last.
+struct Picked {
+  uint32_t ids[kLanes];
+  int count;
+
+  template <int kWidth>
+  void write(float* to, const Lanes* column) const {
+    if (!to) return;
+    float values[kWidth][kLanes];
+    for (int k = 0; k < kWidth; k++) store(values[k], column[k]);
+    for (int lane = 0; lane < count; lane++)
+      for (int k = 0; k < kWidth; k++)
+        to[static_cast<size_t>(ids[lane]) * kWidth + k] = values[k][lane];
   }
-  if (!(want & kGeometry)) return;
-  Projection p;
-  project(c, in, i, p);
-  const ImageGradient g = image_gradient(c, p, sums);
-  if (to.means2d) write3(to.means2d + 3 * i, {g.x * 0.5f * c.width, g.y * 0.5f * c.height, 0});
-  const Shape shape = shape_of(c, in, i);
-  Mat3 m;
-  Vec3 view = shape_gradient(c, p, shape, g, m);
-  view.z -= sums.inv_z / (p.view.z * p.view.z);
-  if (to.means)
-    write3(to.means + 3 * i, by_mean + mean_gradient(c, read3(in.means + 3 * i), g, view));
-  if (to.cov3d) {
-    float* o = to.cov3d + 6 * i;  // an off-diagonal entry stands for two
-    o[0] = m.row[0].x, o[1] = m.row[0].y + m.row[1].x, o[2] = m.row[0].z + m.row[2].x;
-    o[3] = m.row[1].y, o[4] = m.row[1].z + m.row[2].y, o[5] = m.row[2].z;
+  void write(float* to, const Vec<Lanes>& v) const { write<3>(to, &v.x); }
+};
+
+// From the sums over pixels to the inputs.
+class Chain {
+ public:
+  Chain(const fragprune_state& state, const fragprune_input_grads& to, int want)
+      : in_(state.in), to_(to), want_(want), c_(lift<Lanes>(state.camera)),
+        means_(in_.means, in_.count), scales_(in_.scales, in_.count) {}
+
+  void run(const Picked& who, const PixelSums<Lanes>& sums) const {
+    who.write<1>(to_.thresholds, &sums.threshold);
+    if (to_.opacities) {  // alpha is proportional to it
+      Lanes opacity;
+      for (int i = 0; i < kLanes; i++) opacity[i] = in_.opacities[who.ids[i]];
+      const Lanes by_opacity = sums.w / opacity;
+      who.write<1>(to_.opacities, &by_opacity);
+    }
+    who.write(to_.colors, {sums.r, sums.g, sums.b});
+    const bool by_colour = in_.sh && want_ & kColour;
+    if (!(want_ & kGeometry) && !by_colour) return;
+    Given<Lanes> given;
+    given.mean = means_.load(who.ids);
+    Vec<Lanes> by_mean = Vec<Lanes>();
+    if (by_colour) by_mean = colour(who, given.mean, sums);
+    if (want_ & kGeometry) geometry(who, given, by_mean, sums);
   }
-  if (to.scales || to.rotations) {
-    const Mat3 r = rotation_of(in.rotations + 4 * i);
-    const Vec3 size = c.scale_modifier * read3(in.scales + 3 * i);
-    if (to.scales) {
-      Vec3 by_size = {0, 0, 0};
-      for (int k = 0; k < 3; k++) {
-        by_size.x += r.row[k].x * m.row[k].x;
-        by_size.y += r.row[k].y * m.row[k].y;
-        by_size.z += r.row[k].z * m.row[k].z;
+
+ private:
+  // Writes dL/dsh, returns dL/dmean through the direction.
+  Vec<Lanes> colour(const Picked& who, const Vec<Lanes>& mean, const PixelSums<Lanes>& sums) const {
+    const bool by_direction = to_.means && in_.sh_degree > 0;
+    Lanes inv_length;
+    const Vec<Lanes> direction = direction_to(c_, mean, inv_length);
+    Harmonics<Lanes> h;
+    const int terms = harmonics(in_.sh_degree, direction, h, by_direction);
+    Coefficients coefficients;
+    load_coefficients(in_, who.ids, terms, coefficients);
+    const Vec<Lanes> g = through_clamp(raw_colour(h, terms, coefficients), sums);
+    if (to_.sh) write_sh(who, h, terms, g);
+    if (!by_direction) return Vec<Lanes>();
+    return direction_gradient(h, terms, direction, inv_length, g, coefficients);
+  }
+
+  void write_sh(const Picked& who, const Harmonics<Lanes>& h, int terms,
+                const Vec<Lanes>& g) const {
+    Lanes column[48];
+    for (int k = 0; k < terms; k++) {
+      const Vec<Lanes> v = h.value[k] * g;
+      column[3 * k] = v.x, column[3 * k + 1] = v.y, column[3 * k + 2] = v.z;
+    }
+    const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
+    const size_t used = 3 * static_cast<size_t>(terms);
+    float scratch[48];  // where lanes go that are not meant
+    const auto row = [&](int lane) {
+      return lane < who.count ? to_.sh + who.ids[lane] * width : scratch;
+    };
+    if (used < 4) {
+      for (int lane = 0; lane < who.count; lane++)
+        for (size_t k = 0; k < used; k++) row(lane)[k] = column[k][lane];
+    } else {
+      for (size_t k = 0; k < used; k += 4) {
+        const size_t from = std::min(k, used - 4);
+        store_rows(column + from, [&](int lane) { return row(lane) + from; });
       }
-      write3(to.scales + 3 * i, c.scale_modifier * by_size);
     }
-    if (to.rotations) {
-      for (Vec3& v : m.row) v = {v.x * size.x, v.y * size.y, v.z * size.z};
-      rotation_gradient(in.rotations + 4 * i, m, to.rotations + 4 * i);
+    if (used == width) return;
+    for (int lane = 0; lane < who.count; lane++)
+      std::fill(row(lane) + used, row(lane) + width, 0.f);
+  }
+
+  void geometry(const Picked& who, Given<Lanes>& given, const Vec<Lanes>& by_mean,
+                const PixelSums<Lanes>& sums) const {
+    given.factored = in_.cov3d == nullptr;
+    if (given.factored) {
+      given.scale = scales_.load(who.ids);
+      const auto row = [&](int i) { return in_.rotations + 4 * size_t{who.ids[i]}; };
+      load_columns(row, given.rotation);
+    } else {
+      const auto row = [&](int i) { return in_.cov3d + 6 * size_t{who.ids[i]}; };
+      load_columns(row, given.cov3d);
+      load_columns([&](int i) { return row(i) + 2; }, given.cov3d + 2);
+    }
+    Projection<Lanes> p;
+    project(c_, given, p);
+    const ImageGradient<Lanes> g = image_gradient(c_, p, sums);
+    who.write(to_.means2d,
+              {g.x * 0.5f * c_.width, g.y * 0.5f * c_.height, broadcast<Lanes>(0.f)});
+    Mat3<Lanes> m;
+    Vec<Lanes> view = shape_gradient(c_, p, shape_of(c_, given), g, m);
+    view.z = view.z - sums.inv_z / (p.view.z * p.view.z);
+    who.write(to_.means, by_mean + mean_gradient(c_, given.mean, g, view));
+    if (to_.cov3d) {  // an off-diagonal entry stands for two
+      const Lanes by[6] = {m.row[0].x, m.row[0].y + m.row[1].x, m.row[0].z + m.row[2].x,
+                           m.row[1].y, m.row[1].z + m.row[2].y, m.row[2].z};
+      who.write<6>(to_.cov3d, by);
+    }
+    if (to_.scales) {
+      const Mat3<Lanes> r = rotation_of(given.rotation);
+      const Vec<Lanes> by_size =
+          times(r.row[0], m.row[0]) + times(r.row[1], m.row[1]) + times(r.row[2], m.row[2]);
+      who.write(to_.scales, c_.scale_modifier * by_size);
+    }
+    if (to_.rotations) {
+      const Vec<Lanes> size = c_.scale_modifier * given.scale;
+      for (Vec<Lanes>& v : m.row) v = times(v, size);
+      Lanes by[4];
+      rotation_gradient(given.rotation, m, by);
+      who.write<4>(to_.rotations, by);
     }
   }
-}
+
+  const fragprune_inputs& in_;
+  const fragprune_input_grads& to_;
+  const int want_;
+  const Camera<Lanes> c_;
+  const Triples means_, scales_;
+};
 
 // A gradient array and its numbers per Gaussian.
 struct GradientRows {
@@ -332,22 +351,22 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
 
   static constexpr auto table = unblenders(std::make_index_sequence<16>());
   const int size = sums_of(want);
-  const size_t tiles = lists.first.size() - 1;
+  const size_t tiles = lists.tiles();
   const Losses losses{grads,
                       {in.background[0], in.background[1], in.background[2]},
                       static_cast<size_t>(in.width) * in.height};
   const float pixels = static_cast<float>(losses.plane);
-  const RimLoss rim{in.thresholds, grads.fragments_per_pixel / pixels};
-  Buffer<float> sums(per_gaussian ? lists.splat.size() * size : 0);
-  Buffer<double> by_background(3 * tiles);
+  const float per_fragment = grads.fragments_per_pixel / pixels;
+  Buffer<float> sums(state.memory, per_gaussian ? lists.splat.size() * size : 0);
+  Buffer<double> by_background(state.memory, 3 * tiles);
   team.each(tiles, 1, [&](size_t t, size_t) {
     const Tile tile = tile_at(state.camera, lists, t);
     LossPixels loss;
     load_losses(state.camera, losses, tile, state.pixels[t], loss, &by_background[3 * t]);
     if (per_gaussian)
-      table[want](state.splats.data(), tile, state.pixels[t],
-                  state.reached.data() + state.words[t], lists.slot.data() + lists.first[t], rim,
-                  loss, sums.data());
+      table[want](state.scene.splats.data(), tile, state.pixels[t],
+                  state.reached.data() + state.words[t], lists.slot.data() + lists.first[t],
+                  per_fragment, loss, sums.data());
   });
   if (to.background)
     for (int k = 0; k < 3; k++) {
@@ -356,19 +375,35 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
       to.background[k] = static_cast<float>(total);
     }
   if (!per_gaussian) return;
-  const size_t splats = state.splats.size();
-  if (splats == 0) clear(0, n);
-  team.each(splats, kGrain, [&](size_t begin, size_t end) {
+  const Chain chain(state, to, want);
+  team.each(state.scene.pieces(), 1, [&](size_t piece, size_t) {
+    const Scene& scene = state.scene;
+    const size_t begin = piece * kPiece, end = begin + scene.count[piece];
+    size_t row = begin;  // the first whose gradients are not written yet
+    Picked who;
+    who.count = 0;
+    Lanes total[sums_of(15)] = {};
+    const auto flush = [&] {
+      for (int lane = who.count; lane < kLanes; lane++) who.ids[lane] = who.ids[who.count - 1];
+      chain.run(who, unpack_sums(total, want));
+      who.count = 0;
+    };
     for (size_t k = begin; k < end; k++) {
-      const size_t i = state.splats[k].id;
-      clear(k ? state.splats[k - 1].id + size_t{1} : 0, i);
-      float total[sums_of(15)] = {};
-      const float* v = sums.data() + static_cast<size_t>(state.slot_begin[k]) * size;
-      for (uint32_t slot = state.slot_begin[k]; slot < state.slot_begin[k + 1]; slot++)
-        for (int s = 0; s < size; s++) total[s] += *v++;
-      chain(state, to, want, static_cast<int64_t>(i), unpack_sums(total, want));
+      const uint32_t from = scene.slot_begin(k), until = scene.slot_end(k);
+      if (from == until) continue;
+      const size_t i = scene.splats[k].id;
+      clear(row, i);
+      row = i + 1;
+      float mine[sums_of(15)] = {};
+      const float* v = sums.data() + static_cast<size_t>(from) * size;
+      for (uint32_t slot = from; slot < until; slot++)
+        for (int s = 0; s < size; s++) mine[s] += *v++;
+      for (int s = 0; s < size; s++) total[s][who.count] = mine[s];
+      who.ids[who.count++] = static_cast<uint32_t>(i);
+      if (who.count == kLanes) flush();
     }
-    if (end == splats) clear(state.splats[splats - 1].id + size_t{1}, n);
+    if (who.count) flush();
+    clear(row, std::min(begin + kPiece, n));
   });
 }
 
@@ -425,8 +460,11 @@ int fragprune_forward(const fragprune_inputs* inputs, fragprune_outputs* outputs
   if (const char* fault = fp::fault_of(inputs, outputs))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fault);
   return fp::guarded(error, [&] {
+    const fp::Memory memory =
+        inputs->workspace ? inputs->workspace->memory : std::make_shared<fp::Pool>();
     std::unique_ptr<fragprune_state> keep(state ? new fragprune_state : nullptr);
-    fp::forward(*inputs, *outputs, keep.get());
+    if (keep) keep->memory = memory;
+    fp::forward(*inputs, *outputs, memory, keep.get());
     if (state) *state = keep.release();
   });
 }
@@ -446,6 +484,28 @@ int fragprune_backward(const fragprune_state* state, const fragprune_output_grad
 }
 
 void fragprune_free(fragprune_state* state) { delete state; }
+
+fragprune_workspace* fragprune_workspace_new(void) {
+  try {
+    return new fragprune_workspace;
+  } catch (const std::bad_alloc&) {
+    return nullptr;
+  }
+}
+
+void fragprune_workspace_free(fragprune_workspace* workspace) { delete workspace; }
+
+void* fragprune_workspace_take(fragprune_workspace* workspace, uint64_t bytes) {
+  try {
+    return workspace->memory->take(fp::Pool::class_of(bytes));
+  } catch (const std::exception&) {
+    return nullptr;
+  }
+}
+
+void fragprune_workspace_give(fragprune_workspace* workspace, void* memory, uint64_t bytes) {
+  if (memory) workspace->memory->put(memory, fp::Pool::class_of(bytes));
+}
 
 int fragprune_version(void) { return FRAGPRUNE_API_VERSION; }
 

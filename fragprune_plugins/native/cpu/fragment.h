@@ -21,26 +21,29 @@ constexpr float kTransmittanceMin = static_cast<float>(FRAGPRUNE_TRANSMITTANCE_M
 // a sum of two positive terms: the expanded form a dx^2 + 2 b dx dy + c dy^2 loses all digits far
 // out on a long thin splat. With u = scale (dx - slope dy) and v = down dy, scaled so that
 // u^2 + v^2 = q log2(e) / 2, alpha before the cap is 2^(log_opacity - u^2 - v^2).
+template <class V>
 struct Brush {
-  float x, y;             // mean, pixels
-  float scale;            // sqrt(log2(e) / 2 / var_along)
-  float skew;             // -scale * slope
-  float down;             // sqrt(log2(e) / 2 / var_down)
-  float log_opacity;      // log2 of the compensated opacity
-  float cut;              // drawn iff the exponent is at least this
-  float list_cut;         // lists reach to here: cut, or farther when the rim wants gradients
-  float r, g, b, inv_z;
+  V x, y;                 // mean, pixels
+  V scale;                // sqrt(log2(e) / 2 / var_along)
+  V skew;                 // -scale * slope
+  V down;                 // sqrt(log2(e) / 2 / var_down)
+  V log_opacity;          // log2 of the compensated opacity
+  V cut;                  // drawn iff the exponent is at least this
+  V list_cut;             // lists reach to here: cut, or farther when the rim wants gradients
+  V r, g, b, inv_z;
 };
 
 // A brush seen from a tile: u = scale px + skew py + u0, v = down py + v0.
+template <class V>
 struct LocalBrush {
-  float scale, skew, u0, down, v0;
-  float log_opacity, cut;
-  float r, g, b, inv_z;
+  V scale, skew, u0, down, v0;
+  V log_opacity, cut;
+  V r, g, b, inv_z;
 };
 
-FP_HD inline LocalBrush localize(const Brush& b, float tile_x, float tile_y) {
-  const float x = b.x - tile_x, y = b.y - tile_y;
+template <class V>
+FP_HD inline LocalBrush<V> localize(const Brush<V>& b, V tile_x, V tile_y) {
+  const V x = b.x - tile_x, y = b.y - tile_y;
   return {b.scale,       b.skew, -(b.scale * x + b.skew * y), b.down, -b.down * y,
           b.log_opacity, b.cut,  b.r, b.g, b.b, b.inv_z};
 }
@@ -53,7 +56,7 @@ struct Meeting {
 };
 
 template <class V>
-FP_HD inline Meeting<V> meet(const LocalBrush& b, V px, V py) {
+FP_HD inline Meeting<V> meet(const LocalBrush<float>& b, V px, V py) {
   Meeting<V> m;
   m.u = fma(broadcast<V>(b.scale), px, fma(broadcast<V>(b.skew), py, broadcast<V>(b.u0)));
   m.v = fma(broadcast<V>(b.down), py, broadcast<V>(b.v0));

@@ -19,6 +19,11 @@
 #define FP_LANES 4
 #endif
 
+// Functions that take lanes by value are all inline: no other compiler's calls to agree with.
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wpsabi"
+#endif
+
 namespace fp {
 
 constexpr int kLanes = FP_LANES;
@@ -26,6 +31,31 @@ static_assert(kLanes == 4 || kLanes == 8 || kLanes == 16, "FP_LANES is 4, 8 or 1
 
 typedef float Lanes __attribute__((vector_size(4 * FP_LANES)));
 typedef int32_t IntLanes __attribute__((vector_size(4 * FP_LANES)));
+typedef uint32_t BitLanes __attribute__((vector_size(4 * FP_LANES)));  // where overflow is meant
+typedef double WideLanes __attribute__((vector_size(8 * FP_LANES)));
+#if FP_LANES == 16
+typedef __mmask16 Mask;
+#else
+typedef IntLanes Mask;  // all ones or all zeros in each lane
+#endif
+
+// What goes with a number type: the result of its comparisons, and double precision.
+template <class V>
+struct With;
+template <>
+struct With<float> {
+  typedef bool Mask;
+  typedef double Wide;
+};
+template <>
+struct With<Lanes> {
+  typedef fp::Mask Mask;
+  typedef WideLanes Wide;
+};
+template <class V>
+using MaskOf = typename With<V>::Mask;
+template <class V>
+using WideOf = typename With<V>::Wide;
 
 template <class V>
 inline V broadcast(float x);
@@ -34,10 +64,21 @@ inline float broadcast<float>(float x) {
   return x;
 }
 
-// The same names for one number as for lanes of them.
+// The same names for one number as for lanes of them. NaN for a gives b in min and max.
 inline float min(float a, float b) { return a < b ? a : b; }
 inline float max(float a, float b) { return a > b ? a : b; }
+inline float abs(float a) { return std::fabs(a); }
 inline float sqrt(float a) { return std::sqrt(a); }
+inline float floor(float a) { return std::floor(a); }
+inline float ceil(float a) { return std::ceil(a); }
+inline bool ge(float a, float b) { return a >= b; }
+inline bool gt(float a, float b) { return a > b; }
+inline bool both(bool a, bool b) { return a && b; }
+inline float select(bool m, float a, float b) { return m ? a : b; }
+inline double widen(float a) { return a; }
+inline float narrow(double a) { return static_cast<float>(a); }
+inline WideLanes widen(Lanes a) { return __builtin_convertvector(a, WideLanes); }
+inline Lanes narrow(const WideLanes& a) { return __builtin_convertvector(a, Lanes); }
 inline float fma(float a, float b, float c) {
 #ifdef FP_FAST_FMAF
   return __builtin_fmaf(a, b, c);
@@ -69,7 +110,6 @@ inline void store(int32_t* p, IntLanes v) { std::memcpy(p, &v, sizeof v); }
 
 #if FP_LANES == 16
 
-typedef __mmask16 Mask;
 template <>
 inline Lanes broadcast<Lanes>(float x) {
   return _mm512_set1_ps(x);
@@ -81,7 +121,11 @@ inline Lanes sqrt(Lanes a) { return _mm512_sqrt_ps(a); }
 inline Lanes min(Lanes a, Lanes b) { return _mm512_min_ps(a, b); }
 inline Lanes max(Lanes a, Lanes b) { return _mm512_max_ps(a, b); }
 inline Lanes abs(Lanes a) { return _mm512_abs_ps(a); }
+inline Lanes floor(Lanes a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEG_INF); }
+inline Lanes ceil(Lanes a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_POS_INF); }
+inline IntLanes to_int(Lanes a) { return (IntLanes)_mm512_cvttps_epi32(a); }
 inline Mask ge(Lanes a, Lanes b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+inline Mask gt(Lanes a, Lanes b) { return _mm512_cmp_ps_mask(a, b, _CMP_GT_OQ); }
 inline Mask gt(IntLanes a, IntLanes b) {
   return _mm512_cmpgt_epi32_mask((__m512i)a, (__m512i)b);
 }
@@ -98,7 +142,6 @@ inline uint32_t bits(Mask m) { return m; }
 
 #else
 
-typedef IntLanes Mask;  // all ones or all zeros in each lane
 #if FP_LANES == 8
 template <>
 inline Lanes broadcast<Lanes>(float x) {
@@ -111,6 +154,7 @@ inline Lanes sqrt(Lanes a) { return _mm256_sqrt_ps(a); }
 inline Lanes min(Lanes a, Lanes b) { return _mm256_min_ps(a, b); }
 inline Lanes max(Lanes a, Lanes b) { return _mm256_max_ps(a, b); }
 inline Mask ge(Lanes a, Lanes b) { return (Mask)_mm256_cmp_ps(a, b, _CMP_GE_OQ); }
+inline Mask gt(Lanes a, Lanes b) { return (Mask)_mm256_cmp_ps(a, b, _CMP_GT_OQ); }
 inline uint32_t bits(Mask m) { return (uint32_t)_mm256_movemask_ps((__m256)m); }
 #else
 template <>
@@ -125,11 +169,13 @@ inline Lanes sqrt(Lanes a) { return _mm_sqrt_ps(a); }
 inline Lanes min(Lanes a, Lanes b) { return _mm_min_ps(a, b); }
 inline Lanes max(Lanes a, Lanes b) { return _mm_max_ps(a, b); }
 inline Mask ge(Lanes a, Lanes b) { return (Mask)_mm_cmpge_ps(a, b); }
+inline Mask gt(Lanes a, Lanes b) { return (Mask)_mm_cmpgt_ps(a, b); }
 inline uint32_t bits(Mask m) { return (uint32_t)_mm_movemask_ps((__m128)m); }
 #else
 inline Lanes min(Lanes a, Lanes b) { return a < b ? a : b; }
 inline Lanes max(Lanes a, Lanes b) { return a > b ? a : b; }
 inline Mask ge(Lanes a, Lanes b) { return (Mask)(a >= b); }
+inline Mask gt(Lanes a, Lanes b) { return (Mask)(a > b); }
 inline uint32_t bits(Mask m) { return (m[0] & 1) | (m[1] & 2) | (m[2] & 4) | (m[3] & 8); }
 #if defined(__ARM_NEON) && defined(__aarch64__)
 inline Lanes fma(Lanes a, Lanes b, Lanes c) {
@@ -152,9 +198,21 @@ inline Lanes sqrt(Lanes a) {
 inline Lanes abs(Lanes a) {
   return bits_as<Lanes>(bits_as<IntLanes>(a) & broadcast_int(0x7fffffff));
 }
+inline IntLanes to_int(Lanes a) { return __builtin_convertvector(a, IntLanes); }
 inline Mask gt(IntLanes a, IntLanes b) { return (Mask)(a > b); }
 inline Mask both(Mask a, Mask b) { return a & b; }
 inline Lanes where(Mask m, Lanes a) { return bits_as<Lanes>(bits_as<IntLanes>(a) & m); }
+#if FP_LANES == 8
+inline Lanes floor(Lanes a) { return _mm256_floor_ps(a); }
+inline Lanes ceil(Lanes a) { return _mm256_ceil_ps(a); }
+#else
+// Through integers: right for numbers that fit one, and no others are looked at.
+inline Lanes floor(Lanes a) {
+  const Lanes whole = __builtin_convertvector(to_int(a), Lanes);
+  return whole - where((Mask)(whole > a), broadcast<Lanes>(1.f));
+}
+inline Lanes ceil(Lanes a) { return -floor(-a); }
+#endif
 inline IntLanes select(Mask m, IntLanes a, IntLanes b) { return (a & m) | (b & ~m); }
 inline Lanes select(Mask m, Lanes a, Lanes b) {
 #if FP_LANES == 8
@@ -178,7 +236,84 @@ inline Lanes exp2(Lanes x) {
   const Lanes middle = fma(broadcast<Lanes>(5.5507337e-2f), f, broadcast<Lanes>(2.4022242e-1f));
   const Lanes low = fma(broadcast<Lanes>(6.9314698e-1f), f, broadcast<Lanes>(1.0f));
   const Lanes p = fma(fma(high, ff, middle), ff, low);
-  return bits_as<Lanes>(bits_as<IntLanes>(p) + (bits_as<IntLanes>(shifted) << 23));
+  return bits_as<Lanes>(bits_as<BitLanes>(p) + (bits_as<BitLanes>(shifted) << 23));
+}
+
+// log2 of a normal number above 0, absolute error 1e-7 or rounding; of 0, about -127.
+// With the mantissa m in [sqrt(1/2), sqrt(2)), the series of log2((1 + s) / (1 - s)).
+inline Lanes log2(Lanes x) {
+  const BitLanes all = bits_as<BitLanes>(x), since_root = all - 0x3f3504f3;  // sqrt(1/2)
+  const IntLanes exponent = bits_as<IntLanes>(since_root) >> 23;
+  const Lanes m = bits_as<Lanes>(all - (bits_as<BitLanes>(exponent) << 23));
+  const Lanes one = broadcast<Lanes>(1.f);
+  const Lanes s = (m - one) / (m + one), ss = s * s;
+  Lanes p = fma(broadcast<Lanes>(0.32059889f), ss, broadcast<Lanes>(0.41219858f));
+  p = fma(p, ss, broadcast<Lanes>(0.57707802f));
+  p = fma(p, ss, broadcast<Lanes>(0.96179669f));
+  p = fma(p, ss, broadcast<Lanes>(2.88539008f));
+  return fma(p, s, __builtin_convertvector(exponent, Lanes));
+}
+
+// The first four numbers of kLanes rows, row(i) pointing to row i, as four columns.
+template <class RowOf>
+inline void load_columns(RowOf row, Lanes* column) {
+#if FP_LANES == 16
+  const auto four = [&](int i) {
+    __m512 v = _mm512_castps128_ps512(_mm_loadu_ps(row(i)));
+    v = _mm512_insertf32x4(v, _mm_loadu_ps(row(i + 4)), 1);
+    v = _mm512_insertf32x4(v, _mm_loadu_ps(row(i + 8)), 2);
+    return _mm512_insertf32x4(v, _mm_loadu_ps(row(i + 12)), 3);
+  };
+  const __m512 a = four(0), b = four(1), c = four(2), d = four(3);
+  const __m512 ab = _mm512_unpacklo_ps(a, b), cd = _mm512_unpacklo_ps(c, d);
+  const __m512 ab2 = _mm512_unpackhi_ps(a, b), cd2 = _mm512_unpackhi_ps(c, d);
+  column[0] = _mm512_shuffle_ps(ab, cd, 0x44), column[1] = _mm512_shuffle_ps(ab, cd, 0xee);
+  column[2] = _mm512_shuffle_ps(ab2, cd2, 0x44), column[3] = _mm512_shuffle_ps(ab2, cd2, 0xee);
+#elif FP_LANES == 8
+  const auto two = [&](int i) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row(i))),
+                                _mm_loadu_ps(row(i + 4)), 1);
+  };
+  const __m256 a = two(0), b = two(1), c = two(2), d = two(3);
+  const __m256 ab = _mm256_unpacklo_ps(a, b), cd = _mm256_unpacklo_ps(c, d);
+  const __m256 ab2 = _mm256_unpackhi_ps(a, b), cd2 = _mm256_unpackhi_ps(c, d);
+  column[0] = _mm256_shuffle_ps(ab, cd, 0x44), column[1] = _mm256_shuffle_ps(ab, cd, 0xee);
+  column[2] = _mm256_shuffle_ps(ab2, cd2, 0x44), column[3] = _mm256_shuffle_ps(ab2, cd2, 0xee);
+#else
+  for (int i = 0; i < kLanes; i++)
+    for (int k = 0; k < 4; k++) column[k][i] = row(i)[k];
+#endif
+}
+
+// The opposite: four columns to rows of four, row(i) pointing to where row i goes.
+template <class RowOf>
+inline void store_rows(const Lanes* column, RowOf row) {
+#if FP_LANES == 16
+  const __m512 a = column[0], b = column[1], c = column[2], d = column[3];
+  const __m512 ab = _mm512_unpacklo_ps(a, b), cd = _mm512_unpacklo_ps(c, d);
+  const __m512 ab2 = _mm512_unpackhi_ps(a, b), cd2 = _mm512_unpackhi_ps(c, d);
+  const auto four = [&](int i, __m512 v) {
+    _mm_storeu_ps(row(i), _mm512_castps512_ps128(v));
+    _mm_storeu_ps(row(i + 4), _mm512_extractf32x4_ps(v, 1));
+    _mm_storeu_ps(row(i + 8), _mm512_extractf32x4_ps(v, 2));
+    _mm_storeu_ps(row(i + 12), _mm512_extractf32x4_ps(v, 3));
+  };
+  four(0, _mm512_shuffle_ps(ab, cd, 0x44)), four(1, _mm512_shuffle_ps(ab, cd, 0xee));
+  four(2, _mm512_shuffle_ps(ab2, cd2, 0x44)), four(3, _mm512_shuffle_ps(ab2, cd2, 0xee));
+#elif FP_LANES == 8
+  const __m256 a = column[0], b = column[1], c = column[2], d = column[3];
+  const __m256 ab = _mm256_unpacklo_ps(a, b), cd = _mm256_unpacklo_ps(c, d);
+  const __m256 ab2 = _mm256_unpackhi_ps(a, b), cd2 = _mm256_unpackhi_ps(c, d);
+  const auto two = [&](int i, __m256 v) {
+    _mm_storeu_ps(row(i), _mm256_castps256_ps128(v));
+    _mm_storeu_ps(row(i + 4), _mm256_extractf128_ps(v, 1));
+  };
+  two(0, _mm256_shuffle_ps(ab, cd, 0x44)), two(1, _mm256_shuffle_ps(ab, cd, 0xee));
+  two(2, _mm256_shuffle_ps(ab2, cd2, 0x44)), two(3, _mm256_shuffle_ps(ab2, cd2, 0xee));
+#else
+  for (int i = 0; i < kLanes; i++)
+    for (int k = 0; k < 4; k++) row(i)[k] = column[k][i];
+#endif
 }
 
 // In a fixed order: halves are added to halves.

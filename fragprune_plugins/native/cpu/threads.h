@@ -11,17 +11,23 @@
 #include <thread>
 #include <vector>
 
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
 namespace fp {
 
 class Team {
  public:
   explicit Team(int threads) {
     crew_.reserve(threads > 1 ? threads - 1 : 0);
+    const unsigned wanted = threads > 1 ? static_cast<unsigned>(threads) : 0;
+    impatient_ = wanted && wanted <= std::thread::hardware_concurrency();
     for (int i = 1; i < threads; i++) {
       try {
         crew_.emplace_back([this] { wait_for_work(); });
-      } catch (const std::system_error&) {
-        break;  // the machine gives no more: fewer do the same work
+      } catch (const std::exception&) {
+        break;  // the machine gives no more, or no memory for it: fewer do the same work
       }
     }
   }
@@ -61,6 +67,7 @@ class Team {
     }
     wake_.notify_all();
     run_guarded(take);
+    watch([&] { return running_ == 0; });
     std::unique_lock<std::mutex> lock(mutex_);
     done_.wait(lock, [&] { return running_ == 0; });
     if (failure_) {
@@ -75,6 +82,7 @@ class Team {
     unsigned seen = 0;
     for (;;) {
       const std::function<void()>* job;
+      watch([&] { return leaving_ || round_ != seen; });
       {
         std::unique_lock<std::mutex> lock(mutex_);
         wake_.wait(lock, [&] { return leaving_ || round_ != seen; });
@@ -85,6 +93,18 @@ class Team {
       run_guarded(*job);
       std::lock_guard<std::mutex> lock(mutex_);
       if (--running_ == 0) done_.notify_one();
+    }
+  }
+
+  // Looks for a while before going to sleep: pieces of work follow each other closely, and waking
+  // takes longer than many of them. Not where threads outnumber processors: they need the time.
+  template <class Condition>
+  void watch(Condition condition) const {
+    if (!impatient_) return;
+    for (int i = 0; i < 4000 && !condition(); i++) {
+#if defined(__SSE2__)
+      _mm_pause();
+#endif
     }
   }
 
@@ -102,9 +122,10 @@ class Team {
   std::condition_variable wake_, done_;
   const std::function<void()>* job_ = nullptr;
   std::exception_ptr failure_;
-  size_t running_ = 0;
-  unsigned round_ = 0;
-  bool leaving_ = false;
+  std::atomic<size_t> running_{0};
+  std::atomic<unsigned> round_{0};
+  std::atomic<bool> leaving_{false};
+  bool impatient_ = false;  // may spin
 };
 
 }  // namespace fp

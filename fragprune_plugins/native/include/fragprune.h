@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 1
+#define FRAGPRUNE_API_VERSION 2
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
@@ -51,6 +51,8 @@ typedef struct fragprune_error {
   char message[256]; /* empty unless the status is not FRAGPRUNE_OK */
 } fragprune_error;
 
+typedef struct fragprune_workspace fragprune_workspace;
+
 typedef struct fragprune_inputs {
   uint32_t size;           /* sizeof(fragprune_inputs) */
   int32_t threads;         /* results do not depend on it */
@@ -77,6 +79,7 @@ typedef struct fragprune_inputs {
   const float *sh;         /* (N, K, 3); or NULL */
   const float *colors;     /* (N, 3); or NULL */
   const float *thresholds; /* (N) falloff in (0, 1); or NULL: no truncation */
+  fragprune_workspace *workspace; /* memory to use again; or NULL */
 } fragprune_inputs;
 
 /* NULL pointers: not wanted. */
@@ -90,6 +93,9 @@ typedef struct fragprune_outputs {
   int32_t *fragments_per_gaussian; /* (N) drawn fragments */
   int64_t drawn;                   /* filled in: fragments drawn */
   int64_t evaluated;               /* filled in: lanes spent on (Gaussian, pixel) pairs */
+  float projection_ms;             /* filled in: time of each stage */
+  float binning_ms;
+  float blend_ms;
 } fragprune_outputs;
 
 /* Gradients of a loss with respect to the outputs; NULL stands for zero. */
@@ -130,6 +136,18 @@ FRAGPRUNE_EXPORT int fragprune_backward(const fragprune_state *state,
                                         fragprune_error *error);
 
 FRAGPRUNE_EXPORT void fragprune_free(fragprune_state *state); /* NULL is fine */
+
+/* Memory that calls hand on to the next ones, so that the system need not find and clear it each
+ * time. Any number of calls may use one workspace at once; the states that came of them may outlive
+ * it. What lies idle is bounded by what was lately in use. NULL: out of memory, which is no harm. */
+FRAGPRUNE_EXPORT fragprune_workspace *fragprune_workspace_new(void);
+FRAGPRUNE_EXPORT void fragprune_workspace_free(fragprune_workspace *workspace); /* NULL is fine */
+
+/* Memory for a caller's own arrays, images for example: `bytes` of it, 64-byte aligned, or NULL.
+ * Given back to the workspace it came from, with the same number. */
+FRAGPRUNE_EXPORT void *fragprune_workspace_take(fragprune_workspace *workspace, uint64_t bytes);
+FRAGPRUNE_EXPORT void fragprune_workspace_give(fragprune_workspace *workspace, void *memory,
+                                               uint64_t bytes);
 
 FRAGPRUNE_EXPORT int fragprune_version(void); /* FRAGPRUNE_API_VERSION of this build */
 FRAGPRUNE_EXPORT int fragprune_lanes(void);   /* pixels handled by one instruction */

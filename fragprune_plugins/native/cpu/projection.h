@@ -1,0 +1,480 @@
+// From Gaussians to splats: all that blending and binning need of those that can draw.
+//
+// Gaussians go kLanes at a time through the mathematics of gaussian.h. Those that are left are
+// packed per piece of kPiece rows; colours come last, for them alone.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cstring>
+#include <vector>
+
+#include "gaussian.h"
+#include "threads.h"
+#include "workspace.h"
+
+namespace fp {
+
+constexpr int kTile = FRAGPRUNE_TILE;
+constexpr size_t kPiece = 1024;  // Gaussians per piece of work
+
+// One cache line, for blending reads splats in no order at all.
+struct alignas(64) Splat {
+  Brush<float> brush;
+  uint32_t id;         // row of the inputs
+  float threshold;     // 0 for none
+  float inv_opacity;   // of the compensated opacity
+  float unused;
+};
+static_assert(sizeof(Splat) == 64, "four columns of four");
+
+// Tiles x0..x1, both included, of one row of tiles; none when x0 > x1.
+struct Span {
+  uint16_t x0, x1;
+  uint32_t tiles() const { return static_cast<uint32_t>(x1 - x0 + 1); }
+};
+
+// The tiles that a splat reaches: spans[first] is of row `row`, and so on down.
+struct Reach {
+  uint32_t first;  // within the piece
+  uint16_t row, rows;
+};
+
+// What projection leaves. Splats of piece k begin at kPiece * k, in the order of the inputs.
+struct Scene {
+  Buffer<Splat> splats;
+  Buffer<float> depth;
+  Buffer<Reach> reach;
+  Buffer<uint32_t> slot;            // per splat: tiles of its piece's splats before it
+  std::vector<Heap<Span>> spans;    // per piece
+  std::vector<uint32_t> count;      // per piece: splats
+  std::vector<uint32_t> slot_base;  // per piece: tiles of the splats before it; one more at the end
+  struct RowTotal {
+    uint32_t spans, tiles;
+  };
+  std::vector<RowTotal> rows;       // per row of tiles: what reaches it
+  size_t total = 0;                 // splats
+
+  size_t pieces() const { return count.size(); }
+  // A splat's slots, from its own first to the next one's.
+  uint32_t slot_begin(size_t k) const { return slot_base[k / kPiece] + slot[k]; }
+  uint32_t slot_end(size_t k) const {
+    return k % kPiece + 1 < count[k / kPiece] ? slot_begin(k + 1) : slot_base[k / kPiece + 1];
+  }
+};
+
+// ---- which tiles -----------------------------------------------------------------------------
+
+// Spans only preselect, the fragment test decides. This much is added to every reach so that their
+// rounding never loses a fragment: relative, and absolute for splats of a pixel or less.
+constexpr float kReachMargin = 1.0002f, kReachFloor = 1e-3f;
+constexpr float kSpanMargin = 0.01f;  // pixels
+
+// The ellipse {q <= reach} by rows: where it begins and ends in x for an interval of y.
+template <class V>
+struct Ellipse {
+  V slope;        // dx/dy of the line on which x is most likely given y
+  V reach;        // squared radius, a little more than the cutoff
+  V half_height;  // pixels
+  V rightmost;    // dy at which x is largest; -rightmost for the smallest
+  V var_along;    // variance of x given y, pixels^2
+  V inv_down;     // 1 / variance of y
+};
+
+// `power` is how far the exponent may fall from its peak; see Brush for the others.
+template <class V>
+inline Ellipse<V> ellipse_of(V scale, V skew, V down, V power) {
+  const V unit = broadcast<V>(0.5f * kLog2E), slope = -skew / scale;
+  const V var_down = unit / (down * down), cov = slope * var_down;
+  Ellipse<V> e;
+  e.slope = slope;
+  e.reach = power * broadcast<V>(2 / kLog2E * kReachMargin) + broadcast<V>(kReachFloor);
+  e.var_along = unit / (scale * scale);
+  e.inv_down = down * down * broadcast<V>(2 / kLog2E);
+  e.half_height = sqrt(e.reach * var_down) + broadcast<V>(kSpanMargin);
+  e.rightmost = cov * sqrt(e.reach / (e.var_along + slope * cov));
+  return e;
+}
+
+// Where an ellipse's span ends, right (side 1) or left (side -1) of its mean, over rows low..high.
+template <class V>
+inline V span_end(const Ellipse<V>& e, V low, V high, V side) {
+  const V at = min(max(e.rightmost * side, low), high);
+  const V inside = e.var_along * (e.reach - at * at * e.inv_down);
+  return e.slope * at + side * (sqrt(max(inside, broadcast<V>(0.f))) + broadcast<V>(kSpanMargin));
+}
+
+// The pixels that may matter of one splat: its ellipse within the host's rectangle of tiles and the
+// image. All bounds are whole numbers, of pixel centres; top > bottom: none.
+template <class V>
+struct Bounds {
+  Ellipse<V> ellipse;
+  V x, y, top, bottom, left, right;
+};
+
+template <class V>
+inline Bounds<V> bounds_of(const Camera<V>& c, const Projection<V>& p, const Brush<V>& b) {
+  constexpr float tile = kTile;
+  Bounds<V> o;
+  o.ellipse = ellipse_of(b.scale, b.skew, b.down, b.log_opacity - b.list_cut);
+  o.x = b.x, o.y = b.y;
+  o.top = max(ceil(b.y - o.ellipse.half_height), p.tile_y0 * tile);
+  o.bottom = min(min(floor(b.y + o.ellipse.half_height), c.height - 1.f), p.tile_y1 * tile - 1.f);
+  o.left = p.tile_x0 * tile;
+  o.right = min(c.width, p.tile_x1 * tile) - 1.f;
+  return o;
+}
+
+// Columns of tiles reached in a row of tiles: first and last, whole numbers; none if first > last.
+template <class V>
+inline void span_of(const Bounds<V>& o, V row, V& first, V& last) {
+  constexpr float tile = kTile;
+  const V low = max(row * tile, o.top) - o.y;
+  const V high = min(row * tile + (tile - 1), o.bottom) - o.y;
+  const V side = broadcast<V>(1.f), none = broadcast<V>(1.f);
+  const V x0 = max(o.left, ceil(o.x + span_end(o.ellipse, low, high, -side)));
+  const V x1 = min(o.right, floor(o.x + span_end(o.ellipse, low, high, side)));
+  const MaskOf<V> some = ge(x1, x0);
+  first = select(some, floor(x0 * (1 / tile)), none);
+  last = select(some, floor(x1 * (1 / tile)), broadcast<V>(0.f));
+}
+
+// ---- reading ---------------------------------------------------------------------------------
+
+// Rows of the inputs; for the last few, of copies with room behind them, for whole registers read
+// beyond a row's end.
+struct Rows {
+  const float *means, *scales, *rotations, *cov3d, *opacities, *thresholds;
+};
+
+// Copies of up to kLanes rows.
+struct Tail {
+  float means[3 * kLanes + 1], scales[3 * kLanes + 1], rotations[4 * kLanes], cov3d[6 * kLanes],
+      opacities[kLanes], thresholds[kLanes];
+};
+
+inline Rows rows_at(const fragprune_inputs& in, size_t i, size_t count, Tail& tail) {
+  if (i + kLanes < static_cast<size_t>(in.count)) {
+    const auto at = [i](const float* p, size_t width) { return p ? p + i * width : nullptr; };
+    return {at(in.means, 3), at(in.scales, 3),    at(in.rotations, 4),
+            at(in.cov3d, 6), at(in.opacities, 1), at(in.thresholds, 1)};
+  }
+  std::memset(&tail, 0, sizeof tail);  // a mean of 0 may be in view, but its opacity is 0
+  const auto copy = [&](const float* p, size_t width, float* to) -> const float* {
+    return p ? (std::copy(p + i * width, p + (i + count) * width, to), to) : nullptr;
+  };
+  return {copy(in.means, 3, tail.means),         copy(in.scales, 3, tail.scales),
+          copy(in.rotations, 4, tail.rotations), copy(in.cov3d, 6, tail.cov3d),
+          copy(in.opacities, 1, tail.opacities), copy(in.thresholds, 1, tail.thresholds)};
+}
+
+inline Vec<Lanes> load_vec(const float* rows) {
+  Lanes v[4];
+  load_columns([&](int i) { return rows + 3 * i; }, v);
+  return {v[0], v[1], v[2]};
+}
+
+// All but the mean.
+inline void load_shape(const Rows& rows, Given<Lanes>& g) {
+  g.factored = rows.cov3d == nullptr;
+  if (g.factored) {
+    g.scale = load_vec(rows.scales);
+    load_columns([&](int i) { return rows.rotations + 4 * i; }, g.rotation);
+  } else {
+    load_columns([&](int i) { return rows.cov3d + 6 * i; }, g.cov3d);
+    load_columns([&](int i) { return rows.cov3d + 6 * i + 2; }, g.cov3d + 2);
+  }
+}
+
+// Rows of 3 numbers picked by id, for registers that read a fourth: the array's last row is copied.
+class Triples {
+ public:
+  Triples(const float* data, int64_t count) : data_(data), last_(static_cast<uint32_t>(count - 1)) {
+    if (data && count > 0) std::copy(data + 3 * size_t{last_}, data + 3 * size_t{last_} + 3, copy_);
+  }
+  Vec<Lanes> load(const uint32_t* ids) const {
+    Lanes v[4];
+    const auto row = [&](int i) { return ids[i] == last_ ? copy_ : data_ + size_t{3} * ids[i]; };
+    load_columns(row, v);
+    return {v[0], v[1], v[2]};
+  }
+
+ private:
+  const float* data_;
+  uint32_t last_;
+  float copy_[4] = {};
+};
+
+// The spherical harmonics' coefficients of kLanes Gaussians as columns, 3 k + channel.
+struct Coefficients {
+  Lanes column[48];
+  Vec<Lanes> operator()(int k) const {
+    return {column[3 * k], column[3 * k + 1], column[3 * k + 2]};
+  }
+};
+
+inline void load_coefficients(const fragprune_inputs& in, const uint32_t* ids, int terms,
+                              Coefficients& to) {
+  const size_t width = 3 * static_cast<size_t>(in.sh_coefficients);
+  const int used = 3 * terms;
+  if (used < 4) {  // degree 0, and perhaps rows of 3
+    for (int k = 0; k < used; k++)
+      for (int i = 0; i < kLanes; i++) to.column[k][i] = in.sh[ids[i] * width + k];
+    return;
+  }
+  for (int k = 0; k < used; k += 4) {
+    const int from = std::min(k, used - 4);
+    load_columns([&](int i) { return in.sh + ids[i] * width + from; }, to.column + from);
+  }
+}
+
+// ---- a piece ---------------------------------------------------------------------------------
+
+// Projects one piece.
+class Projector {
+ public:
+  Projector(const Camera<float>& camera, const fragprune_inputs& in, int32_t* radii)
+      : c_(lift<Lanes>(camera)), in_(in), radii_(radii), means_(in.means, in.count),
+        colors_(in.colors, in.count) {}
+
+  // Fills piece k of the scene; returns how many tiles its splats reach.
+  uint64_t run(const Memory& memory, Scene& scene, size_t k) const {
+    const size_t begin = k * kPiece;
+    const size_t end = std::min(begin + kPiece, static_cast<size_t>(in_.count));
+    Place to{&scene.splats[begin], &scene.depth[begin], &scene.reach[begin], &scene.slot[begin],
+             Heap<Span>(memory, 4 * kPiece), 0};
+    for (size_t i = begin; i < end; i += kLanes)
+      shape(i, std::min<size_t>(kLanes, end - i), to);
+    colour(to);
+    uint64_t slots = 0;
+    for (uint32_t j = 0; j < to.count; j++) {
+      const uint32_t mine = to.slot[j];
+      to.slot[j] = static_cast<uint32_t>(slots);
+      slots += mine;
+    }
+    add_rows(to, scene);
+    scene.count[k] = to.count;
+    scene.spans[k] = std::move(to.spans);
+    return slots;
+  }
+
+ private:
+  struct Place {
+    Splat* splats;
+    float* depth;
+    Reach* reach;
+    uint32_t* slot;  // tiles of each splat, until run adds them up
+    Heap<Span> spans;
+    uint32_t count;
+  };
+
+  // Adds a piece's spans to the totals of the rows, which all pieces share.
+  static void add_rows(const Place& from, Scene& scene) {
+    std::vector<Scene::RowTotal> mine(scene.rows.size(), Scene::RowTotal{0, 0});
+    for (uint32_t j = 0; j < from.count; j++) {
+      const Reach& reach = from.reach[j];
+      for (uint32_t r = 0; r < reach.rows; r++) {
+        Scene::RowTotal& total = mine[reach.row + r];
+        total.spans++, total.tiles += from.spans.data()[reach.first + r].tiles();
+      }
+    }
+    for (size_t r = 0; r < mine.size(); r++) {
+      if (!mine[r].spans) continue;
+      __atomic_fetch_add(&scene.rows[r].spans, mine[r].spans, __ATOMIC_RELAXED);
+      __atomic_fetch_add(&scene.rows[r].tiles, mine[r].tiles, __ATOMIC_RELAXED);
+    }
+  }
+
+  // Everything but colour, for `count` Gaussians from row i.
+  void shape(size_t i, size_t count, Place& to) const {
+    Tail tail;
+    const Rows rows = rows_at(in_, i, count, tail);
+    Given<Lanes> given;
+    given.mean = load_vec(rows.means);
+    if (!bits(in_front(c_, given.mean))) {
+      std::fill_n(radii_ + i, count, 0);
+      return;
+    }
+    load_shape(rows, given);
+    Projection<Lanes> p;
+    const Mask seen = project(c_, given, p);
+    write_radii(select(seen, p.radius, broadcast<Lanes>(0.f)), i, count);
+    const Lanes none = broadcast<Lanes>(0.f);
+    const Lanes opacity = load(rows.opacities) * compensation(c_, p);
+    const Lanes threshold = rows.thresholds ? load(rows.thresholds) : none;
+    Brush<Lanes> b;
+    b.log_opacity = log2(opacity);
+    b.cut = cut_of(b.log_opacity, threshold);
+    b.list_cut = in_.widen ? cut_of(b.log_opacity, rim_reach(threshold)) : b.cut;
+    const Mask draws = both(both(gt(opacity, none), gt(broadcast<Lanes>(1e30f), opacity)),
+                            both(ge(threshold, none), ge(b.log_opacity, b.list_cut)));
+    const uint32_t living = bits(both(seen, draws)) & ((uint64_t{1} << count) - 1);
+    if (!living) return;
+    b.x = p.x;
+    b.y = p.y;
+    b.scale = sqrt(0.5f * kLog2E * (p.var_y / p.det));
+    b.skew = -b.scale * (p.cov / p.var_y);
+    b.down = sqrt(0.5f * kLog2E / p.var_y);
+    const Bounds<Lanes> bounds = bounds_of(c_, p, b);
+    pack(i, living, b, threshold, 1.f / opacity, p.view.z, bounds, to);
+  }
+
+  void write_radii(Lanes radius, size_t i, size_t count) const {
+    const IntLanes whole = to_int(radius);
+    if (count == kLanes) return store(radii_ + i, whole);
+    int32_t values[kLanes];
+    store(values, whole);
+    std::copy(values, values + count, radii_ + i);
+  }
+
+  // Appends those of the lanes that live and reach a tile.
+  void pack(size_t i, uint32_t living, const Brush<Lanes>& b, Lanes threshold, Lanes inv_opacity,
+            Lanes z, const Bounds<Lanes>& bounds, Place& to) const {
+    alignas(64) float quads[3][kLanes][4];
+    const Lanes columns[3][4] = {{b.x, b.y, b.scale, b.skew},
+                                 {b.down, b.log_opacity, b.cut, b.list_cut},
+                                 {threshold, inv_opacity, z, z}};
+    for (int k = 0; k < 3; k++) store_rows(columns[k], [&](int lane) { return quads[k][lane]; });
+    constexpr float tile = 1.f / kTile;
+    const Lanes first_row = floor(bounds.top * tile);
+    const Lanes rows = floor(bounds.bottom * tile) - first_row + 1.f;
+    alignas(64) int32_t row[kLanes], height[kLanes];
+    store(row, to_int(first_row));
+    store(height, to_int(select(ge(bounds.bottom, bounds.top), rows, broadcast<Lanes>(0.f))));
+    int highest = 0;
+    for (uint32_t todo = living; todo; todo &= todo - 1)
+      highest = std::max(highest, height[__builtin_ctz(todo)]);
+    constexpr int kAtOnce = 32;  // rows of tiles; higher splats take theirs one by one
+    alignas(64) int32_t from[kAtOnce][kLanes], last[kAtOnce][kLanes];
+    for (int r = 0; r < std::min(highest, kAtOnce); r++) {
+      Lanes x0, x1;
+      span_of(bounds, first_row + static_cast<float>(r), x0, x1);
+      store(from[r], to_int(x0)), store(last[r], to_int(x1));
+    }
+    for (uint32_t todo = living; todo; todo &= todo - 1) {
+      const int lane = __builtin_ctz(todo);
+      const size_t before = to.spans.size();
+      uint32_t tiles = 0;
+      const auto push = [&](int x0, int x1) {
+        const Span span{static_cast<uint16_t>(x0), static_cast<uint16_t>(x1)};
+        to.spans.push(span);
+        tiles += span.tiles();
+      };
+      for (int r = 0; r < std::min(height[lane], kAtOnce); r++) push(from[r][lane], last[r][lane]);
+      if (height[lane] > kAtOnce) {
+        const Bounds<float> mine = lane_of(bounds, lane);
+        for (int r = kAtOnce; r < height[lane]; r++) {
+          float x0, x1;
+          span_of(mine, static_cast<float>(row[lane] + r), x0, x1);
+          push(static_cast<int>(x0), static_cast<int>(x1));
+        }
+      }
+      if (!tiles) {
+        to.spans.shrink(before);
+        continue;
+      }
+      const uint32_t j = to.count++;
+      float* splat = reinterpret_cast<float*>(to.splats + j);
+      std::memcpy(splat, quads[0][lane], 16);
+      std::memcpy(splat + 4, quads[1][lane], 16);
+      to.splats[j].id = static_cast<uint32_t>(i) + lane;
+      to.splats[j].threshold = quads[2][lane][0];
+      to.splats[j].inv_opacity = quads[2][lane][1];
+      to.depth[j] = quads[2][lane][2];
+      to.reach[j] = {static_cast<uint32_t>(before), static_cast<uint16_t>(row[lane]),
+                     static_cast<uint16_t>(height[lane])};
+      to.slot[j] = tiles;
+    }
+  }
+
+  static Bounds<float> lane_of(const Bounds<Lanes>& v, int lane) {
+    static_assert(sizeof(Bounds<Lanes>) == kLanes * sizeof(Bounds<float>), "numbers only");
+    Bounds<float> one;
+    float all[sizeof(Bounds<Lanes>) / sizeof(float)], *to = reinterpret_cast<float*>(&one);
+    std::memcpy(all, &v, sizeof v);
+    for (size_t k = 0; k < sizeof one / sizeof(float); k++) to[k] = all[k * kLanes + lane];
+    return one;
+  }
+
+  // Colour and 1/z of a piece's splats; those of no finite colour reach no tile any more.
+  void colour(Place& to) const {
+    for (uint32_t j = 0; j < to.count; j += kLanes) {
+      const int count = static_cast<int>(std::min<uint32_t>(kLanes, to.count - j));
+      uint32_t ids[kLanes];
+      float depth[kLanes];
+      for (int lane = 0; lane < kLanes; lane++) {
+        const uint32_t from = j + std::min(lane, count - 1);
+        ids[lane] = to.splats[from].id;
+        depth[lane] = to.depth[from];
+      }
+      const Lanes none = broadcast<Lanes>(0.f);
+      Vec<Lanes> colour;
+      if (in_.colors) {
+        colour = colors_.load(ids);
+      } else {
+        Lanes inv_length;
+        Harmonics<Lanes> h;
+        const int terms = harmonics(
+            in_.sh_degree, direction_to(c_, means_.load(ids), inv_length), h, false);
+        Coefficients coefficients;
+        prefetch(to, j + 2 * kLanes);
+        load_coefficients(in_, ids, terms, coefficients);
+        colour = raw_colour(h, terms, coefficients);
+      }
+      const Lanes size = abs(colour.x) + abs(colour.y) + abs(colour.z);
+      const uint32_t broken = ~bits(gt(broadcast<Lanes>(1e30f), size));
+      if (!in_.colors)
+        colour = {max(colour.x, none), max(colour.y, none), max(colour.z, none)};
+      const Lanes columns[4] = {colour.x, colour.y, colour.z, 1.f / load(depth)};
+      alignas(64) float quads[kLanes][4];
+      store_rows(columns, [&](int lane) { return quads[lane]; });
+      for (int lane = 0; lane < count; lane++) {
+        std::memcpy(reinterpret_cast<float*>(&to.splats[j + lane]) + 8, quads[lane], 16);
+        if (broken >> lane & 1) to.reach[j + lane].rows = 0, to.slot[j + lane] = 0;
+      }
+    }
+  }
+
+  // Asks for the coefficients of kLanes splats from j: the processor does not foresee rows of
+  // several cache lines with gaps between them.
+  void prefetch(const Place& to, uint32_t j) const {
+    const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
+    for (uint32_t end = std::min(j + kLanes, to.count); j < end; j++) {
+      const float* row = in_.sh + to.splats[j].id * width;
+      for (size_t k = 0; k < width; k += 16) __builtin_prefetch(row + k);
+    }
+  }
+
+  const Camera<Lanes> c_;
+  const fragprune_inputs& in_;
+  int32_t* radii_;
+  const Triples means_, colors_;
+};
+
+inline Scene project_all(Team& team, const Memory& memory, const Camera<float>& c,
+                         const fragprune_inputs& in, int32_t* radii) {
+  const size_t n = static_cast<size_t>(in.count), pieces = (n + kPiece - 1) / kPiece;
+  Scene scene;
+  scene.splats = Buffer<Splat>(memory, n);
+  scene.depth = Buffer<float>(memory, n);
+  scene.reach = Buffer<Reach>(memory, n);
+  scene.slot = Buffer<uint32_t>(memory, n);
+  scene.spans.resize(pieces);
+  scene.count.resize(pieces);
+  scene.slot_base.resize(pieces + 1);
+  scene.rows.resize(static_cast<size_t>(c.tiles_y));
+  std::vector<uint64_t> slots(pieces);
+  const Projector projector(c, in, radii);
+  team.each(pieces, 1, [&](size_t k, size_t) { slots[k] = projector.run(memory, scene, k); });
+  uint64_t total = 0;
+  for (size_t k = 0; k < pieces; k++) {
+    scene.slot_base[k] = static_cast<uint32_t>(total);
+    scene.total += scene.count[k];
+    total += slots[k];
+    if (total > UINT32_MAX) throw std::length_error("tile lists");
+  }
+  scene.slot_base[pieces] = static_cast<uint32_t>(total);
+  return scene;
+}
+
+}  // namespace fp
