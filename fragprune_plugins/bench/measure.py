@@ -1,4 +1,4 @@
-"""Timing rasterizers side by side: interleaved rounds, the same picture checked, peak memory."""
+"""Timing rasterizers side by side: rounds in turns, pictures compared, peak memory."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 
 Pass = Literal["forward", "forward_backward"]
-
-SAME_PICTURE = 1e-3
-"""Largest mean absolute difference, in intensity, at which two engines drew the same picture."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +92,7 @@ def measure(
                 "engine": engine.name,
                 "threads": torch.get_num_threads(),
                 "truncated": case.thresholds is not None,
-                "fragments_per_pixel": float(last[index].fragments_per_pixel),
+                "fragments_per_pixel": float(last[index].fragments_per_pixel.detach()),
                 "evaluated_per_pixel": last[index].evaluated_per_pixel,
                 "ms_median": statistics.median(times[index]),
                 "ms_min": min(times[index]),
@@ -111,20 +108,27 @@ def measure(
     return results
 
 
-def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float]:
-    """How much of the fragments saved is time saved, by size: 1 is all of it.
+def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, dict[str, float]]:
+    """What truncation saves, by scene and size, forward.
 
-    (frame time untruncated / truncated) over (fragments untruncated / truncated), forward.
+    Returns:
+        For "scene WIDTHxHEIGHT": fragments, how many times fewer are drawn; time, how many times
+        less a frame takes; share, time over fragments: 1 where all of the one becomes the other.
     """
-    found: dict[str, float] = {}
+    found: dict[str, dict[str, float]] = {}
     forward = [r for r in results if r["engine"] == engine and r["pass"] == "forward"]
     for plain in forward:
         for cut in forward:
             same = all(plain[k] == cut[k] for k in ("scene", "width", "height", "gaussians"))
-            if same and cut["truncated"] and not plain["truncated"]:
+            drawn = cut["fragments_per_pixel"] > 0
+            if same and drawn and cut["truncated"] and not plain["truncated"]:
                 time_ratio = plain["ms_median"] / cut["ms_median"]
                 fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
-                found[f"{plain['width']}x{plain['height']}"] = time_ratio / fragments
+                found[f"{plain['scene']} {plain['width']}x{plain['height']}"] = {
+                    "fragments": fragments,
+                    "time": time_ratio,
+                    "share": time_ratio / fragments,
+                }
     return found
 
 

@@ -44,6 +44,9 @@ def _size(text: str) -> tuple[int, int]:
 @click.option("--cameras", type=FILE, help="With --model: its first view is drawn.")
 @click.option("--repeats", type=click.IntRange(min=2), default=9, show_default=True)
 @click.option("--forward-only", is_flag=True, help="Leave gradients out.")
+@click.option(
+    "--peers", is_flag=True, help="Also time other rasterizers found installed, at SH degree 0."
+)
 @engine_options
 def command(
     sizes: tuple[str, ...],
@@ -52,6 +55,7 @@ def command(
     cameras: Path | None,
     repeats: int,
     forward_only: bool,
+    peers: bool,
     engine: str,
     threads: int | None,
 ) -> Report:
@@ -78,14 +82,18 @@ def command(
     rasterizer = create_engine(engine)
     kinds = ("forward",) if forward_only else ("forward", "forward_backward")
     cases: list[Case] = []
-    for name, splats, view, learned in _scenes(model, cameras, gaussians, sizes):
+    scenes = _scenes(model, cameras, gaussians, sizes)
+    for name, splats, view, learned in scenes:
         cut = torch.full((len(splats),), TRUNCATION) if learned is None else learned
         for kind in kinds:
             cases += [Case(name, view, splats, kind, thresholds) for thresholds in (None, cut)]  # type: ignore[arg-type]
     before = os.getloadavg()[0]
-    results = measure(
-        cases, [rasterizer], repeats=repeats, say=lambda text: click.echo(text, err=True)
-    )
+
+    def say(text: str) -> None:
+        click.echo(text, err=True)
+
+    results = measure(cases, [rasterizer], repeats=repeats, say=say)
+    others = _peers(scenes, rasterizer, repeats, say) if peers else []
     machine = {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -96,8 +104,8 @@ def command(
         "native": _native(),
     }
     share = translation(results, rasterizer.name)
-    data = {"results": results, "translation": share, "machine": machine}
-    return Report(data, _table(results, share, machine))
+    data = {"results": results, "translation": share, "peers": others, "machine": machine}
+    return Report(data, _table(results, share, others, machine))
 
 
 def _scenes(
@@ -125,7 +133,36 @@ def _scenes(
     ]
 
 
-def _table(results: list[dict[str, Any]], share: dict[str, float], machine: dict[str, Any]) -> str:
+def _peers(
+    scenes: list[tuple[str, Any, Any, Any]], rasterizer: Any, repeats: int, say: Any
+) -> list[dict[str, Any]]:
+    """Every scene at SH degree 0: our own row, then one a peer; see ``peers.time_peer``."""
+    from dataclasses import replace
+
+    from fragprune_plugins.bench.measure import Case, measure
+    from fragprune_plugins.bench.peers import installed, time_peer
+    from fragprune_plugins.types import RasterInputs
+
+    rows = []
+    for name, splats, view, _ in scenes:
+        flat = replace(splats, sh=splats.sh[:, :1].contiguous(), sh_degree=0)
+        (ours,) = measure([Case(name, view, flat, "forward")], [rasterizer], repeats=repeats)
+        keys = ("width", "height", "gaussians", "ms_median", "ms_min", "ms_se")
+        row = {"name": "fragprune", "device": "cpu", "psnr": None, "failed": None}
+        rows.append({"scene": name, **row, **{key: ours[key] for key in keys}})
+        truth = rasterizer.rasterize(RasterInputs(view, flat), None).image
+        for peer in installed():
+            say(f"{peer}, {name}, {view.width}x{view.height}")
+            rows.append({"scene": name, **time_peer(peer, flat, view, truth, repeats=repeats)})
+    return rows
+
+
+def _table(
+    results: list[dict[str, Any]],
+    share: dict[str, dict[str, float]],
+    others: list[dict[str, Any]],
+    machine: dict[str, Any],
+) -> str:
     lines = [
         f"{'scene':<16}{'size':>11}  {'pass':<17}{'cut':<5}{'frag/px':>8}{'tested':>8}"
         f"{'median ms':>11}{'min':>9}{'±se':>7}{'peak MB':>9}"
@@ -141,8 +178,19 @@ def _table(results: list[dict[str, Any]], share: dict[str, float], machine: dict
         if r["stages"]:
             parts = ", ".join(f"{name} {ms:.2f}" for name, ms in r["stages"].items())
             lines.append(f"{'':<29}{parts}")
-    for size, value in share.items():
-        lines.append(f"{size}: {100 * value:.0f}% of the fragments saved is time saved")
+    for name, saved in share.items():
+        lines.append(
+            f"{name}: {saved['fragments']:.2f}x fewer fragments, {saved['time']:.2f}x less time "
+            f"({100 * saved['share']:.0f}% of it)"
+        )
+    if others:
+        lines.append("forward, SH degree 0, 8 bits from peers:")
+    for row in others:
+        what = row["failed"] or f"{row['ms_median']:.2f} ms median, {row['ms_min']:.2f} min"
+        lines.append(
+            f"{row['scene']:<16}{row['width']:>6}x{row['height']:<4}  {row['name']} "
+            f"({row['device']}): {what}"
+        )
     lines.append(
         f"{results[0]['engine']} engine ({machine['native']}), {results[0]['threads']} threads on "
         f"{machine['processor']}; load {machine['load_before']:.1f} to {machine['load_after']:.1f}"

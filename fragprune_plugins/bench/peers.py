@@ -1,0 +1,181 @@
+"""Other rasterizers that are installed here, timed on our scene: the same picture, or no figure.
+
+A peer runs in a process of its own: a crash or a deadlock in its driver is then an answer too. To
+add one, write how it draws as in ``_gausscam`` and enter it in ``PEERS``.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import Splats, View
+
+SAME_PICTURE_DB = 40.0
+"""Peers answer in 8 bits and end Gaussians at other radii; another camera or colour is below 25."""
+
+Arrays = dict[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A peer that is ready to draw.
+
+    Attributes:
+        device: what it draws on, by its own name.
+        draw: one frame, in memory when it returns; the part that is timed.
+        image: (3, H, W) in 0 to 1, of what ``draw`` returned.
+    """
+
+    device: str
+    draw: Callable[[], Any]
+    image: Callable[[Any], NDArray[np.float32]]
+
+
+def installed() -> list[str]:
+    """The peers that can be imported here."""
+    return [
+        name for name, (needs, _) in PEERS.items() if all(find_spec(module) for module in needs)
+    ]
+
+
+def time_peer(
+    name: str, splats: Splats, view: View, truth: Tensor, *, repeats: int, limit: float = 300
+) -> dict[str, Any]:
+    """Time one peer's forward pass.
+
+    Args:
+        name: one of ``installed()``.
+        splats: activated; SH of degree 0, which is all that some peers draw.
+        view: pixels square, background black.
+        truth: (3, H, W) our picture of the same.
+        repeats: frames after one to warm up.
+        limit: seconds, for all of them.
+
+    Returns:
+        name, width, height, gaussians, device, ms_median, ms_min, ms_se, psnr, failed. Times are
+        None where it drew another picture or none; failed then says so.
+    """
+    row: dict[str, Any] = {
+        "name": name,
+        "width": view.width,
+        "height": view.height,
+        "gaussians": len(splats),
+        **dict.fromkeys(("device", "ms_median", "ms_min", "ms_se", "psnr", "failed")),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        inputs, outputs = Path(folder, "inputs.npz"), Path(folder, "outputs.npz")
+        np.savez(inputs, allow_pickle=False, **_arrays(splats, view))
+        command = [
+            sys.executable,
+            "-m",
+            __spec__.name,
+            name,
+            str(inputs),
+            str(outputs),
+            str(repeats),
+        ]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
+        except subprocess.TimeoutExpired:
+            return {**row, "failed": f"no end after {limit:.0f} s"}
+        if done.returncode:
+            last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+            return {**row, "failed": f"exit code {done.returncode}: {last[0]}"}
+        with np.load(outputs) as made:
+            image, times = made["image"], made["times"]
+            row["device"] = str(made["device"])
+    squared = float(((image - truth.numpy().clip(0, 1)) ** 2).mean())
+    row["psnr"] = -10 * float(np.log10(max(squared, 1e-12)))
+    if row["psnr"] < SAME_PICTURE_DB:
+        return {**row, "failed": f"another picture: {row['psnr']:.1f} dB"}
+    row["ms_median"], row["ms_min"] = float(np.median(times)), float(times.min())
+    row["ms_se"] = float(times.std(ddof=1) / len(times) ** 0.5) if len(times) > 1 else 0.0
+    return row
+
+
+def _arrays(splats: Splats, view: View) -> Arrays:
+    given = {
+        "means": splats.means,
+        "scales": splats.scales,
+        "rotations": splats.rotations,
+        "opacities": splats.opacities,
+        "dc": None if splats.sh is None else splats.sh[:, 0],
+        "viewmatrix": view.viewmatrix,
+    }
+    plain = {name: tensor.numpy() for name, tensor in given.items() if tensor is not None}
+    size = np.array([view.width, view.height, view.tan_fov_y], dtype=np.float32)
+    return {**plain, "size": size}
+
+
+def _gausscam(given: Arrays) -> Drawing:
+    """WebGPU compute shaders, 8 bits, SH degree 0; on a CPU by Mesa's lavapipe 25 or later."""
+    webgpu = import_module("gausscam.backends.webgpu")
+    adapters = import_module("wgpu").gpu.enumerate_adapters_sync()
+    device = next(a.info["device"] for a in adapters if a.info["backend_type"] == "Vulkan")
+    width, height, tan_fov_y = given["size"]
+    turn, shift = given["viewmatrix"][:3, :3].T, given["viewmatrix"][3, :3]
+    unit = np.linalg.norm(given["rotations"], axis=1, keepdims=True)
+    scene = {
+        "xyz": given["means"],
+        "rot": given["rotations"] / unit,
+        "scale": given["scales"],
+        "opacity": given["opacities"],
+        "sh": np.ascontiguousarray(given["dc"]),
+        "slots": np.zeros(0, np.int32),
+        "W": np.int32(width),
+        "H": np.int32(height),
+        "fovy": np.float32(np.degrees(2 * np.arctan(tan_fov_y))),
+        "cam_pos": (-turn.T @ shift)[None].astype(np.float32),
+        # it looks along -z with y up, we along z with y down
+        "cam_xmat": (turn.T * np.array([1, -1, -1]))[None].astype(np.float32),
+    }
+    pipeline = webgpu.Pipeline(scene, device, variant=webgpu.pick_variant(device))
+
+    def image(frame: Any) -> NDArray[np.float32]:
+        rgb: NDArray[np.uint8] = pipeline.unpack(*frame)[0][0]
+        return (rgb.transpose(2, 0, 1) / 255).astype(np.float32)
+
+    return Drawing(device, pipeline.render_frame, image)
+
+
+PEERS: dict[str, tuple[tuple[str, ...], Callable[[Arrays], Drawing]]] = {
+    "gausscam": (("gausscam", "wgpu"), _gausscam),
+}
+"""By name: the modules it needs, and how it draws."""
+
+
+def _child(name: str, inputs: str, outputs: str, repeats: str) -> None:
+    """Draw in this process and leave picture, times in ms and device in a file."""
+    with np.load(inputs) as given:
+        drawing = PEERS[name][1](dict(given))
+    frame = drawing.draw()
+    times = []
+    for _ in range(int(repeats)):
+        started = time.perf_counter()
+        frame = drawing.draw()
+        times.append(1e3 * (time.perf_counter() - started))
+    np.savez(
+        outputs,
+        image=drawing.image(frame),
+        times=np.array(times),
+        device=np.array(drawing.device),
+    )
+
+
+if __name__ == "__main__":
+    _child(*sys.argv[1:])

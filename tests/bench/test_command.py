@@ -1,0 +1,106 @@
+"""``fragprune bench``: its JSON shape, its options, a model of one's own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins.bench import peers
+from fragprune_plugins.cli.bench import TRUNCATION
+from fragprune_plugins.ply import write_ply
+
+SMALL = ("--size", "40x30", "--gaussians", 200, "--repeats", 2)
+
+
+def test_json_shape() -> None:
+    found = run_json("bench", *SMALL, "--threads", 1)
+    assert set(found) == {"results", "translation", "peers", "machine"}
+    assert len(found["results"]) == 4
+    assert {row["scene"] for row in found["results"]} == {"bench-200"}
+    assert {row["threads"] for row in found["results"]} == {1}
+    assert set(found["translation"]) == {"bench-200 40x30"}
+    assert set(found["translation"]["bench-200 40x30"]) == {"fragments", "time", "share"}
+    assert found["peers"] == []
+    assert set(found["machine"]) == {
+        "processor",
+        "cores",
+        "load_before",
+        "load_after",
+        "platform",
+        "torch",
+        "native",
+    }
+
+
+def test_every_size_and_count_forward_only() -> None:
+    sizes = ("--size", "24x16", "--size", "33x17")
+    counts = ("--gaussians", 50, "--gaussians", 120)
+    found = run_json("bench", *sizes, *counts, "--repeats", 2, "--forward-only")
+    assert len(found["results"]) == 2 * 2 * 2
+    assert {row["pass"] for row in found["results"]} == {"forward"}
+    assert len(found["translation"]) == 4
+
+
+def test_the_text_says_what_was_saved_and_how_busy_the_machine_was() -> None:
+    said = run("bench", *SMALL, "--forward-only")
+    assert said.exit_code == 0
+    assert "x fewer fragments" in said.stdout
+    assert "load" in said.stdout.splitlines()[-1]
+    assert "round 2 of 2" in said.stderr
+
+
+def cameras_file(folder: Path) -> Path:
+    camera = tiny.cameras()[0]
+    entry = {
+        "id": 0,
+        "img_name": "first",
+        "width": camera.width,
+        "height": camera.height,
+        "position": (-camera.rotation.T @ camera.translation).tolist(),
+        "rotation": camera.rotation.T.tolist(),
+        "fx": camera.fx,
+        "fy": camera.fy,
+    }
+    file = folder / "cameras.json"
+    file.write_text(json.dumps([entry]))
+    return file
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_model_of_ones_own_with_its_thresholds(tmp_path: Path, learned: bool) -> None:
+    model = tmp_path / "mine.ply"
+    thresholds = torch.full((60,), 0.5) if learned else None
+    write_ply(model, tiny.random_model(), thresholds)
+    arguments = ("--model", model, "--cameras", cameras_file(tmp_path), "--size", "32x32")
+    rows = run_json("bench", *arguments, "--repeats", 2, "--forward-only")["results"]
+    assert [(row["scene"], row["gaussians"]) for row in rows] == [("mine", 60)] * 2
+    plain, cut = (row["fragments_per_pixel"] for row in rows)
+    assert plain > cut > 0
+    assert (cut < 0.5 * plain) == learned
+    assert TRUNCATION < 0.1
+
+
+def test_peers_are_timed_beside_ourselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    def time_peer(name, splats, view, truth, *, repeats):
+        assert splats.sh_degree == 0
+        assert truth.shape == (3, view.height, view.width)
+        return {"name": name, "width": 40, "height": 30, "device": "x", "failed": "no device"}
+
+    monkeypatch.setattr(peers, "installed", lambda: ["somebody"])
+    monkeypatch.setattr(peers, "time_peer", time_peer)
+    found = run_json("bench", *SMALL, "--forward-only", "--peers")["peers"]
+    assert [row["name"] for row in found] == ["fragprune", "somebody"]
+    assert found[0]["ms_median"] > 0
+    assert "no device" in run("bench", *SMALL, "--forward-only", "--peers").stdout
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--size", "40"), ("--size", "0x9"), ("--model", "m.ply"), ("--repeats", 1)]
+)
+def test_usage(arguments: tuple[object, ...]) -> None:
+    assert run("bench", *arguments).exit_code == 2
