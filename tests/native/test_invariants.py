@@ -158,6 +158,49 @@ def test_backward_twice_and_graph_freed(engine: CpuEngine) -> None:
         loss.backward()
 
 
+def test_memory_used_again_holds_nothing_of_its_past(engine: CpuEngine) -> None:
+    inputs = scenes.random_scene(6, 300, 200, 160)  # images large enough for the workspace
+    fresh = everything(engine, inputs, None)
+    poison = engine.rasterize(scenes.random_scene(7, 900, 210, 160), None)
+    for tensor in (poison.image, poison.invdepth, poison.alpha):
+        tensor.fill_(float("nan"))
+    del poison, tensor
+    assert_identical(fresh, everything(engine, inputs, None))
+
+
+def test_outputs_and_graphs_outlive_their_engine() -> None:
+    engine = CpuEngine()
+    made, leaves = scenes.leaves(scenes.random_scene(0, 50, 200, 160))
+    out = engine.rasterize(made, None)
+    expected = out.image.detach().clone()
+    del engine
+    out.image.sum().backward()
+    assert torch.equal(out.image, expected)
+    assert leaves["means"].grad.isfinite().all()
+
+
+def test_stages_are_timed(engine: CpuEngine) -> None:
+    out = engine.rasterize(scenes.random_scene(0), None)
+    assert list(out.stages) == ["projection", "binning", "blend"]
+    assert all(ms > 0 for ms in out.stages.values())
+
+
+def test_no_gaussian_at_all(engine: CpuEngine) -> None:
+    inputs = scenes.random_scene(0, 3)
+    none = replace(
+        inputs.splats,
+        **{
+            name: value[:0]
+            for name, value in vars(inputs.splats).items()
+            if isinstance(value, torch.Tensor)
+        },
+    )
+    found = everything(engine, replace(inputs, splats=none, means2d_hook=None), None)
+    assert torch.equal(
+        found["image"], inputs.view.background[:, None, None].expand_as(found["image"])
+    )
+
+
 def test_double_backward_is_refused(engine: CpuEngine) -> None:
     made, leaves = scenes.leaves(scenes.random_scene(0))
     loss = engine.rasterize(made, None).image.square().sum()

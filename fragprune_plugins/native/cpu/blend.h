@@ -300,7 +300,7 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, int po
   const Lanes one = broadcast<Lanes>(1.f);
   const Lanes uncapped = exp2(m.exponent), full = capped(uncapped);
   const Lanes alpha = where(drawn, full);
-  const Lanes inv = one / (one - alpha);
+  const Lanes inv = reciprocal(one - alpha);
   const Lanes light = load(loss.light + at) * inv;
   const Lanes behind = load(loss.behind + at);
   const Lanes gr = load(loss.r + at), gg = load(loss.g + at), gb = load(loss.b + at);

@@ -321,6 +321,16 @@ class Chain {
   const Triples means_, scales_;
 };
 
+// A slot's sums, and what happens to lie behind them.
+typedef float Record __attribute__((vector_size(64)));
+static_assert(sums_of(15) <= 16, "fits a Record");
+
+Record load_record(const float* from) {
+  Record r;
+  std::memcpy(&r, from, sizeof r);
+  return r;
+}
+
 // A gradient array and its numbers per Gaussian.
 struct GradientRows {
   float* data;
@@ -357,7 +367,7 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
                       static_cast<size_t>(in.width) * in.height};
   const float pixels = static_cast<float>(losses.plane);
   const float per_fragment = grads.fragments_per_pixel / pixels;
-  Buffer<float> sums(state.memory, per_gaussian ? lists.splat.size() * size : 0);
+  Buffer<float> sums(state.memory, per_gaussian ? lists.splat.size() * size + 16 : 0);
   Buffer<double> by_background(state.memory, 3 * tiles);
   team.each(tiles, 1, [&](size_t t, size_t) {
     const Tile tile = tile_at(state.camera, lists, t);
@@ -394,10 +404,10 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
       const size_t i = scene.splats[k].id;
       clear(row, i);
       row = i + 1;
-      float mine[sums_of(15)] = {};
       const float* v = sums.data() + static_cast<size_t>(from) * size;
-      for (uint32_t slot = from; slot < until; slot++)
-        for (int s = 0; s < size; s++) mine[s] += *v++;
+      const float* last = sums.data() + static_cast<size_t>(until) * size;
+      Record mine = {};
+      for (; v < last; v += size) mine = mine + load_record(v);
       for (int s = 0; s < size; s++) total[s][who.count] = mine[s];
       who.ids[who.count++] = static_cast<uint32_t>(i);
       if (who.count == kLanes) flush();

@@ -75,7 +75,7 @@ FP_HD inline V rim_density(V away) {
   constexpr float scale = static_cast<float>(1.0 / FRAGPRUNE_RIM_WIDTH);
   const V e = exp2(away * broadcast<V>(-kLog2E * scale));
   const V one_e = broadcast<V>(1.0f) + e;
-  return e * broadcast<V>(scale) / (one_e * one_e);
+  return e * broadcast<V>(scale) * reciprocal(one_e * one_e);
 }
 
 // Beyond this distance from the threshold the density is below 2e-9 of its peak and left out.

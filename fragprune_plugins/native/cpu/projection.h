@@ -378,6 +378,7 @@ class Projector {
       std::memcpy(splat, quads[0][lane], 16);
       std::memcpy(splat + 4, quads[1][lane], 16);
       to.splats[j].id = static_cast<uint32_t>(i) + lane;
+      prefetch_colour(i + lane);
       to.splats[j].threshold = quads[2][lane][0];
       to.splats[j].inv_opacity = quads[2][lane][1];
       to.depth[j] = quads[2][lane][2];
@@ -417,7 +418,6 @@ class Projector {
         const int terms = harmonics(
             in_.sh_degree, direction_to(c_, means_.load(ids), inv_length), h, false);
         Coefficients coefficients;
-        prefetch(to, j + 2 * kLanes);
         load_coefficients(in_, ids, terms, coefficients);
         colour = raw_colour(h, terms, coefficients);
       }
@@ -435,14 +435,11 @@ class Projector {
     }
   }
 
-  // Asks for the coefficients of kLanes splats from j: the processor does not foresee rows of
-  // several cache lines with gaps between them.
-  void prefetch(const Place& to, uint32_t j) const {
+  // Asks for what colour() will read of a splat: it comes while the piece's others are projected.
+  void prefetch_colour(size_t id) const {
+    if (!in_.sh) return;
     const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
-    for (uint32_t end = std::min(j + kLanes, to.count); j < end; j++) {
-      const float* row = in_.sh + to.splats[j].id * width;
-      for (size_t k = 0; k < width; k += 16) __builtin_prefetch(row + k);
-    }
+    for (size_t k = 0; k < width; k += 16) __builtin_prefetch(in_.sh + id * width + k, 0, 2);
   }
 
   const Camera<Lanes> c_;
