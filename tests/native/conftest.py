@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from native.sanitize import building
 
 from fragprune_plugins.engines.cpu import CpuEngine
 from fragprune_plugins.native import loader
@@ -12,3 +13,12 @@ from fragprune_plugins.native import loader
 def engine(request: pytest.FixtureRequest) -> CpuEngine:
     """The cpu engine, once per build."""
     return CpuEngine(loader.open_build(request.param))
+
+
+@pytest.fixture(scope="session")
+def toolchain(tmp_path_factory: pytest.TempPathFactory) -> building.Toolchain:
+    """A C++ compiler; skips where there is none."""
+    compiler = building.find_compiler()
+    if compiler is None:
+        pytest.skip("no C++ compiler here")
+    return building.Toolchain(compiler, tmp_path_factory.mktemp("sanitize"))

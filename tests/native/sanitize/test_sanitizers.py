@@ -1,0 +1,38 @@
+"""The engine under sanitizers: random calls of the C interface, two at once, memory running out.
+
+``driver.cpp`` says what is called and ``calls.h`` what must hold after each call; a failure prints
+the seed in hand. For a longer run see docs/how-to/sanitize.md.
+"""
+
+from __future__ import annotations
+
+import pytest
+from native.sanitize import building
+from native.sanitize.building import MEMORY, THREADS, Toolchain
+
+BUILDS = [
+    pytest.param(build, marks=[pytest.mark.slow] if build == "avx512" else [])
+    for build in building.builds()
+]
+"""The widest compiles longest, and its source differs from the others' in a hundred lines only."""
+
+
+@pytest.mark.parametrize("build", BUILDS)
+def test_no_access_out_of_bounds_no_leak_nothing_undefined(
+    toolchain: Toolchain, build: str
+) -> None:
+    before = building.wrapper(toolchain, MEMORY)
+    program = toolchain.program("sanitize/driver.cpp", build, MEMORY)
+    tally = building.run([*before, str(program), "0", "1500"], toolchain.folder)
+    assert tally["calls"] == 1500
+    # The dice left nothing out: an engine that draws nothing would pass without a word.
+    for kind in ("drew", "poisoned", "backward", "refused", "empty"):
+        assert tally[kind] > 50, kind
+
+
+def test_no_race(toolchain: Toolchain) -> None:
+    before = building.wrapper(toolchain, THREADS)
+    program = toolchain.program("sanitize/driver.cpp", "baseline", THREADS)
+    tally = building.run([*before, str(program), "0", "400"], toolchain.folder)
+    assert tally["drew"] > 100
+    assert tally["backward"] > 100
