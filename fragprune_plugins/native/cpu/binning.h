@@ -114,18 +114,22 @@ inline RowSpans spans_by_row(Team& team, const Memory& memory, const Scene& scen
     const auto found = std::lower_bound(by_row.first.begin(), by_row.first.end(), least);
     return band == bands ? rows : static_cast<size_t>(found - by_row.first.begin());
   };
+  const auto spans_of = [&](uint32_t k) {
+    return scene.spans[k / kPiece].data() + scene.reach[k].first;
+  };
   team.each(bands, 1, [&](size_t band, size_t) {
     const size_t top = edge(band), bottom = edge(band + 1);
     std::vector<RowSpan*> cursor(rows);
     for (size_t r = top; r < bottom; r++) cursor[r] = by_row.spans.data() + by_row.first[r];
     for (size_t i = 0; i < order.size(); i++) {
-      if (i + ahead < order.size()) __builtin_prefetch(&scene.reach[order[i + ahead]]);
+      if (i + 2 * ahead < order.size()) __builtin_prefetch(&scene.reach[order[i + 2 * ahead]]);
+      if (i + ahead < order.size()) __builtin_prefetch(spans_of(order[i + ahead]));
       const uint32_t k = order[i];
       const Reach reach = scene.reach[k];
       const size_t first = std::max<size_t>(reach.row, top);
       const size_t end = std::min<size_t>(size_t{reach.row} + reach.rows, bottom);
       if (first >= end) continue;
-      const Span* of_row = scene.spans[k / kPiece].data() + reach.first;
+      const Span* of_row = spans_of(k);
       uint32_t slot = with_slots ? scene.slot_begin(k) : 0;
       if (with_slots)
         for (size_t r = reach.row; r < first; r++) slot += of_row[r - reach.row].tiles();

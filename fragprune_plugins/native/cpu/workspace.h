@@ -13,6 +13,10 @@
 #include <utility>
 #include <vector>
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 namespace fp {
 
 // Blocks by size class, four to an octave. What lies idle is bounded by what was in use at once,
@@ -24,7 +28,7 @@ class Pool {
   Pool& operator=(const Pool&) = delete;
   ~Pool() {
     for (auto& idle : idle_)
-      for (void* block : idle.second) give_up(block);
+      for (void* block : idle.second) give_up(block, idle.first);
   }
 
   static size_t class_of(size_t bytes) {
@@ -43,7 +47,7 @@ class Pool {
       count_in(size_class);
       return block;
     }
-    void* block = ::operator new(size_class, std::align_val_t(64));
+    void* block = obtain(size_class);
     count_in(size_class);
     return block;
   }
@@ -54,7 +58,7 @@ class Pool {
     try {
       idle_[size_class].push_back(block);
     } catch (...) {
-      give_up(block);
+      give_up(block, size_class);
       return;
     }
     idle_bytes_ += size_class;
@@ -63,7 +67,25 @@ class Pool {
   }
 
  private:
-  static void give_up(void* block) { ::operator delete(block, std::align_val_t(64)); }
+  // Large blocks ask for large pages: splats are read in no order at all, and with small pages each
+  // read would first have to find out where its page is.
+  static constexpr size_t kLargePage = size_t{1} << 21;
+  static size_t alignment_of(size_t size_class) {
+    return size_class >= 2 * kLargePage ? kLargePage : 64;
+  }
+
+  static void* obtain(size_t size_class) {
+    const size_t alignment = alignment_of(size_class);
+    void* block = ::operator new(size_class, std::align_val_t(alignment));
+#if defined(__linux__)
+    if (alignment == kLargePage) madvise(block, size_class, MADV_HUGEPAGE);  // a wish, no more
+#endif
+    return block;
+  }
+
+  static void give_up(void* block, size_t size_class) {
+    ::operator delete(block, std::align_val_t(alignment_of(size_class)));
+  }
 
   void count_in(size_t size_class) {
     in_use_ += size_class;
@@ -73,7 +95,7 @@ class Pool {
   void drop_largest() {
     auto last = std::prev(idle_.end());
     if (!last->second.empty()) {
-      give_up(last->second.back());
+      give_up(last->second.back(), last->first);
       last->second.pop_back();
       idle_bytes_ -= last->first;
     }
