@@ -104,7 +104,16 @@ def command(
         "native": _native(),
     }
     share = translation(results, rasterizer.name)
-    data = {"results": results, "translation": share, "peers": others, "machine": machine}
+    one_scene = len({row["scene"] for row in results}) == 1
+    data = {
+        "results": results,
+        "translation": {
+            key.split()[-1] if one_scene else key: saved["share"] for key, saved in share.items()
+        },
+        "saved": share,
+        "peers": others,
+        "machine": machine,
+    }
     return Report(data, _table(results, share, others, machine))
 
 

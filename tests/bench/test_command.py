@@ -19,12 +19,13 @@ SMALL = ("--size", "40x30", "--gaussians", 200, "--repeats", 2)
 
 def test_json_shape() -> None:
     found = run_json("bench", *SMALL, "--threads", 1)
-    assert set(found) == {"results", "translation", "peers", "machine"}
+    assert set(found) == {"results", "translation", "saved", "peers", "machine"}
     assert len(found["results"]) == 4
     assert {row["scene"] for row in found["results"]} == {"bench-200"}
     assert {row["threads"] for row in found["results"]} == {1}
-    assert set(found["translation"]) == {"bench-200 40x30"}
-    assert set(found["translation"]["bench-200 40x30"]) == {"fragments", "time", "share"}
+    assert set(found["saved"]) == {"bench-200 40x30"}
+    assert set(found["saved"]["bench-200 40x30"]) == {"fragments", "time", "share"}
+    assert found["translation"] == {"40x30": found["saved"]["bench-200 40x30"]["share"]}
     assert found["peers"] == []
     assert set(found["machine"]) == {
         "processor",
