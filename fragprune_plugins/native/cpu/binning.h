@@ -143,11 +143,11 @@ inline RowSpans spans_by_row(Team& team, const Memory& memory, const Scene& scen
   return by_row;
 }
 
-inline TileLists distribute(Team& team, const Memory& memory, size_t across, const Scene& scene,
-                            bool with_slots) {
+inline TileLists distribute(Team& team, const Memory& memory, const Memory& scratch, size_t across,
+                            const Scene& scene, bool with_slots) {
   const size_t rows = scene.rows.size();
-  const Buffer<uint32_t> order = order_by_depth(team, memory, scene);
-  const RowSpans by_row = spans_by_row(team, memory, scene, order, with_slots);
+  const Buffer<uint32_t> order = order_by_depth(team, scratch, scene);
+  const RowSpans by_row = spans_by_row(team, scratch, scene, order, with_slots);
   const size_t entries = by_row.tiles[rows];
   TileLists lists{Buffer<uint32_t>(memory, across * rows + 1), Buffer<uint32_t>(memory, entries),
                   with_slots ? Buffer<uint32_t>(memory, entries) : Buffer<uint32_t>()};

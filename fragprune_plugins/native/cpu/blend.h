@@ -364,7 +364,11 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
                          const uint64_t* reached, const uint32_t* slots, float per_fragment,
                          LossPixels& loss, float* out) {
   constexpr int n = sums_of(kWant);
-  const Lanes lx = lane_x(), ly = lane_y();
+  Lanes xs[4], ys[kBlockRows];  // of each column and row of blocks
+  for (int b = 0; b < 4; b++)
+    xs[b] = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
+  for (int b = 0; b < kBlockRows; b++)
+    ys[b] = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(4 * b)));
   int32_t last_stop[kBlocks], end = 0;
   for (int b = 0; b < kBlocks; b++) {
     last_stop[b] = *std::max_element(kept.stop + b * kLanes, kept.stop + (b + 1) * kLanes);
@@ -391,10 +395,8 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
       for (Lanes& v : sums) v = broadcast<Lanes>(0.f);
       for (; todo; todo &= todo - 1) {
         const int b = __builtin_ctzll(todo);
-        unblend_block<kWant>(brush, at, first + j,
-                             lx + broadcast<Lanes>(static_cast<float>(block_x(b))),
-                             ly + broadcast<Lanes>(static_cast<float>(block_y(b))), kept.stop,
-                             b * kLanes, loss, sums);
+        unblend_block<kWant>(brush, at, first + j, xs[b % 4], ys[b / 4], kept.stop, b * kLanes,
+                             loss, sums);
       }
       float* to = place(first + j);
       sum_each<n>(sums, to);

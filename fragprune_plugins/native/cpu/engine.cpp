@@ -98,10 +98,15 @@ void forward(const fragprune_inputs& in, fragprune_outputs& out, const Memory& m
   Clock clock;
   Team team(in.threads);
   const Camera<float> camera = unpack_camera(in);
-  Scene scene = project_all(team, memory, camera, in, out.radii);
+  // A state holds on to its memory until the backward pass is done, which then wants more: what the
+  // forward pass alone needed goes back to the system first, lest both lie idle in turns.
+  Memory scratch = keep ? std::make_shared<Pool>() : memory;
+  Scene scene = project_all(team, memory, scratch, camera, in, out.radii);
   out.projection_ms = clock.lap();
   const size_t across = static_cast<size_t>(camera.tiles_x);
-  TileLists lists = distribute(team, memory, across, scene, keep != nullptr);
+  TileLists lists = distribute(team, memory, scratch, across, scene, keep != nullptr);
+  scene.drop_reach();
+  scratch.reset();
   out.binning_ms = clock.lap();
   if (out.fragments_per_gaussian)
     std::fill_n(out.fragments_per_gaussian, static_cast<size_t>(in.count), 0);
@@ -110,9 +115,6 @@ void forward(const fragprune_inputs& in, fragprune_outputs& out, const Memory& m
   if (keep) {
     keep->in = in;
     keep->camera = camera;
-    scene.depth = Buffer<float>();
-    scene.reach = Buffer<Reach>();
-    scene.spans.clear();
     keep->scene = std::move(scene);
     keep->lists = std::move(lists);
   }

@@ -56,6 +56,12 @@ struct Scene {
   size_t total = 0;                 // splats
 
   size_t pieces() const { return count.size(); }
+  // Gives up what only binning reads.
+  void drop_reach() {
+    depth = Buffer<float>();
+    reach = Buffer<Reach>();
+    spans.clear();
+  }
   // A splat's slots, from its own first to the next one's.
   uint32_t slot_begin(size_t k) const { return slot_base[k / kPiece] + slot[k]; }
   uint32_t slot_end(size_t k) const {
@@ -238,11 +244,11 @@ class Projector {
         colors_(in.colors, in.count) {}
 
   // Fills piece k of the scene; returns how many tiles its splats reach.
-  uint64_t run(const Memory& memory, Scene& scene, size_t k) const {
+  uint64_t run(const Memory& scratch, Scene& scene, size_t k) const {
     const size_t begin = k * kPiece;
     const size_t end = std::min(begin + kPiece, static_cast<size_t>(in_.count));
     Place to{&scene.splats[begin], &scene.depth[begin], &scene.reach[begin], &scene.slot[begin],
-             Heap<Span>(memory, 4 * kPiece), 0};
+             Heap<Span>(scratch, 4 * kPiece), 0};
     for (size_t i = begin; i < end; i += kLanes)
       shape(i, std::min<size_t>(kLanes, end - i), to);
     colour(to);
@@ -448,13 +454,14 @@ class Projector {
   const Triples means_, colors_;
 };
 
-inline Scene project_all(Team& team, const Memory& memory, const Camera<float>& c,
-                         const fragprune_inputs& in, int32_t* radii) {
+// What only binning reads lies in `scratch`.
+inline Scene project_all(Team& team, const Memory& memory, const Memory& scratch,
+                         const Camera<float>& c, const fragprune_inputs& in, int32_t* radii) {
   const size_t n = static_cast<size_t>(in.count), pieces = (n + kPiece - 1) / kPiece;
   Scene scene;
   scene.splats = Buffer<Splat>(memory, n);
-  scene.depth = Buffer<float>(memory, n);
-  scene.reach = Buffer<Reach>(memory, n);
+  scene.depth = Buffer<float>(scratch, n);
+  scene.reach = Buffer<Reach>(scratch, n);
   scene.slot = Buffer<uint32_t>(memory, n);
   scene.spans.resize(pieces);
   scene.count.resize(pieces);
@@ -462,7 +469,7 @@ inline Scene project_all(Team& team, const Memory& memory, const Camera<float>& 
   scene.rows.resize(static_cast<size_t>(c.tiles_y));
   std::vector<uint64_t> slots(pieces);
   const Projector projector(c, in, radii);
-  team.each(pieces, 1, [&](size_t k, size_t) { slots[k] = projector.run(memory, scene, k); });
+  team.each(pieces, 1, [&](size_t k, size_t) { slots[k] = projector.run(scratch, scene, k); });
   uint64_t total = 0;
   for (size_t k = 0; k < pieces; k++) {
     scene.slot_base[k] = static_cast<uint32_t>(total);

@@ -71,7 +71,7 @@ class Pool {
   // read would first have to find out where its page is.
   static constexpr size_t kLargePage = size_t{1} << 21;
   static size_t alignment_of(size_t size_class) {
-    return size_class >= 2 * kLargePage ? kLargePage : 64;
+    return size_class >= 16 * kLargePage ? kLargePage : 64;
   }
 
   static void* obtain(size_t size_class) {
