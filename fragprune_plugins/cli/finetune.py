@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -19,31 +18,16 @@ from fragprune_plugins.cli.common import (
     load_store,
     set_threads,
 )
+from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.pressure import DEFAULT_PRESSURE
-from fragprune_plugins.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
+from fragprune_plugins.schedule import Settings
 
 
 @click.command("finetune", cls=Command)
 @click.argument("model", type=FILE)
 @click.option("--out", type=FILE, required=True, help="The new .ply; its sidecar goes beside it.")
 @data_options
-@click.option("--iters", type=int, help=f"Optimizer steps; {FINETUNE_ITERATIONS} when left out.")
-@click.option("--quick", is_flag=True, help=f"{QUICK_ITERATIONS} steps: most of the gain.")
-@click.option(
-    "--train",
-    type=click.Choice(["opacity", "appearance", "all"]),
-    default="opacity",
-    show_default=True,
-    help="What learns beside the thresholds; appearance adds SH, all adds shapes and positions.",
-)
-@click.option(
-    "--pressure",
-    type=float,
-    help=f"Weight of drawn fragments per pixel in the loss; {DEFAULT_PRESSURE:g} when left out.",
-)
-@click.option("--target-speedup", type=float, help="Steer for this many times fewer fragments.")
-@click.option("--control", is_flag=True, help="Same steps without truncation: the honest zero.")
+@learning_options
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the order of views.")
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
 @click.option("--curves", type=FILE, help="Write a picture of the learning curves here (.png).")
@@ -54,12 +38,7 @@ def command(
     data: Path,
     resolution: int,
     white_background: bool,
-    iters: int | None,
-    quick: bool,
-    train: Any,
-    pressure: float | None,
-    target_speedup: float | None,
-    control: bool,
+    settings: Settings,
     seed: int,
     no_truncation: bool,
     curves: Path | None,
@@ -79,7 +58,6 @@ def command(
       fragprune finetune point_cloud.ply --data scene --out half.ply --target-speedup 2
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
     """
-    settings = _settings(iters, quick, train, pressure, target_speedup, control, seed)
     if out.resolve() == model.resolve():
         raise UsageError("--out", f"{out}, the model itself", "another file", "Name a new file.")
 
@@ -94,7 +72,7 @@ def command(
     writable_folder(out.parent)
     if out.is_dir():
         raise OutputError(str(out), "a folder", "a .ply file", "Name a file in it.")
-    splat, thresholds = load_model(model, truncation=not (no_truncation or control))
+    splat, thresholds = load_model(model, truncation=settings.truncate and not no_truncation)
     dataset = load_dataset(data, resolution=resolution, white_background=white_background)
     rasterizer = create_engine(engine, splat.xyz.device)
     store = None if thresholds is None else load_store(model, splat)
@@ -142,39 +120,4 @@ def command(
         },
         "\n".join(lines),
         exit_code=130 if result.interrupted else 0,
-    )
-
-
-def _settings(
-    iters: int | None,
-    quick: bool,
-    train: Any,
-    pressure: float | None,
-    target_speedup: float | None,
-    control: bool,
-    seed: int,
-) -> Settings:
-    asked = {
-        "--quick": quick,
-        "--iters": iters is not None,
-        "--pressure": pressure is not None,
-        "--target-speedup": target_speedup is not None,
-        "--control": control,
-    }
-    for one, other in (
-        ("--quick", "--iters"),
-        ("--pressure", "--target-speedup"),
-        ("--control", "--pressure"),
-        ("--control", "--target-speedup"),
-    ):
-        if asked[one] and asked[other]:
-            raise UsageError("options", f"{one} with {other}", "one of the two", "Drop one.")
-    default = QUICK_ITERATIONS if quick else FINETUNE_ITERATIONS
-    return Settings(
-        iterations=default if iters is None else iters,
-        train=train,
-        pressure=DEFAULT_PRESSURE if pressure is None else pressure,
-        target_speedup=target_speedup,
-        truncate=not control,
-        seed=seed,
     )

@@ -11,9 +11,9 @@ from typing import Any
 import click
 
 from fragprune_plugins.cli.common import JSON, Command, Report, describe
+from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import FragpruneError, UsageError
-from fragprune_plugins.pressure import DEFAULT_PRESSURE
-from fragprune_plugins.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
+from fragprune_plugins.schedule import Settings
 
 
 @click.command(
@@ -37,22 +37,7 @@ from fragprune_plugins.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Se
 @click.option(
     "--alternate", type=click.IntRange(min=1), help="joint: learn N iterations, hold N, and so on."
 )
-@click.option("--iters", type=int, help=f"Stage 2's iterations; default {FINETUNE_ITERATIONS}.")
-@click.option("--quick", is_flag=True, help=f"{QUICK_ITERATIONS} iterations: most of the gain.")
-@click.option(
-    "--train",
-    type=click.Choice(["opacity", "appearance", "all"]),
-    default="opacity",
-    show_default=True,
-    help="What learns beside the thresholds; appearance adds SH, all adds shapes and positions.",
-)
-@click.option(
-    "--pressure",
-    type=float,
-    help=f"Weight of drawn fragments per pixel in the loss; default {DEFAULT_PRESSURE:g}.",
-)
-@click.option("--target-speedup", type=float, help="Steer for this many times fewer fragments.")
-@click.option("--control", is_flag=True, help="Same iterations without truncation: honest zero.")
+@learning_options
 @click.option(
     "--engine",
     type=click.Choice(["auto", "reference", "cpu"]),
@@ -81,12 +66,7 @@ def command(
     stage: Any,
     from_iter: int | None,
     alternate: int | None,
-    iters: int | None,
-    quick: bool,
-    train: Any,
-    pressure: float | None,
-    target_speedup: float | None,
-    control: bool,
+    settings: Settings,
     engine: str,
     device: Any,
     evaluate: bool,
@@ -106,17 +86,6 @@ def command(
     """
     if alternate is not None and stage != "joint":
         raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Add or drop it.")
-    if quick and iters is not None:
-        raise UsageError("options", "--quick with --iters", "one of the two", "Drop one.")
-    if pressure is not None and target_speedup is not None:
-        raise UsageError("options", "--pressure with --target-speedup", "one", "Drop one.")
-    settings = Settings(
-        iterations=iters or (QUICK_ITERATIONS if quick else FINETUNE_ITERATIONS),
-        train=train,
-        pressure=DEFAULT_PRESSURE if pressure is None else pressure,
-        target_speedup=target_speedup,
-        truncate=not control,
-    )
 
     from fragprune_plugins.launch import RunOptions, run
 
