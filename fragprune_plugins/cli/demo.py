@@ -45,14 +45,14 @@ def command(out: Path, iters: int, seed: int, engine: str, threads: int | None) 
     """
     # Read when torch loads: idle threads sleep instead of spinning against other programs' work.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from fragprune_plugins.demo.story import DemoSettings, quotable, run_demo
+    from fragprune_plugins.demo.story import DemoSettings, honest, quotable, run_demo
 
     set_threads(threads)
     settings = DemoSettings(iterations=iters, finetune=iters // 2, seed=seed, engine=engine)
     report = run_demo(out, settings, lambda line: click.echo(line, err=True))
     table = describe({"before": report["before"], "after": report["after"]})
     text = (
-        f"\n{table}\n\n{quotable(report)}\n"
+        f"\n{table}\n\n{quotable(report)}\n{honest(report)}\n"
         f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures."
     )
     return Report(report, text)

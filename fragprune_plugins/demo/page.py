@@ -112,12 +112,13 @@ def save_learning(path: Path, curves: Sequence[dict[str, float]], thresholds: Te
 
 def _page(report: dict[str, Any], views: list[str], learned: bool) -> str:
     from fragprune_plugins.cli.common import describe
-    from fragprune_plugins.demo.story import quotable
+    from fragprune_plugins.demo.story import honest, quotable
 
     table = describe({"before": report["before"], "after": report["after"]})
     learning = '<h2>How it learned</h2>\n<img class="wide" src="pictures/learning.png" alt="">'
     return _PAGE.substitute(
         quote=html.escape(quotable(report)),
+        honest=html.escape(honest(report)),
         table=html.escape(table),
         views="\n".join(_VIEW.substitute(name=html.escape(name)) for name in views),
         learning=learning if learned else "",
@@ -161,6 +162,7 @@ learned how far it reaches; what lies beyond is neither sorted nor blended. No l
 repository was changed. Drag the sliders: left of the handle before, right of it after; beside it
 the photograph, which neither has seen.</p>
 <pre>$table</pre>
+<p>$honest</p>
 $views
 $learning
 <h2>Your own</h2>

@@ -20,6 +20,7 @@ from fragprune_plugins.pressure import DEFAULT_PRESSURE
 
 if TYPE_CHECKING:
     from fragprune_plugins.launch import RunOptions, RunSummary
+    from fragprune_plugins.ply import SplatFile
 
 HOST = Path(__file__).with_name("host") / "train.py"
 """The training script that the demo runs, as a user runs their own."""
@@ -87,7 +88,8 @@ def run_demo(
         say: told one line at the start of each part.
 
     Returns:
-        The report: "before" and "after" as measured on the held-out views, seconds by part.
+        The report: "before", "after" and "control" (opacities alone, as long) as measured on the
+        held-out views, seconds by part.
 
     Raises:
         OutputError: the folder cannot be written, or holds something else.
@@ -101,20 +103,23 @@ def run_demo(
     scene, model = out / "scene", out / "model"
     views = settings.scene.views
     with clock.part("scene"):
-        say(f"1/4  Photographing a room from {views} sides (ray-traced, nothing is downloaded)")
+        say(f"1/5  Photographing a room from {views} sides (ray-traced, nothing is downloaded)")
         _photograph(scene, settings)
     with clock.part("train"), contextlib.redirect_stdout(sys.stderr):
         command = host_command(scene.resolve(), model.resolve(), settings)
         say(
-            f"2/4  Training for {settings.iterations} iterations, then opacities and thresholds "
+            f"2/5  Training for {settings.iterations} iterations, then opacities and thresholds "
             f"for {settings.finetune}"
         )
         summary = run(command, _run_options(settings))
+    with clock.part("control"):
+        say(f"3/5  The honest zero: the same {settings.finetune} iterations with opacities alone")
+        control = _control(scene, summary, settings)
     with clock.part("measure"):
-        say("3/4  Measuring on the held-out views, before and after")
-        report = _measure(scene, summary, settings)
+        say("4/5  Measuring on the held-out views")
+        report = _measure(scene, summary, control, settings)
     with clock.part("pictures"):
-        say("4/4  Drawing the pictures")
+        say("5/5  Drawing the pictures")
         report["files"] = write_page(out, report, scene, summary, settings.engine)
     report["seconds_by_part"] = clock.seconds
     report["seconds"] = sum(clock.seconds.values())
@@ -134,6 +139,15 @@ def quotable(report: dict[str, Any]) -> str:
         + (f" and {report['frame_ratio']:.2f}x faster frames" if faster else "")
         + f" at {report['psnr_change']:+.2f} dB PSNR: {after['gaussians']:,} Gaussians, "
         f"{after['views']} held-out views."
+    )
+
+
+def honest(report: dict[str, Any]) -> str:
+    """How much of the change in quality is not truncation's, in one sentence."""
+    return (
+        f"The same {report['iterations']:,} iterations with opacities alone: "
+        f"{report['control_psnr_change']:+.2f} dB PSNR "
+        f"at {report['control']['fragments_per_pixel']:.1f} fragments per pixel."
     )
 
 
@@ -177,24 +191,42 @@ def _run_options(settings: DemoSettings) -> RunOptions:
     return RunOptions(settings=learning, engine=settings.engine, device="cpu")
 
 
-def _measure(scene: Path, summary: RunSummary, settings: DemoSettings) -> dict[str, Any]:
+def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> SplatFile:
+    from fragprune_plugins.cli.common import load_model
+    from fragprune_plugins.finetuning.dataset import load_dataset
+    from fragprune_plugins.finetuning.loop import finetune
+    from fragprune_plugins.schedule import Settings
+
+    assert summary.model_before is not None  # the host saves at its last iteration
+    model, _ = load_model(summary.model_before)
+    learning = Settings(iterations=settings.finetune, truncate=False, seed=settings.seed)
+    data = load_dataset(scene)
+    return finetune(model, data, learning, engine=settings.engine, progress=True).model
+
+
+def _measure(
+    scene: Path, summary: RunSummary, control: SplatFile, settings: DemoSettings
+) -> dict[str, Any]:
     from fragprune_plugins.cli.common import load_model
     from fragprune_plugins.finetuning.dataset import load_dataset
     from fragprune_plugins.measure import Candidate, measure
 
-    assert summary.model_before is not None  # the host saves at its last iteration
+    assert summary.model_before is not None
     assert summary.model_after is not None
     candidates = [
-        Candidate(*load_model(path)) for path in (summary.model_before, summary.model_after)
+        *(Candidate(*load_model(path)) for path in (summary.model_before, summary.model_after)),
+        Candidate(control, None),
     ]
     shots = load_dataset(scene).test
-    before, after = measure(candidates, shots, engine=settings.engine, repeats=_REPEATS)
+    before, after, zero = measure(candidates, shots, engine=settings.engine, repeats=_REPEATS)
     return {
         "before": before,
         "after": after,
+        "control": zero,
         "fragments_ratio": before["fragments_per_pixel"] / max(after["fragments_per_pixel"], 1e-9),
         "frame_ratio": before["frame_ms"] / max(after["frame_ms"], 1e-9),
         "psnr_change": after["psnr"] - before["psnr"],
+        "control_psnr_change": zero["psnr"] - before["psnr"],
         "ssim_change": after["ssim"] - before["ssim"],
         "gaussians": after["gaussians"],
         "iterations": summary.iterations,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fragprune_plugins.demo.story import DemoSettings, host_command, quotable, run_demo
+from fragprune_plugins.demo.story import DemoSettings, honest, host_command, quotable, run_demo
 from fragprune_plugins.errors import OutputError
 
 TINY = """
@@ -43,7 +43,7 @@ def demo(tmp_path_factory):
 
 def test_report_has_the_names_of_every_report(demo):
     out, report, _ = demo
-    for side in ("before", "after"):
+    for side in ("before", "after", "control"):
         assert {
             "psnr",
             "ssim",
@@ -61,6 +61,15 @@ def test_report_has_the_names_of_every_report(demo):
     assert report["device"] == "cpu"
     saved = json.loads((out / "report.json").read_text())
     assert saved == report
+
+
+def test_control_shows_what_opacities_alone_would_have_given(demo):
+    _, report, _ = demo
+    gain = report["control"]["psnr"] - report["before"]["psnr"]
+    assert gain != 0
+    assert report["control_psnr_change"] == pytest.approx(gain)
+    assert report["control"]["gaussians"] == report["before"]["gaussians"]
+    assert f"{gain:+.2f} dB" in honest(report)
 
 
 def test_pictures_and_page_are_there(demo):
