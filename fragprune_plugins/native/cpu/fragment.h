@@ -2,10 +2,9 @@
 #pragma once
 
 #include "../include/fragprune.h"
+#ifndef FP_NUMBERS  // a CUDA build brings its own, and __host__ __device__ for FP_HD
 #include "simd.h"  // fma, exp2, min, abs and broadcast for V
-
-#ifndef FP_HD
-#define FP_HD  // a CUDA build puts __host__ __device__ here
+#define FP_HD
 #endif
 
 namespace fp {

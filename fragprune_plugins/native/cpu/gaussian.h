@@ -3,8 +3,6 @@
 // register of lanes, one Gaussian each. No memory but what it is handed.
 #pragma once
 
-#include <cstdint>
-
 #include "fragment.h"
 
 namespace fp {
