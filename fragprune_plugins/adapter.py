@@ -16,6 +16,7 @@ from fragprune_plugins.seams import Seam
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from fragprune_plugins.ply import SplatFile
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 
@@ -36,10 +37,17 @@ class HostInfo:
 
 @dataclass(frozen=True)
 class HostCall:
-    """The host's call of its rasterizer as data: positional or keyword, no matter."""
+    """The host's call of its rasterizer as data: positional or keyword, no matter.
+
+    Attributes:
+        settings: what the host configured its rasterizer with.
+        arguments: of the call, by name.
+        entry: the function called, "module:attribute" as seams spell it.
+    """
 
     settings: Any
     arguments: Mapping[str, Any]
+    entry: str = ""
 
     @classmethod
     def bind(
@@ -48,10 +56,11 @@ class HostCall:
         settings: Any,
         args: Sequence[Any],
         kwargs: dict[str, Any],
+        entry: str = "",
     ) -> HostCall:
         """Name every argument by the function's signature."""
         bound = inspect.signature(function).bind(*args, **kwargs)
-        return cls(settings, bound.arguments)
+        return cls(settings, bound.arguments, entry)
 
     def get(self, name: str) -> Tensor | None:
         """A tensor argument; None when it is absent, None or empty (hosts pass all three)."""
@@ -74,13 +83,29 @@ class Dialect(ABC):
     def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
         """What the host expects back, arity and all."""
 
+    def answer(
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
+    ) -> Any:
+        """Draw and pack; a dialect may draw several times where one picture does not say it all.
+
+        Args:
+            call: the host's.
+            inputs: what ``unpack`` made of it.
+            draw: rasterizes, with the thresholds that apply to this call.
+        """
+        return self.pack(draw(inputs), call)
+
     @abstractmethod
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the host's compiled packages, by import name.
 
         Args:
-            draw: rasterizes a host call without thresholds and returns what ``pack`` returned.
+            draw: answers a host call without thresholds.
         """
+
+    def spares(self) -> dict[str, ModuleType]:
+        """Stand-ins for what the host imports and can do without, used on a CPU where absent."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -147,6 +172,21 @@ class HostAdapter(ABC):
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command that can resume what a training script left; the same one by default."""
         return script, arguments
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+        """How the finished model of a training command is drawn, beyond vanilla's rules.
+
+        Returns:
+            Fields of ``RasterInputs``; None where no held-out view is left, or the command asks
+            for what our own readers would draw or read otherwise.
+        """
+        return None
+
+    def read_model(self, ply: Path) -> SplatFile:
+        """The host's own PLY."""
+        from fragprune_plugins.ply import read_ply
+
+        return read_ply(ply)
 
     def view(self, camera: Any) -> int:
         """Tells training views apart; by the object, unless a host draws through copies."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from fragprune_plugins import session as _session
-from fragprune_plugins.detect import Finding, HostRepo, choose
+from fragprune_plugins.detect import Finding, locate
 from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.schedule import JointSchedule, Settings
 from fragprune_plugins.session import Session
@@ -41,12 +41,13 @@ def activate(
         SessionError: a session is active already.
     """
     settings = settings or Settings()
-    repo = HostRepo(Path(host) if host is not None else Path(sys.argv[0]).resolve().parent)
     plugins = load_plugins()
     joint = stage == "joint"
+    folder = Path(host) if host is not None else Path(sys.argv[0]).resolve().parent
     tie = plugins.manager.hook.fragprune_select_adapter
+    repo, chosen = locate(folder, plugins.adapters, adapter, select=tie)
     return Session(
-        choose(repo, plugins.adapters, adapter, select=tie),
+        chosen,
         repo,
         plugins,
         settings,

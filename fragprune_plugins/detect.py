@@ -186,6 +186,23 @@ def check_seams(repo: HostRepo, seams: Iterable[Seam]) -> list[Finding]:
     return findings
 
 
+def locate(
+    folder: Path,
+    adapters: Sequence[HostAdapter],
+    name: str | None = None,
+    select: Callable[..., str | None] | None = None,
+) -> tuple[HostRepo, HostAdapter]:
+    """The checkout that a script's folder is, or lies in, and its adapter; see ``choose``."""
+    repo, above = HostRepo(folder), HostRepo(folder.resolve().parent)
+    try:
+        return repo, choose(repo, adapters, name, select)
+    except UnknownHostError as error:
+        try:
+            return above, choose(above, adapters, name, select)
+        except UnknownHostError:
+            raise error from None
+
+
 def choose(
     repo: HostRepo,
     adapters: Sequence[HostAdapter],

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from fragprune_plugins.adapter import CommandLine, HostAdapter
-from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.detect import HostRepo, locate
 from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
 from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.schedule import JointSchedule, Schedule, Settings
@@ -83,6 +83,8 @@ class RunSummary:
         curves: a dict per learned step: step, loss, fragments_per_pixel, pressure,
             threshold_median.
         settings: of the fine-tuning.
+        drawing: fields of ``RasterInputs`` by which the host draws its model; None where its
+            command leaves no view out, or our readers do not draw what the host does.
     """
 
     adapter: str
@@ -99,6 +101,7 @@ class RunSummary:
     target_reached: bool | None
     curves: list[dict[str, float]]
     settings: dict[str, Any]
+    drawing: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -137,13 +140,12 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
 
     options = options or RunOptions()
     script, arguments = _split(command)
-    repo = HostRepo(script.parent)
     plugins = load_plugins()
     for finding in plugins.findings:
         if finding.level != "info":
             log.warning("%s", finding)
     tie = plugins.manager.hook.fragprune_select_adapter
-    adapter = choose(repo, plugins.adapters, options.adapter, select=tie)
+    repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
     host = _parse(script, arguments, adapter.command_line(repo))
     device = _device(options.device)
     runner = _Runner(host, repo, adapter, plugins, options, device)
@@ -190,8 +192,14 @@ class _Runner:
         start = self.options.from_iter if self.options.from_iter is not None else total // 2
         settings = _with_iterations(self.options.settings, total)
         schedule = JointSchedule(settings, start, self.options.alternate)
+        resumed = self.host.flags.resume
         self._execute(
-            self.host.arguments, learn=True, freeze=False, schedule=schedule, settings=settings
+            self.host.arguments,
+            learn=True,
+            freeze=False,
+            start=_iteration_of(Path(resumed)) if resumed else 0,
+            schedule=schedule,
+            settings=settings,
         )
         self._note_after(total)
 
@@ -232,7 +240,7 @@ class _Runner:
             arguments = self.host.with_flags(iterations=total, resume=checkpoint)
             if self.output is not None and not self.host.flags.output:
                 arguments += [self.host.line.output[-1], str(self.output)]  # the host named it
-            self._execute(arguments, learn=True)
+            self._execute(arguments, learn=True, start=iteration)
             self._note_after(total)
 
     @contextlib.contextmanager
@@ -271,6 +279,7 @@ class _Runner:
         learn: bool,
         freeze: bool = True,
         from_step: int = 0,
+        start: int = 0,
         schedule: Schedule | None = None,
         settings: Settings | None = None,
     ) -> None:
@@ -284,6 +293,7 @@ class _Runner:
             learn=learn,
             freeze=freeze,
             from_step=from_step,
+            start=start,
             schedule=schedule,
             engine=self.options.engine,
             drop_in=True if self.device == "cpu" else None,
@@ -337,6 +347,7 @@ class _Runner:
             target_reached=learned.target_reached if learned else None,
             curves=self.curves,
             settings=self.options.settings.as_dict(),
+            drawing=self.adapter.drawing(self.repo, self.host.arguments),
         )
 
     def _iterations(self) -> int:

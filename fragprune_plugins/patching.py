@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -23,9 +24,14 @@ Wrapper = Callable[[Callable[..., Any], Any, tuple[Any, ...], dict[str, Any]], A
 
 
 class PatchLedger:
-    """What we wrapped, in order, and how to take it back."""
+    """What we wrapped, in order, and how to take it back.
 
-    def __init__(self) -> None:
+    Args:
+        root: the host's folder; its modules must come from there. None: from anywhere.
+    """
+
+    def __init__(self, root: Path | None = None) -> None:
+        self._root = root
         self._live = True
         self._wrapped: list[tuple[ModuleType, Seam, Any]] = []
 
@@ -86,8 +92,16 @@ class PatchLedger:
                 )
         return findings
 
-    @staticmethod
-    def _check(module: ModuleType, seam: Seam) -> None:
+    def _check(self, module: ModuleType, seam: Seam) -> None:
+        file = Path(getattr(module, "__file__", None) or "")
+        shadowed = not seam.external and not file.resolve().is_relative_to(self._root or "/")
+        if shadowed:  # hosts have plain names, and some append themselves to the path
+            raise SeamError(
+                str(seam),
+                f"a module of the same name from {file}",
+                f"the host's, in {self._root}",
+                "Uninstall the other, or take it from PYTHONPATH.",
+            )
         try:
             original = wrapt.resolve_path(module, seam.attribute)[2]
         except AttributeError as error:

@@ -19,6 +19,7 @@ class Role(Enum):
     VIEW = "remember which model is being rendered"
     RASTERIZE = "draw with thresholds"
     LOSS = "note the host's loss when it goes backward"
+    METRIC = "evaluate a picture; NaN where the weights it downloads are not to be had"
     PARENTS = "work out the parents of the rows about to be appended"
     KEEP = "keep the surviving rows"
     APPEND = "append rows"

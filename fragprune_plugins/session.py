@@ -41,6 +41,7 @@ from fragprune_plugins.pressure import (
 from fragprune_plugins.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.seams import Role, Seam
 from fragprune_plugins.thresholds import ThresholdStore
+from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")
 
@@ -104,7 +105,6 @@ class _ModelState:
 
     store: ThresholdStore
     steps: int = 0
-    iteration: int = 0
     plan: StepPlan | None = None
     pending_parents: Tensor | None = None
     prepared: bool = False
@@ -160,6 +160,7 @@ class Session:
         schedule: replaces the one the plugins create.
         from_step: steps of the host to let pass before learning and freezing begin.
         freeze: in learning, everything but what ``settings.train`` names stands still.
+        start: the host's iteration that this run goes on after.
         engine: name, see ``fragprune_create_engine``.
         drop_in: put our stand-ins in place of the host's compiled packages: True, False, or None
             for those that cannot be imported.
@@ -177,6 +178,7 @@ class Session:
         schedule: Schedule | None = None,
         from_step: int = 0,
         freeze: bool = True,
+        start: int = 0,
         engine: str = "auto",
         drop_in: bool | None = None,
         output: Path | None = None,
@@ -185,6 +187,7 @@ class Session:
         self.settings = settings or Settings()
         self.hook = plugins.manager.hook
         self.learn, self.from_step, self.freeze = learn, from_step, freeze
+        self.start = start
         self.schedule = schedule or self.hook.fragprune_create_schedule(settings=self.settings)
         self.pressure: Pressure = self.settings.make_pressure() if learn else FixedPressure(0.0)
         self.output = output
@@ -214,7 +217,7 @@ class Session:
         global _active
         if _active is not None:
             raise SessionError("activate()", "a session is active", "none", "Deactivate it first.")
-        self._ledger = PatchLedger()
+        self._ledger = PatchLedger(self.repo.root)
         try:
             self._install_stand_ins()
             for seam in self.adapter.seams_for(self.repo):
@@ -309,7 +312,7 @@ class Session:
         state = self._models[model]
         if state.store.neutral:
             return None
-        return self.adapter.save_model(model, self.output, state.iteration)
+        return self.adapter.save_model(model, self.output, self.start + state.steps)
 
     # -- stand-ins -------------------------------------------------------------------------------
 
@@ -335,12 +338,16 @@ class Session:
                     "Start the host with fragprune run, or call activate() above those imports.",
                 )
             sys.modules[name] = self._stand_ins[name] = module
+        for name, module in self._dialect.spares().items() if self._drop_in else ():
+            if name not in sys.modules and find_spec(name) is None:
+                log.warning("%s is not installed: the host imports an empty stand-in", name)
+                sys.modules[name] = self._stand_ins[name] = module
 
     def _draw(self, call: HostCall) -> Any:
         """The host's picture without thresholds, from our engine."""
         inputs = self._dialect.unpack(call)
-        outputs = self.engine(inputs.splats.means.device).rasterize(inputs, None)
-        return self._dialect.pack(outputs, call)
+        engine = self.engine(inputs.splats.means.device)
+        return self._dialect.answer(call, inputs, lambda inputs: engine.rasterize(inputs, None))
 
     # -- roles -----------------------------------------------------------------------------------
 
@@ -364,18 +371,18 @@ class Session:
         state = self._models.get(model)
         kept = state is not None and self._is_followed(model, state)  # before a new optimizer
         result = wrapped(*args, **kwargs)
+        rows = self.adapter.rows(model)
+        if state is not None and not kept:
+            before = len(state.store)
+            state.store.replace(rows)
+            self._changed(state.store, "training_setup", before)
         if not self.learn:
             return result
-        rows = self.adapter.rows(model)
         if state is None:
             store = ThresholdStore(
                 rows, self.adapter.means(model).device, self.settings.threshold_lr
             )
             state = self._models[model] = _ModelState(store)
-        elif not kept:
-            before = len(state.store)
-            state.store.replace(rows)
-            self._changed(state.store, "training_setup", before)
         self._follow(model, state)
         state.base_rates = {
             group["name"]: group["lr"]
@@ -448,7 +455,6 @@ class Session:
             return result
         self._report(state)
         state.steps += 1
-        state.iteration = int(signature(wrapped).bind(*args, **kwargs).arguments["iteration"])
         step = state.steps - self.from_step
         state.plan = self.schedule.at(step) if step > 0 else None
         if self._standing_still(model):
@@ -522,8 +528,7 @@ class Session:
         state = self._models.get(rendering[0]) if rendering else None
         if rendering is None or state is None or self._paused.get():
             return wrapped(*args, **kwargs)
-        view = rendering[1]
-        call = HostCall.bind(wrapped, rasterizer.raster_settings, args, kwargs)
+        call = HostCall.bind(wrapped, rasterizer.raster_settings, args, kwargs, str(seam))
         means = call["means3D"]
         if len(means) != len(state.store):
             raise AlignmentError(
@@ -538,7 +543,14 @@ class Session:
         thresholds = self.hook.fragprune_truncate(inputs=inputs, store=state.store)
         if thresholds is None:
             return wrapped(*args, **kwargs)
-        engine = self.engine(means.device)
+        draw = partial(self._rasterize, state, rendering[1], thresholds)
+        return self._dialect.answer(call, inputs, draw)
+
+    def _rasterize(
+        self, state: _ModelState, view: int, thresholds: Tensor, inputs: RasterInputs
+    ) -> RasterOutputs:
+        """With thresholds; learning, with the fragment pressure in the loss."""
+        engine = self.engine(inputs.splats.means.device)
         outputs = engine.rasterize(inputs, thresholds)
         state.last_drawn = float(outputs.fragments_per_pixel.detach())
         if torch.is_grad_enabled() and state.plan is not None and state.plan.learn:
@@ -547,9 +559,9 @@ class Session:
                     untruncated = engine.rasterize(inputs, None)
                 state.baseline[view] = float(untruncated.fragments_per_pixel)
             outputs = self._press(state, view, outputs)
-        return self._dialect.pack(outputs, call)
+        return outputs
 
-    def _press(self, state: _ModelState, view: int, outputs: Any) -> Any:
+    def _press(self, state: _ModelState, view: int, outputs: RasterOutputs) -> RasterOutputs:
         """Put the fragment pressure into the host's loss and keep this step's figures."""
         plan = state.plan
         assert plan is not None
@@ -571,6 +583,13 @@ class Session:
         if state is not None and state.stats is not None and tensor.numel() == 1:
             state.stats = replace(state.stats, loss=float(tensor.detach()))
         return wrapped(*args, **kwargs)
+
+    def _on_metric(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
+        try:
+            return wrapped(*args, **kwargs)
+        except OSError as error:  # the download failed; a run of hours should not end on it
+            log.warning("%s: its weights are not to be had (%s); NaN stands for it", seam, error)
+            return torch.tensor(math.nan)
 
     def _on_parents(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         state = self._models.get(model)
@@ -745,6 +764,7 @@ _HANDLERS: dict[Role, Callable[..., Any]] = {
     Role.VIEW: Session._on_view,
     Role.RASTERIZE: Session._on_rasterize,
     Role.LOSS: Session._on_loss,
+    Role.METRIC: Session._on_metric,
     Role.PARENTS: Session._on_parents,
     Role.KEEP: Session._on_keep,
     Role.APPEND: Session._on_append,

@@ -20,7 +20,11 @@ from fragprune_plugins.constants import NEAR
 
 
 def rasterizer(
-    package: str, settings: tuple[str, ...], sparse_adam: bool, draw: Callable[[HostCall], Any]
+    package: str,
+    settings: tuple[str, ...],
+    sparse_adam: bool,
+    draw: Callable[[HostCall], Any],
+    also: tuple[str, ...] = (),
 ) -> ModuleType:
     """The rasterizer package: settings, rasterizer and, for late revisions, the sparse Adam.
 
@@ -28,7 +32,8 @@ def rasterizer(
         package: its import name.
         settings: field names of the settings tuple, in order.
         sparse_adam: whether to offer SparseGaussianAdam.
-        draw: rasterizes a bound call.
+        draw: answers a bound call.
+        also: further methods of the rasterizer that are called as ``forward`` is.
     """
     fields = [(name, Any) for name in settings]
     settings_type = NamedTuple("GaussianRasterizationSettings", fields)  # type: ignore[misc]
@@ -47,8 +52,9 @@ def rasterizer(
             visible: Tensor = depth > NEAR
             return visible
 
-        def forward(
-            self,
+    def entry(name: str) -> Callable[..., Any]:
+        def call(
+            self: GaussianRasterizer,
             means3D: Tensor,
             means2D: Tensor,
             opacities: Tensor,
@@ -71,7 +77,13 @@ def rasterizer(
                 "cov3D_precomp": cov3D_precomp,
                 "dc": dc,
             }
-            return draw(HostCall(self.raster_settings, arguments))
+            where = f"{package}:GaussianRasterizer.{name}"
+            return draw(HostCall(self.raster_settings, arguments, where))
+
+        return call
+
+    for name in ("forward", *also):
+        setattr(GaussianRasterizer, name, entry(name))
 
     module = ModuleType(package, "Stand-in of fragprune for a compiled rasterizer.")
     members: dict[str, Any] = {
