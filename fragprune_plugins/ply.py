@@ -4,7 +4,8 @@ One ``vertex`` element of float32 columns, values before activation: x y z, nx n
 f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
 (logit), scale_0..2 (log), rot_0..3 (w x y z, any length). ``fragprune export`` adds one column,
 ``trunc_threshold``: the threshold itself, in falloff, in (0, 1). Unknown columns are ignored,
-except Mip-Splatting's ``filter_3D``: ignoring that one would draw another picture.
+except Mip-Splatting's ``filter_3D``: its models are drawn by rules of their own, so only who knows
+these may read them.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ _XYZ = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_FILTER = "filter_3D"
 _REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
 _REMEDY = "Pass the point_cloud.ply that a 3DGS training saved."
 
@@ -43,6 +45,8 @@ class SplatFile:
         scaling: (N, 3) logarithms of standard deviations.
         rotation: (N, 4) quaternions w, x, y, z of any length.
         thresholds: (N,) truncation thresholds in (0, 1) where the file carries them.
+        filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units: it widens
+            every axis and dims what it widens.
     """
 
     xyz: Tensor
@@ -52,6 +56,7 @@ class SplatFile:
     scaling: Tensor
     rotation: Tensor
     thresholds: Tensor | None = None
+    filter_3d: Tensor | None = None
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
@@ -85,18 +90,27 @@ class SplatFile:
 
     def splats(self) -> Splats:
         """The Gaussians activated, as engines take them; differentiable."""
+        opacities, scales = torch.sigmoid(self.opacity[:, 0]), torch.exp(self.scaling)
+        if self.filter_3d is not None:
+            wider = (scales.square() + self.filter_3d.square()).sqrt()
+            opacities = opacities * (scales / wider).prod(dim=1)
+            scales = wider
         return Splats(
             means=self.xyz,
-            opacities=torch.sigmoid(self.opacity[:, 0]),
-            scales=torch.exp(self.scaling),
+            opacities=opacities,
+            scales=scales,
             rotations=torch.nn.functional.normalize(self.rotation),
             sh=torch.cat([self.f_dc, self.f_rest], dim=1),
             sh_degree=self.sh_degree,
         )
 
 
-def read_ply(path: Path) -> SplatFile:
+def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
     """Read a trained splat; SH degree follows from the number of f_rest columns.
+
+    Args:
+        path: the file.
+        filtered: accept a model with a 3D filter; the caller draws it by Mip-Splatting's rules.
 
     Raises:
         ModelFileError: missing, truncated, not a PLY, not a Gaussian splat, empty or not finite.
@@ -112,7 +126,7 @@ def read_ply(path: Path) -> SplatFile:
             "the columns of a Gaussian splat",
             "A point cloud or mesh is not a trained splat. " + _REMEDY,
         )
-    if "filter_3D" in names:
+    if _FILTER in names and not filtered:
         raise ModelFileError(
             str(path),
             "a Mip-Splatting model, whose 3D filter (filter_3D) changes shapes and opacities",
@@ -154,6 +168,7 @@ def read_ply(path: Path) -> SplatFile:
             if THRESHOLD_COLUMN in names
             else None
         ),
+        filter_3d=column(_FILTER) if _FILTER in names else None,
     )
 
 
@@ -181,6 +196,8 @@ def write_ply(path: Path, model: SplatFile, thresholds: Tensor | None = None) ->
         (_SCALES, model.scaling),
         (_ROTATION, model.rotation),
     ]
+    if model.filter_3d is not None:
+        columns.append(((_FILTER,), model.filter_3d))
     if thresholds is not None:
         columns.append(((THRESHOLD_COLUMN,), thresholds.reshape(n, 1)))
     names = [name for group, _ in columns for name in group]

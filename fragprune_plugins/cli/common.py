@@ -145,8 +145,12 @@ def set_threads(threads: int | None) -> None:
         torch.set_num_threads(threads)
 
 
-def load_model(path: Path, *, truncation: bool = True) -> tuple[SplatFile, Tensor | None]:
+def load_model(
+    path: Path, *, truncation: bool = True, filtered: bool = False
+) -> tuple[SplatFile, Tensor | None]:
     """A model and its thresholds (N,): the sidecar's, else the file's own column, else None.
+
+    ``filtered`` as in ``read_ply``.
 
     Raises:
         ModelFileError: the model cannot be read.
@@ -155,7 +159,7 @@ def load_model(path: Path, *, truncation: bool = True) -> tuple[SplatFile, Tenso
     from fragprune_plugins import sidecar
     from fragprune_plugins.ply import read_ply
 
-    model = read_ply(path)
+    model = read_ply(path, filtered=filtered)
     if not truncation:
         return model, None
     if sidecar.path_beside(path).exists():

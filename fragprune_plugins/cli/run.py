@@ -134,10 +134,7 @@ def _text(path: Path | None) -> str | None:
 def _measure(host_command: list[str], summary: Any) -> list[dict[str, Any]] | None:
     """Before and after on held-out views, where our own readers draw what the host would."""
     source = _flag(host_command, "-s", "--source_path")
-    foreign = {"--antialiasing", "--train_test_exp"} & set(host_command)
-    if not (summary.model_before and summary.model_after and source) or foreign:
-        return None
-    if "--eval" not in host_command:
+    if not (summary.model_before and summary.model_after and source) or summary.drawing is None:
         return None
     from fragprune_plugins.cli.common import load_model
     from fragprune_plugins.finetuning import load_dataset
@@ -150,11 +147,12 @@ def _measure(host_command: list[str], summary: Any) -> list[dict[str, Any]] | No
             resolution=int(resolution) if resolution in ("1", "2", "4", "8") else 1,
             white_background=bool({"-w", "--white_background"} & set(host_command)),
         )
-        models = [load_model(path) for path in (summary.model_before, summary.model_after)]
+        paths = (summary.model_before, summary.model_after)
+        models = [load_model(path, filtered=True) for path in paths]
     except FragpruneError as error:
         logging.getLogger("fragprune").warning("not compared on held-out views: %s", error)
         return None
-    return measure([Candidate(*model) for model in models], dataset.test)
+    return measure([Candidate(*model, summary.drawing) for model in models], dataset.test)
 
 
 def _flag(words: list[str], *names: str) -> str | None:

@@ -181,7 +181,7 @@ class GraphdecoAdapter(HostAdapter):
             source=("-s", "--source_path"),
             save_checkpoints="--checkpoint_iterations",
             resume="--start_checkpoint",
-            default_iterations=_default_iterations(repo),
+            default_iterations=int(default(repo, "OptimizationParams", "iterations", 30_000)),
         )
 
     def rows(self, model: Any) -> int:
@@ -215,18 +215,24 @@ class GraphdecoAdapter(HostAdapter):
         """The masks of densify_and_clone and densify_and_split, worked out before they draw."""
         import torch
 
-        grads, threshold = arguments["grads"], arguments["grad_threshold"]
         size = model.get_scaling.detach().max(dim=1).values
         limit = model.percent_dense * arguments["scene_extent"]
-        if method == "densify_and_clone":
-            selected = (torch.norm(grads, dim=-1) >= threshold) & (size <= limit)
-            rows: Tensor = selected.nonzero()[:, 0]
-            return rows
-        padded = torch.zeros(len(size), device=size.device)  # rows cloned just now have no gradient
-        padded[: len(grads)] = grads.squeeze()
-        selected = (padded >= threshold) & (size > limit)
-        rows = selected.nonzero()[:, 0].repeat(arguments["N"])
-        return rows
+        clones = method == "densify_and_clone"
+        grown = self.needy(arguments, len(size), torch.norm if clones else torch.squeeze)
+        selected = grown & (size <= limit if clones else size > limit)
+        rows: Tensor = selected.nonzero()[:, 0]
+        return rows.repeat(arguments.get("N", 1))
+
+    def needy(self, arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
+        """(rows,) bool: whose gradient on the screen asks a densify method for more Gaussians.
+
+        Args:
+            arguments: the method's.
+            rows: of the model now.
+            flat: (n, 1) -> (n,), as the method itself does it: rounded alike, whatever is equal to
+                the threshold for the host is so for us.
+        """
+        return reaches(flat(arguments["grads"], dim=-1), arguments["grad_threshold"], rows)
 
     def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
         """Clones and split children carry their parent's colour and rotation bit for bit."""
@@ -251,9 +257,8 @@ class GraphdecoAdapter(HostAdapter):
 
         from fragprune_plugins import sidecar
         from fragprune_plugins.files import replacing
-        from fragprune_plugins.ply import read_ply
 
-        m = read_ply(ply)
+        m = self.read_model(ply)
         rows = len(m.xyz)
         tensors = dict(
             zip(
@@ -288,6 +293,11 @@ class GraphdecoAdapter(HostAdapter):
         with replacing(target) as temporary:
             torch.save((capture, iteration), temporary)
 
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+        """As vanilla draws, where the command holds views out (``--eval``)."""
+        foreign = {"--antialiasing", "--train_test_exp"} & set(arguments)
+        return {} if "--eval" in arguments and not foreign else None
+
     def model_file(self, output: Path, iteration: int) -> Path:
         """Where ``scene.save`` writes."""
         return output / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
@@ -306,16 +316,31 @@ class GraphdecoAdapter(HostAdapter):
         return [(iteration, path) for iteration, _, path in sorted(found)]
 
 
-def _default_iterations(repo: HostRepo) -> int:
-    """``self.iterations = 30_000`` in OptimizationParams; 30,000 where it is not spelled so."""
-    function = repo.function("arguments", "OptimizationParams.__init__")
+def reaches(grads: Tensor, threshold: Any, rows: int) -> Tensor:
+    """(rows,) bool: gradients (n,) at or above it; rows appended just now have none."""
+    padded = grads.new_zeros(rows)
+    padded[: len(grads)] = grads
+    reached: Tensor = padded >= threshold
+    return reached
+
+
+def default(repo: HostRepo, group: str, name: str, otherwise: float) -> float:
+    """A number that an argument group's ``__init__`` assigns to ``self.name``; else ``otherwise``.
+
+    Args:
+        repo: the checkout.
+        group: class in ``arguments``, such as OptimizationParams.
+        name: of the attribute.
+        otherwise: where it is not spelled so.
+    """
+    function = repo.function("arguments", f"{group}.__init__")
     for node in ast.walk(function) if function else ():
         if (
             isinstance(node, ast.Assign)
             and isinstance(node.targets[0], ast.Attribute)
-            and node.targets[0].attr == "iterations"
+            and node.targets[0].attr == name
             and isinstance(node.value, ast.Constant)
-            and isinstance(node.value.value, int)
+            and isinstance(node.value.value, int | float)
         ):
             return node.value.value
-    return 30_000
+    return otherwise

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -15,17 +15,25 @@ from fragprune_plugins.engines import Engine, create_engine
 from fragprune_plugins.finetuning.dataset import Shot
 from fragprune_plugins.measure.metrics import psnr, ssim
 from fragprune_plugins.ply import SplatFile
-from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.types import RasterInputs, Splats, View
 
 REPEATS = 9
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A splat and the thresholds (N,) to draw it with, None for no truncation."""
+    """A splat and the thresholds (N,) to draw it with, None for no truncation.
+
+    ``drawing`` holds fields of ``RasterInputs`` where other rules than vanilla's apply.
+    """
 
     model: SplatFile
     thresholds: Tensor | None = None
+    drawing: Mapping[str, Any] = field(default_factory=dict)
+
+    def inputs(self, view: View, splats: Splats) -> RasterInputs:
+        """One view of the activated model."""
+        return RasterInputs(view, splats, **self.drawing)
 
 
 def evaluate(
@@ -72,7 +80,7 @@ def measure(
     for candidate, splats in zip(candidates, drawn, strict=True):
         rows = []
         for shot in shots:
-            outputs = engine.rasterize(RasterInputs(shot.view, splats), candidate.thresholds)
+            outputs = engine.rasterize(candidate.inputs(shot.view, splats), candidate.thresholds)
             rows.append(
                 (
                     psnr(outputs.image, shot.image),
@@ -101,7 +109,7 @@ def measure(
         for shot in shots:
             turns.reverse()  # neither is always the one that finds a cold cache
             for candidate, splats, rounds in turns:
-                inputs = RasterInputs(shot.view, splats)
+                inputs = candidate.inputs(shot.view, splats)
                 started = time.perf_counter()
                 engine.rasterize(inputs, candidate.thresholds)
                 rounds[-1].append(1e3 * (time.perf_counter() - started))

@@ -19,9 +19,10 @@ from fragprune_plugins.ply import SplatFile, read_ply, write_ply
 
 def same(a: SplatFile, b: SplatFile) -> bool:
     return all(
-        torch.equal(getattr(a, f.name), getattr(b, f.name))
+        torch.equal(one, other) if torch.is_tensor(one) else one is other
         for f in fields(a)
         if f.name != "thresholds"
+        for one, other in [(getattr(a, f.name), getattr(b, f.name))]
     )
 
 
@@ -73,6 +74,31 @@ def test_ascii_doubles_and_unknown_columns(tmp_path):
     elements = [PlyElement.describe(wide, "vertex"), PlyElement.describe(faces, "face")]
     PlyData(elements, text=True).write(tmp_path / "foreign.ply")
     assert same(model, read_ply(tmp_path / "foreign.ply"))
+
+
+def test_a_filtered_model_is_read_only_by_who_asks_for_it_and_written_as_it_was(tmp_path):
+    model = tiny.random_model(4, degree=1)
+    model = replace(model, filter_3d=torch.rand(4, 1))
+    write_ply(tmp_path / "m.ply", model)
+    with pytest.raises(ModelFileError, match="Mip-Splatting model"):
+        read_ply(tmp_path / "m.ply")
+    assert same(model, read_ply(tmp_path / "m.ply", filtered=True))
+    names = [p.name for p in PlyData.read(tmp_path / "m.ply")["vertex"].properties]
+    assert names[-1] == "filter_3D"
+
+
+def test_a_3d_filter_widens_every_axis_and_keeps_what_the_gaussian_covers(tmp_path):
+    model = tiny.random_model(6, degree=0)
+    filtered = replace(model, filter_3d=torch.linspace(0, 3, 6)[:, None])
+    plain, wide = model.splats(), filtered.splats()
+    assert torch.equal(wide.scales[0], plain.scales[0])
+    for row in range(1, 6):
+        for axis in range(3):
+            s, f = plain.scales[row, axis].item(), filtered.filter_3d[row, 0].item()
+            assert wide.scales[row, axis].item() == pytest.approx((s * s + f * f) ** 0.5, rel=1e-5)
+    # The integral over space, opacity times the product of widths, is what it was.
+    mass = [each.opacities * each.scales.prod(dim=1) for each in (plain, wide)]
+    torch.testing.assert_close(*mass, rtol=1e-5, atol=0)
 
 
 def test_activation(tmp_path):

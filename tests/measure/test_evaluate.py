@@ -57,6 +57,12 @@ def test_truncation_draws_less(truth, shots):
     assert plain["frame_ms_se"] == 0.0
 
 
+def test_a_model_is_measured_as_its_host_draws_it(truth, shots):
+    plain, wide = measure([Candidate(truth), Candidate(truth, None, {"dilation": 2.0})], shots)
+    assert wide["fragments_per_pixel"] > plain["fragments_per_pixel"]
+    assert wide["psnr"] < plain["psnr"]
+
+
 def test_images_are_written_as_seen(tmp_path):
     image = torch.tensor([[[0.0, 2.0]], [[-1.0, 0.5]], [[1.0, 0.25]]])
     save_image(tmp_path / "deep" / "x.png", image)
