@@ -116,6 +116,21 @@ class ThresholdStore:
 
         self._resize(moved)
 
+    def rearrange(self, origins: Tensor, fresh: Tensor) -> None:
+        """Keep, copy and append at once: row i becomes what row ``origins[i]`` was.
+
+        Args:
+            origins: (M,) int64, for each of the M new rows the old row it descends from.
+            fresh: (M,) bool, True where the row is a new Gaussian: its moments are zero.
+        """
+        origins = self._rows(origins, len(fresh), "rearrange")
+
+        def placed(rows: Tensor) -> Tensor:
+            return rows[origins]
+
+        self._resize(placed)
+        self.forget(fresh.nonzero()[:, 0])
+
     def forget(self, rows: Tensor | None = None) -> None:
         """Zero the moments of rows (M,) int64, repeats allowed; of all when None."""
         chosen = slice(None) if rows is None else self._rows(rows, len(rows), "forget")

@@ -46,6 +46,9 @@ operations = st.lists(
         st.tuples(
             st.just("forget"), st.one_of(st.none(), st.lists(st.integers(0, 99), max_size=4))
         ),
+        st.tuples(
+            st.just("rearrange"), st.lists(st.tuples(st.integers(0, 99), st.booleans()), max_size=9)
+        ),
         st.tuples(st.just("replace"), st.integers(0, 6)),
         st.tuples(st.just("step"), st.integers(1, 1000)),
     ),
@@ -70,6 +73,16 @@ def apply(store: ThresholdStore, shadow: Shadow, operation: str, argument) -> No
         source, target = (i % n for i in argument)
         store.copy(torch.tensor([source]), torch.tensor([target]))
         shadow.rows[target] = list(shadow.rows[source])
+    elif operation == "rearrange" and n:
+        origins, fresh = [i % n for i, _ in argument], [new for _, new in argument]
+        store.rearrange(
+            torch.tensor(origins, dtype=torch.int64), torch.tensor(fresh, dtype=torch.bool)
+        )
+        old = shadow.rows
+        shadow.rows = [
+            [old[i][0], 0.0, 0.0] if new else list(old[i])
+            for i, new in zip(origins, fresh, strict=True)
+        ]
     elif operation == "forget":
         rows = None if argument is None else [i % n for i in argument if n]
         store.forget(None if rows is None else torch.tensor(rows, dtype=torch.int64))
