@@ -29,6 +29,9 @@ FRUSTUM_MARGIN: Final = 1.3
 ANTIALIASING_FLOOR: Final = 2.5e-5
 """Least ratio of determinants under the square root of the antialiasing compensation."""
 
+MIP_FLOOR: Final = 1e-6
+"""Mip-Splatting draws no Gaussian whose 2D covariance has a determinant this small, pixels^4."""
+
 RIM_WIDTH: Final = 0.01
 """Width w, in falloff, of the surrogate s((g - tau)/w) at the rim; results are flat .003 to .03."""
 

@@ -346,7 +346,7 @@ class Session:
     def _draw(self, call: HostCall) -> Any:
         """The host's picture without thresholds, from our engine."""
         inputs = self._dialect.unpack(call)
-        engine = self.engine(inputs.splats.means.device)
+        engine = self.engine(inputs.splats.device)
         return self._dialect.answer(call, inputs, lambda inputs: engine.rasterize(inputs, None))
 
     # -- roles -----------------------------------------------------------------------------------
@@ -550,7 +550,7 @@ class Session:
         self, state: _ModelState, view: int, thresholds: Tensor, inputs: RasterInputs
     ) -> RasterOutputs:
         """With thresholds; learning, with the fragment pressure in the loss."""
-        engine = self.engine(inputs.splats.means.device)
+        engine = self.engine(inputs.splats.device)
         outputs = engine.rasterize(inputs, thresholds)
         state.last_drawn = float(outputs.fragments_per_pixel.detach())
         if torch.is_grad_enabled() and state.plan is not None and state.plan.learn:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
-from fragprune_plugins.constants import DILATION
+from fragprune_plugins.constants import ALPHA_MAX, ALPHA_MIN, DILATION, NEAR
 from fragprune_plugins.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
+
+Compensation = Literal["none", "antialiasing", "mip"]
+"""What keeps a dilated Gaussian's weight, by name; ``RasterInputs`` has the formulas."""
+
+FEATURES_MAX = 8
+"""Most channels that one rasterization blends beside colour."""
 
 
 def _check(name: str, tensor: Tensor | None, *shape: int | None) -> None:
@@ -23,6 +30,18 @@ def _check(name: str, tensor: Tensor | None, *shape: int | None) -> None:
         want = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
         raise InputError(
             name, f"shape {tuple(tensor.shape)}", f"shape {want}", "Check the call's arguments."
+        )
+
+
+def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
+    """Raise InputError unless tensor is None or (n, F) with F in 1 to FEATURES_MAX."""
+    _check(name, tensor, n, None)
+    if tensor is not None and not 1 <= tensor.shape[1] <= FEATURES_MAX:
+        raise InputError(
+            name,
+            f"{tensor.shape[1]} channels",
+            f"1 to {FEATURES_MAX}",
+            "Blend more in several rasterizations.",
         )
 
 
@@ -130,6 +149,7 @@ class Splats:
         sh: (N, K, 3), K = (degree + 1)^2 or more.
         colors: (N, 3) RGB, used as given.
         sh_degree: 0 to 3, how many bands of ``sh`` are used.
+        features: (N, F), F in 1 to 8: more channels, blended as colour is, without background.
     """
 
     means: Tensor
@@ -140,6 +160,7 @@ class Splats:
     sh: Tensor | None = None
     colors: Tensor | None = None
     sh_degree: int = 0
+    features: Tensor | None = None
 
     def __post_init__(self) -> None:
         _check("Splats.means", self.means, None, 3)
@@ -150,6 +171,7 @@ class Splats:
         _check("Splats.cov3d", self.cov3d, n, 6)
         _check("Splats.sh", self.sh, n, None, 3)
         _check("Splats.colors", self.colors, n, 3)
+        _check_features("Splats.features", self.features, n)
         if (self.scales is None) != (self.rotations is None) or (
             (self.scales is None) == (self.cov3d is None)
         ):
@@ -181,32 +203,123 @@ class Splats:
     def __len__(self) -> int:
         return len(self.means)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians live."""
+        return self.means.device
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """N Gaussians on the image already, of dialects that project in a way of their own.
+
+    One that has no tiles, a depth that is not positive or a conic that is not positive definite
+    draws nothing. All but ``tiles`` are differentiable.
+
+    Attributes:
+        means2d: (N, 2) pixels; (0, 0) is the centre of the first pixel.
+        conics: (N, 3) inverse covariances xx, xy, yy, pixels^-2.
+        depths: (N,) they are blended in this order, ties by row; 1 / depth feeds ``invdepth``.
+        opacities: (N,) in (0, 1), used as given.
+        colors: (N, 3) RGB, used as given.
+        tiles: (N, 4) int32 x0, y0, x1, y1, half open: the 16x16 tiles it may draw in.
+        features: as in ``Splats``.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    opacities: Tensor
+    colors: Tensor
+    tiles: Tensor
+    features: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        _check("Footprints.means2d", self.means2d, None, 2)
+        n = len(self.means2d)
+        _check("Footprints.conics", self.conics, n, 3)
+        _check("Footprints.depths", self.depths, n)
+        _check("Footprints.opacities", self.opacities, n)
+        _check("Footprints.colors", self.colors, n, 3)
+        _check("Footprints.tiles", self.tiles, n, 4)
+        _check_features("Footprints.features", self.features, n)
+
+    def __len__(self) -> int:
+        return len(self.means2d)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians live."""
+        return self.means2d.device
+
 
 @dataclass(frozen=True)
 class RasterInputs:
     """One rasterization, of any dialect the engines know.
 
+    With ``Footprints``, of the view only size and background count, and scale_modifier, dilation,
+    compensation and near do not.
+
     Attributes:
         view: the camera.
-        splats: the Gaussians.
+        splats: the Gaussians, in the world or on the image.
         means2d_hook: (N, 3) or None; values unused, its gradient is the host's NDC-scaled screen
-            gradient (x0.5 W, x0.5 H) in [:, :2] and 0 in [:, 2].
+            gradient (x0.5 W, x0.5 H) in [:, :2]; see ``absolute_gradient`` for [:, 2].
         scale_modifier: factor on the scales.
         dilation: pixels^2 added to the 2D covariance's diagonal.
-        antialiasing: multiply opacity by sqrt(max(2.5e-5, det before / det after dilation)).
+        compensation: factor on opacity by the determinants d0, d1 of the 2D covariance before and
+            after dilation. "antialiasing": sqrt(max(2.5e-5, d0 / d1)). "mip", Mip-Splatting's:
+            sqrt(d0 / (d1 + 1e-6) + 1e-6), and 0 where either is at most 1e-6.
         counts: also count drawn fragments per pixel and per Gaussian.
+        near: view depth at or below which a Gaussian is culled; 0 or more.
+        sample_offsets: (H, W, 2) or None; pixel (x, y) is sampled at (x, y) + its offset, finite,
+            in pixels. Not differentiable.
+        absolute_gradient: the hook's gradient in [:, 2] is the sum over pixels of |gx| + |gy|,
+            (gx, gy) being the pixel's share of [:, :2]; else 0.
+        scores: also give each Gaussian's weights and wins, and the pixels' winners.
+        alpha_max: alpha is capped here; 1/255 to 1.
+        cap_gradient: the gradient passes through the cap; else it is 0 where alpha was capped.
     """
 
     view: View
-    splats: Splats
+    splats: Splats | Footprints
     means2d_hook: Tensor | None = None
     scale_modifier: float = 1.0
     dilation: float = DILATION
-    antialiasing: bool = False
+    compensation: Compensation = "none"
     counts: bool = False
+    near: float = NEAR
+    sample_offsets: Tensor | None = None
+    absolute_gradient: bool = False
+    scores: bool = False
+    alpha_max: float = ALPHA_MAX
+    cap_gradient: bool = True
 
     def __post_init__(self) -> None:
         _check("RasterInputs.means2d_hook", self.means2d_hook, len(self.splats), None)
+        size = self.view.height, self.view.width
+        _check("RasterInputs.sample_offsets", self.sample_offsets, *size, 2)
+        checks = (
+            ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),
+            ("near", self.near >= 0, "0 or more"),
+            ("alpha_max", ALPHA_MIN <= self.alpha_max <= 1, "1/255 to 1"),
+        )
+        for name, holds, expected in checks:
+            if not holds:
+                raise InputError(
+                    f"RasterInputs.{name}",
+                    repr(getattr(self, name)),
+                    str(expected),
+                    "Check the call's arguments.",
+                )
+        hook = self.means2d_hook
+        if self.absolute_gradient and hook is not None and hook.shape[1] < 3:
+            raise InputError(
+                "RasterInputs.means2d_hook",
+                f"{hook.shape[1]} columns",
+                "3 or more with absolute_gradient",
+                "Pass a wider hook.",
+            )
 
     def with_counts(self) -> RasterInputs:
         """The same, counting fragments per pixel and per Gaussian."""
@@ -220,7 +333,7 @@ class RasterOutputs:
     Attributes:
         image: (3, H, W) RGB with background, not clamped.
         radii: (N,) int32, the HOST's rule: ceil(3 sigma), 0 when culled by the host, thresholds
-            never change it.
+            never change it; 0 for ``Footprints``.
         invdepth: (1, H, W) sum of alpha T / z, no background term.
         alpha: (1, H, W) 1 - final transmittance.
         fragments_per_pixel: scalar, drawn fragments over pixels; differentiable in the thresholds
@@ -230,6 +343,13 @@ class RasterOutputs:
         fragments: (H, W) int32 drawn fragments per pixel, when counts were asked for.
         fragments_per_gaussian: (N,) int32 drawn fragments, when counts were asked for.
         stages: milliseconds of the forward pass by stage, from engines that keep time.
+        features: (F, H, W) sum of alpha T feature, when features were given.
+        weights_per_gaussian: (N,) float32 sum of alpha T over its drawn fragments, when scores
+            were asked for; as the other scores without gradient, and the same for any number of
+            threads.
+        wins_per_gaussian: (N,) int32 pixels in which its weight alpha T is the largest.
+        winners: (H, W) int32 row of the Gaussian of largest weight, the first in depth order of
+            equal ones; -1 where nothing is drawn.
     """
 
     image: Tensor
@@ -241,3 +361,7 @@ class RasterOutputs:
     fragments: Tensor | None = None
     fragments_per_gaussian: Tensor | None = None
     stages: dict[str, float] | None = None
+    features: Tensor | None = None
+    weights_per_gaussian: Tensor | None = None
+    wins_per_gaussian: Tensor | None = None
+    winners: Tensor | None = None

@@ -5,9 +5,20 @@ that what it says about our engines is an independent statement. The rules and t
 of the vanilla CUDA rasterizer, down to which derivatives that rasterizer leaves out.
 
     covariance -> project -> (sh) -> fragment -> composite,  all called by ``render``.
+
+``render_footprints`` enters after the projection, for those who project in a way of their own.
 """
 
-from reference_renderer.render import render
+from reference_renderer.project import Footprints
+from reference_renderer.render import render, render_footprints
 from reference_renderer.scene import Camera, Gaussians, Options, Rendering
 
-__all__ = ["Camera", "Gaussians", "Options", "Rendering", "render"]
+__all__ = [
+    "Camera",
+    "Footprints",
+    "Gaussians",
+    "Options",
+    "Rendering",
+    "render",
+    "render_footprints",
+]

@@ -22,12 +22,16 @@ def alive(alpha: Tensor, transmittance_min: float) -> Tensor:
     return stops.cumsum(0) == 0
 
 
-def blend(alpha: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-    """Sum of alpha T feature, (C, P), and the final transmittance, (P,).
+def weights_of(alpha: Tensor) -> Tensor:
+    """(K, P) alpha T of each fragment; alpha as in ``blend``."""
+    return alpha * transmittances(alpha)[:-1]
+
+
+def blend(alpha: Tensor, channels: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum of alpha T channel, (C, P), and the final transmittance, (P,).
 
     Args:
         alpha: (K, P) of fragments in depth order, 0 where not drawn or stopped.
-        features: (K, C) of each Gaussian.
+        channels: (K, C) of each Gaussian.
     """
-    light = transmittances(alpha)
-    return features.mT @ (alpha * light[:-1]), light[-1]
+    return channels.mT @ weights_of(alpha), transmittances(alpha)[-1]

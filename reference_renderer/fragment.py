@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reference_renderer.project import Footprints
 from reference_renderer.scene import FALLOFF_MIN, RIM_REACH, RIM_WIDTH, Options
@@ -27,9 +29,32 @@ class Fragments:
     drawn: Tensor
 
 
+class Spread(torch.autograd.Function):
+    """Means (K, 2) at each of P pixels, (K, P, 2); ``felt`` (K, 2) changes nothing.
+
+    The means receive the sum over pixels of the gradient, ``felt`` that of its absolute values.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, felt: Tensor, pixels: int) -> Tensor:
+        """(K, P, 2)."""
+        return means[:, None, :].repeat(1, pixels, 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        """(K, 2) twice."""
+        return grad.sum(dim=1), grad.abs().sum(dim=1), None
+
+
 def squared_distances(footprints: Footprints, pixels: Tensor) -> Tensor:
     """(K, P) squared Mahalanobis distance q of pixels (P, 2) from each mean."""
-    dx, dy = (footprints.mean2d[:, None, :] - pixels).unbind(-1)
+    means = footprints.mean2d[:, None, :]
+    if footprints.felt is not None:
+        means = Spread.apply(  # type: ignore[no-untyped-call]
+            footprints.mean2d, footprints.felt, len(pixels)
+        )
+    dx, dy = (means - pixels).unbind(-1)
     xx, xy, yy = footprints.conic[:, :, None].unbind(1)
     return xx * dx * dx + yy * dy * dy + 2 * xy * dx * dy
 
@@ -59,9 +84,10 @@ def rim_cutoffs(visible: Tensor, thresholds: Tensor) -> Tensor:
     return torch.minimum(-2 * reach.log(), visible)
 
 
-def cap(alpha: Tensor, alpha_max: float) -> Tensor:
-    """Alpha, at most alpha_max; the gradient passes as if uncapped, as in the host's backward."""
-    return alpha + (alpha.clamp(max=alpha_max) - alpha).detach()
+def cap(alpha: Tensor, alpha_max: float, with_gradient: bool) -> Tensor:
+    """Alpha, at most alpha_max; the gradient passes as if uncapped, or stops where capped."""
+    capped = alpha.clamp(max=alpha_max)
+    return alpha + (capped - alpha).detach() if with_gradient else capped
 
 
 def surrogate(falloff: Tensor, thresholds: Tensor) -> Tensor:
@@ -108,5 +134,5 @@ def fragments(
     falloff = (-0.5 * q.clamp(min=0)).exp()
     visible = visible_cutoffs(footprints.opacity, options.alpha_min)
     gate = gates(q.detach(), falloff, visible, thresholds, options)
-    alpha = cap(footprints.opacity[:, None] * falloff, options.alpha_max)
+    alpha = cap(footprints.opacity[:, None] * falloff, options.alpha_max, options.cap_gradient)
     return Fragments(alpha=alpha * gate, gate=gate, drawn=gate.detach() > 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,6 +17,9 @@ TILE = 16
 ANTIALIASING_FLOOR = 2.5e-5
 """Least ratio of determinants that the antialiasing compensation takes the root of."""
 
+MIP_FLOOR = 1e-6
+"""Least determinant that Mip-Splatting draws at all; also what it adds against division by 0."""
+
 
 @dataclass(frozen=True)
 class Footprints:
@@ -26,9 +29,11 @@ class Footprints:
         mean2d: (K, 2) pixels; (0, 0) is the centre of the first pixel.
         conic: (K, 3) inverse covariance xx, xy, yy, pixels^-2.
         depth: (K,) view space.
-        opacity: (K,) after antialiasing compensation.
+        opacity: (K,) after compensation.
         color: (K, 3) RGB.
         radius: (K,) pixels, ceil(3 sigma) of the longer axis; 0 when degenerate.
+        features: (K, F) more channels, or None.
+        felt: (K, 2) zeros that receive the means' gradient, absolute pixel by pixel; or None.
     """
 
     mean2d: Tensor
@@ -37,6 +42,8 @@ class Footprints:
     opacity: Tensor
     color: Tensor
     radius: Tensor
+    features: Tensor | None = None
+    felt: Tensor | None = None
 
     def take(self, rows: Tensor) -> Footprints:
         """The footprints of these rows (M,), in their order."""
@@ -47,6 +54,8 @@ class Footprints:
             opacity=self.opacity[rows],
             color=self.color[rows],
             radius=self.radius[rows],
+            features=None if self.features is None else self.features[rows],
+            felt=None if self.felt is None else self.felt[rows],
         )
 
 
@@ -60,15 +69,23 @@ def rows_in_front(camera: Camera, means: Tensor, near: float) -> Tensor:
     return (transform(means.detach(), camera.viewmatrix)[:, 2] > near).nonzero()[:, 0]
 
 
-def project_means(camera: Camera, means: Tensor, hook: Tensor | None) -> Tensor:
-    """(N, 2) pixels of means (N, 3); the hook adds zero and receives the gradient in NDC."""
+def project_means(camera: Camera, means: Tensor) -> Tensor:
+    """(N, 2) pixels of means (N, 3)."""
     clip = transform(means, camera.projmatrix)
     ndc = clip[:, :2] * (1 / (clip[:, 3:] + 1e-7))
     size = means.new_tensor([camera.width, camera.height])
-    mean2d = ((ndc + 1) * size - 1) / 2
-    if hook is None:
-        return mean2d
-    return mean2d + 0.5 * size * (hook - hook.detach())[:, :2]
+    return ((ndc + 1) * size - 1) / 2
+
+
+def hooked(camera: Camera, footprints: Footprints, hook: Tensor, options: Options) -> Footprints:
+    """The same footprints; the hook (K, >= 2) receives their means' gradient in NDC."""
+    half = 0.5 * hook.new_tensor([camera.width, camera.height])
+    zero = hook - hook.detach()
+    return replace(
+        footprints,
+        mean2d=footprints.mean2d + half * zero[:, :2],
+        felt=half * zero[:, 2:3] if options.absolute_gradient else None,
+    )
 
 
 def determinant(cov2d: Tensor) -> Tensor:
@@ -91,38 +108,53 @@ def invert(cov2d: Tensor) -> Tensor:
     return torch.stack([cov2d[:, 2] / det, -cov2d[:, 1] / det, cov2d[:, 0] / det], dim=-1)
 
 
-def compensation(before: Tensor, after: Tensor) -> Tensor:
-    """(N,) factor on opacity that keeps a dilated Gaussian's weight, from covariances (N, 3)."""
+def compensate_antialiasing(before: Tensor, after: Tensor) -> Tensor:
+    """(N,) root of the ratio of determinants of covariances (N, 3), not below a floor."""
     det = determinant(after)
     ratio = determinant(before) / torch.where(det == 0, torch.ones_like(det), det)
     return ratio.clamp(min=ANTIALIASING_FLOOR).sqrt()
 
 
-def project(
-    camera: Camera, gaussians: Gaussians, hook: Tensor | None, options: Options
-) -> Footprints:
+def compensate_mip(before: Tensor, after: Tensor) -> Tensor:
+    """(N,) Mip-Splatting's factor from covariances (N, 3): 0 where a determinant is too small.
+
+    Its derivatives are those of the formula. The host's own backward pass puts small numbers into
+    the denominators elsewhere: with a factor of c and a determinant d after dilation its gradient
+    through the factor is off by 2e-6 / c relative, and the part through d by 1e-6 / d^2, which is
+    1% at worst for the host's kernel size of 0.1 (d >= 0.01) and nothing for larger Gaussians.
+    """
+    sharp, wide = determinant(before), determinant(after)
+    draws = (sharp > MIP_FLOOR) & (wide > MIP_FLOOR)
+    sharp, wide = sharp.clamp(min=MIP_FLOOR), wide.clamp(min=MIP_FLOOR)
+    factor = (sharp / (wide + MIP_FLOOR) + MIP_FLOOR).sqrt()
+    return torch.where(draws, factor, torch.zeros_like(factor))
+
+
+def project(camera: Camera, gaussians: Gaussians, options: Options) -> Footprints:
     """Footprints of Gaussians that are all in front of the camera.
 
     Args:
         camera: the view.
         gaussians: K of them.
-        hook: (K, >= 2) or None.
-        options: scale_modifier, dilation and antialiasing are used.
+        options: scale_modifier, dilation and compensation are used.
     """
     points = transform(gaussians.means, camera.viewmatrix)[:, :3]
     cov3d = covariances(gaussians, options.scale_modifier)
     sharp = project_covariances(camera, points, cov3d)
     cov2d = sharp + options.dilation * sharp.new_tensor([1, 0, 1])
     opacity = gaussians.opacities
-    if options.antialiasing:
-        opacity = opacity * compensation(sharp, cov2d)
+    if options.compensation == "antialiasing":
+        opacity = opacity * compensate_antialiasing(sharp, cov2d)
+    if options.compensation == "mip":
+        opacity = opacity * compensate_mip(sharp, cov2d)
     return Footprints(
-        mean2d=project_means(camera, gaussians.means, hook),
+        mean2d=project_means(camera, gaussians.means),
         conic=invert(cov2d),
         depth=points[:, 2],
         opacity=opacity,
         color=colors_of(camera, gaussians),
         radius=radii_of(cov2d.detach()),
+        features=gaussians.features,
     )
 
 

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from reference_renderer.composite import alive, blend
+from reference_renderer.composite import alive, blend, weights_of
 from reference_renderer.fragment import fragments
 from reference_renderer.project import (
     TILE,
     Footprints,
+    determinant,
+    hooked,
     project,
     rows_in_front,
     tile_grid,
@@ -41,16 +43,20 @@ class Drawing:
     """One block, drawn.
 
     Attributes:
-        layers: (5, h, w) red, green, blue, inverse depth, final transmittance.
+        layers: (5 + F, h, w) red, green, blue, inverse depth, features, final transmittance.
         fragments: (h, w) drawn fragments of each pixel.
         per_row: (K,) drawn fragments of each of the block's footprints.
         gate: scalar, sum of the gates of fragments before their pixel's stop.
+        weights: (K,) sum of alpha T of each of the block's footprints.
+        winners: (h, w) which of all footprints has the largest alpha T; -1 for none.
     """
 
     layers: Tensor
     fragments: Tensor
     per_row: Tensor
     gate: Tensor
+    weights: Tensor
+    winners: Tensor
 
 
 def render(
@@ -73,8 +79,9 @@ def render(
     """
     options = options or Options()
     front = rows_in_front(camera, gaussians.means, options.near)
-    hook = None if means2d_hook is None else means2d_hook[front]
-    footprints = project(camera, gaussians.take(front), hook, options)
+    footprints = project(camera, gaussians.take(front), options)
+    if means2d_hook is not None:
+        footprints = hooked(camera, footprints, means2d_hook[front], options)
     tau = None if thresholds is None else thresholds[front]
 
     rects = tile_rects(camera, footprints)
@@ -86,6 +93,37 @@ def render(
     radii = torch.where(touching, footprints.radius, 0).to(torch.int32)
     none = torch.zeros_like(gaussians.opacities, dtype=torch.int32)
     return collect(camera, front, none.index_add(0, front, radii), blocks, drawings)
+
+
+def render_footprints(
+    camera: Camera,
+    footprints: Footprints,
+    tiles: Tensor,
+    thresholds: Tensor | None = None,
+    *,
+    means2d_hook: Tensor | None = None,
+    options: Options | None = None,
+) -> Rendering:
+    """Draw Gaussians that are on the image already, each truncated at its own threshold.
+
+    Args:
+        camera: of it, size and background count.
+        footprints: N of them; their radius is not looked at, and the rendering's radii are 0.
+            One whose depth is not positive or whose conic is not positive definite is culled.
+        tiles: (N, 4) first and past-the-last tile x0, y0, x1, y1 of each.
+        thresholds: as in ``render``.
+        means2d_hook: as in ``render``.
+        options: as in ``render``; what concerns the projection is not looked at.
+    """
+    options = options or Options()
+    if means2d_hook is not None:
+        footprints = hooked(camera, footprints, means2d_hook, options)
+    conic = footprints.conic.detach()
+    drawable = (conic[:, 0] > 0) & (determinant(conic) > 0) & (footprints.depth > 0)
+    blocks = list(cut(camera, footprints, tiles, drawable, options))
+    drawings = [draw(footprints, thresholds, block, options) for block in blocks]
+    rows = torch.arange(len(tiles), device=tiles.device)
+    return collect(camera, rows, torch.zeros_like(rows, dtype=torch.int32), blocks, drawings)
 
 
 def collect(
@@ -101,19 +139,28 @@ def collect(
         drawings: of each block.
     """
     per_gaussian = torch.zeros_like(radii)
+    weights = drawings[0].weights.new_zeros(len(radii))
     for block, drawing in zip(blocks, drawings, strict=True):
         per_gaussian = per_gaussian.index_add(0, front[block.rows], drawing.per_row)
+        weights = weights.index_add(0, front[block.rows], drawing.weights)
     layers = assemble(blocks, [drawing.layers for drawing in drawings])
     gate = torch.stack([drawing.gate for drawing in drawings]).sum()
+    winners = assemble(blocks, [drawing.winners for drawing in drawings])
+    won = winners >= 0
+    winners[won] = front[winners[won]]
     return Rendering(
-        image=layers[:3] + layers[4:] * camera.background[:, None, None],
+        image=layers[:3] + layers[-1:] * camera.background[:, None, None],
         radii=radii,
         invdepth=layers[3:4],
-        alpha=1 - layers[4:],
+        alpha=1 - layers[-1:],
         fragments_per_pixel=gate / (camera.width * camera.height),
         fragments=assemble(blocks, [drawing.fragments for drawing in drawings]),
         fragments_per_gaussian=per_gaussian,
         evaluated=sum(len(b.rows) * len(b.x) * len(b.y) for b in blocks),
+        features=layers[4:-1] if len(layers) > 5 else None,
+        weights_per_gaussian=weights,
+        winners=winners.to(torch.int32),
+        wins_per_gaussian=winners[won].bincount(minlength=len(radii)).to(torch.int32),
     )
 
 
@@ -160,18 +207,40 @@ def draw(
     """
     here = footprints.take(block.rows)
     tau = None if thresholds is None else thresholds[block.rows]
-    found = fragments(here, pixel_grid(block, here.mean2d), tau, options)
+    found = fragments(here, sample_points(block, options, here.mean2d), tau, options)
     live = alive(found.alpha, options.transmittance_min)
-    features = torch.cat([here.color, 1 / here.depth[:, None]], dim=1)
-    sums, left = blend(found.alpha * live, features)
+    more = [] if here.features is None else [here.features]
+    channels = torch.cat([here.color, 1 / here.depth[:, None], *more], dim=1)
+    alpha = found.alpha * live
+    sums, left = blend(alpha, channels)
     counted = (found.drawn & live).to(torch.int32)
+    weights = weights_of(alpha.detach())
     shape = (len(block.y), len(block.x))
     return Drawing(
         layers=torch.cat([sums, left[None]]).reshape(-1, *shape),
         fragments=counted.sum(dim=0, dtype=torch.int32).reshape(shape),
         per_row=counted.sum(dim=1, dtype=torch.int32),
         gate=(found.gate * live).sum(),
+        weights=weights.sum(dim=1),
+        winners=winners_of(weights, block.rows).reshape(shape),
     )
+
+
+def winners_of(weights: Tensor, rows: Tensor) -> Tensor:
+    """(P,) which of rows (K,) has the largest of weights (K, P), the first of equals; or -1."""
+    if len(rows) == 0:
+        return rows.new_full(weights.shape[1:], -1)
+    largest = weights.max(dim=0)
+    return torch.where(largest.values > 0, rows[largest.indices], -1)
+
+
+def sample_points(block: Block, options: Options, like: Tensor) -> Tensor:
+    """(P, 2) where a block's pixels are sampled, in like's dtype and on its device."""
+    points = pixel_grid(block, like)
+    if options.sample_offsets is None:
+        return points
+    columns, rows = slice(block.x.start, block.x.stop), slice(block.y.start, block.y.stop)
+    return points + options.sample_offsets[rows, columns].reshape(-1, 2).to(like)
 
 
 def pixel_grid(block: Block, like: Tensor) -> Tensor:

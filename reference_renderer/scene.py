@@ -55,6 +55,7 @@ class Gaussians:
         sh: (N, K, 3) with K = (sh_degree + 1)^2 or more.
         colors: (N, 3) RGB, used as given.
         sh_degree: 0 to 3.
+        features: (N, F) more channels to blend, or None.
     """
 
     means: Tensor
@@ -65,6 +66,7 @@ class Gaussians:
     sh: Tensor | None = None
     colors: Tensor | None = None
     sh_degree: int = 0
+    features: Tensor | None = None
 
     def take(self, rows: Tensor) -> Gaussians:
         """The Gaussians of these rows (K,), in their order; all others get zero gradient."""
@@ -77,6 +79,7 @@ class Gaussians:
             sh=None if self.sh is None else self.sh[rows],
             colors=None if self.colors is None else self.colors[rows],
             sh_degree=self.sh_degree,
+            features=None if self.features is None else self.features[rows],
         )
 
 
@@ -87,24 +90,31 @@ class Options:
     Attributes:
         scale_modifier: factor on the scales; cov3d is used as given.
         dilation: pixels^2 added to the 2D covariance's diagonal.
-        antialiasing: opacity times sqrt(max(2.5e-5, det before / det after dilation)).
+        compensation: factor on opacity for the dilation, see ``compensate_*`` in project.py.
         near: view depth at or below which a Gaussian is culled.
         alpha_min: fainter fragments are skipped; 0 skips none.
-        alpha_max: alpha is capped here, its gradient is not.
+        alpha_max: alpha is capped here.
+        cap_gradient: the gradient passes through the cap; else it is 0 where alpha was capped.
         transmittance_min: a pixel stops before a fragment that would leave less; 0 never stops.
         tiles: draw a Gaussian only in the 16x16 tiles of its 3-sigma square; else everywhere.
+        sample_offsets: (H, W, 2) pixels, added to where each pixel is sampled; or None.
+        absolute_gradient: the hook's third column receives the sum over pixels of the absolute
+            values of what they add to its first two; else 0.
         truncation: "hard" cuts at the threshold, with the surrogate's gradient; "soft" multiplies
             alpha by the surrogate itself, everywhere, and so has true derivatives.
     """
 
     scale_modifier: float = 1.0
     dilation: float = 0.3
-    antialiasing: bool = False
+    compensation: Literal["none", "antialiasing", "mip"] = "none"
     near: float = 0.2
     alpha_min: float = 1.0 / 255.0
     alpha_max: float = 0.99
+    cap_gradient: bool = True
     transmittance_min: float = 1e-4
     tiles: bool = True
+    sample_offsets: Tensor | None = None
+    absolute_gradient: bool = False
     truncation: Literal["hard", "soft"] = "hard"
 
 
@@ -122,6 +132,11 @@ class Rendering:
         fragments: (H, W) int32 drawn fragments of each pixel.
         fragments_per_gaussian: (N,) int32 drawn fragments of each Gaussian.
         evaluated: (Gaussian, pixel) pairs tested.
+        features: (F, H, W) sum of alpha T feature; None where none were given.
+        weights_per_gaussian: (N,) sum of alpha T over its drawn fragments; a constant.
+        winners: (H, W) int32 row of the Gaussian of largest alpha T, the first in depth order of
+            equal ones, -1 where nothing is drawn.
+        wins_per_gaussian: (N,) int32 pixels that each wins.
     """
 
     image: Tensor
@@ -132,3 +147,7 @@ class Rendering:
     fragments: Tensor
     fragments_per_gaussian: Tensor
     evaluated: int
+    features: Tensor | None
+    weights_per_gaussian: Tensor
+    winners: Tensor
+    wins_per_gaussian: Tensor

@@ -72,5 +72,5 @@ def rasterize(
             "Pass the thresholds of this very model.",
         )
     if isinstance(engine, str):
-        engine = create_engine(engine, inputs.splats.means.device)
+        engine = create_engine(engine, inputs.splats.device)
     return engine.rasterize(inputs, thresholds)

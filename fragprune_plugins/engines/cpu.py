@@ -13,12 +13,10 @@ from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.native import loader
-from fragprune_plugins.types import RasterOutputs
+from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from fragprune_plugins.types import RasterInputs
 
 # The differentiable inputs, in the order in which the autograd function takes them.
 _NAMES = (
@@ -99,6 +97,7 @@ class _Drawing:
     def fill(self, widen: bool) -> loader.Inputs:
         """The C struct; it points into ``arrays``."""
         view, splats = self.inputs.view, self.inputs.splats
+        assert isinstance(splats, Splats)
         return loader.Inputs(
             threads=torch.get_num_threads(),
             width=view.width,
@@ -107,7 +106,7 @@ class _Drawing:
             tan_fov_y=view.tan_fov_y,
             scale_modifier=self.inputs.scale_modifier,
             dilation=self.inputs.dilation,
-            antialiasing=self.inputs.antialiasing,
+            antialiasing=self.inputs.compensation == "antialiasing",
             sh_degree=splats.sh_degree,
             sh_coefficients=0 if splats.sh is None else splats.sh.shape[1],
             widen=widen,
@@ -230,7 +229,9 @@ class CpuEngine:
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+        _refuse_what_is_missing(inputs)
         view, splats = inputs.view, inputs.splats
+        assert isinstance(splats, Splats)
         tensors: dict[str, Tensor | None] = {
             "means": splats.means,
             "means2d": inputs.means2d_hook,
@@ -261,6 +262,19 @@ class CpuEngine:
             fragments=_on(device, drawing.fragments),
             fragments_per_gaussian=_on(device, drawing.fragments_per_gaussian),
             stages=drawing.stages,
+        )
+
+
+def _refuse_what_is_missing(inputs: RasterInputs) -> None:
+    plain = RasterInputs(inputs.view, inputs.splats)
+    names = ("near", "sample_offsets", "absolute_gradient", "scores", "alpha_max", "cap_gradient")
+    lacks = [name for name in names if getattr(inputs, name) != getattr(plain, name)]
+    lacks += ["compensation 'mip'"] * (inputs.compensation == "mip")
+    lacks += ["Footprints"] * isinstance(inputs.splats, Footprints)
+    lacks += ["features"] * (inputs.splats.features is not None)
+    if lacks:
+        raise EngineError(
+            "engine 'cpu'", ", ".join(lacks), "inputs it can draw", "Use the engine 'reference'."
         )
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fragprune_plugins.types import RasterInputs, RasterOutputs
-from reference_renderer import Camera, Gaussians, Options, render
+from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats
+from reference_renderer import Camera, Gaussians, Options, Rendering, render, render_footprints
+from reference_renderer import Footprints as Projected
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -18,17 +19,7 @@ class ReferenceEngine:
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
-        drawn = render(
-            camera_of(inputs),
-            gaussians_of(inputs),
-            thresholds,
-            means2d_hook=inputs.means2d_hook,
-            options=Options(
-                scale_modifier=inputs.scale_modifier,
-                dilation=inputs.dilation,
-                antialiasing=inputs.antialiasing,
-            ),
-        )
+        drawn = _draw(inputs, thresholds)
         return RasterOutputs(
             image=drawn.image,
             radii=drawn.radii,
@@ -38,7 +29,37 @@ class ReferenceEngine:
             evaluated_per_pixel=drawn.evaluated / (inputs.view.width * inputs.view.height),
             fragments=drawn.fragments if inputs.counts else None,
             fragments_per_gaussian=drawn.fragments_per_gaussian if inputs.counts else None,
+            features=drawn.features,
+            weights_per_gaussian=drawn.weights_per_gaussian.float() if inputs.scores else None,
+            wins_per_gaussian=drawn.wins_per_gaussian if inputs.scores else None,
+            winners=drawn.winners if inputs.scores else None,
         )
+
+
+def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:
+    camera, hook, options = camera_of(inputs), inputs.means2d_hook, options_of(inputs)
+    splats = inputs.splats
+    if isinstance(splats, Splats):
+        gaussians = gaussians_of(splats)
+        return render(camera, gaussians, thresholds, means2d_hook=hook, options=options)
+    projected = projected_of(splats)
+    return render_footprints(
+        camera, projected, splats.tiles, thresholds, means2d_hook=hook, options=options
+    )
+
+
+def options_of(inputs: RasterInputs) -> Options:
+    """The oracle's dialect."""
+    return Options(
+        scale_modifier=inputs.scale_modifier,
+        dilation=inputs.dilation,
+        compensation=inputs.compensation,
+        near=inputs.near,
+        alpha_max=inputs.alpha_max,
+        cap_gradient=inputs.cap_gradient,
+        sample_offsets=inputs.sample_offsets,
+        absolute_gradient=inputs.absolute_gradient,
+    )
 
 
 def camera_of(inputs: RasterInputs) -> Camera:
@@ -56,9 +77,8 @@ def camera_of(inputs: RasterInputs) -> Camera:
     )
 
 
-def gaussians_of(inputs: RasterInputs) -> Gaussians:
+def gaussians_of(splats: Splats) -> Gaussians:
     """The oracle's Gaussians, sharing the tensors."""
-    splats = inputs.splats
     return Gaussians(
         means=splats.means,
         opacities=splats.opacities,
@@ -68,4 +88,18 @@ def gaussians_of(inputs: RasterInputs) -> Gaussians:
         sh=splats.sh,
         colors=splats.colors,
         sh_degree=splats.sh_degree,
+        features=splats.features,
+    )
+
+
+def projected_of(footprints: Footprints) -> Projected:
+    """The oracle's footprints, sharing the tensors."""
+    return Projected(
+        mean2d=footprints.means2d,
+        conic=footprints.conics,
+        depth=footprints.depths,
+        opacity=footprints.opacities,
+        color=footprints.colors,
+        radius=footprints.depths.new_zeros(len(footprints)),
+        features=footprints.features,
     )

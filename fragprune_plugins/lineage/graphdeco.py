@@ -95,7 +95,7 @@ class GraphdecoDialect(Dialect):
             ),
             means2d_hook=call.get("means2D"),
             scale_modifier=float(s.scale_modifier),
-            antialiasing=bool(getattr(s, "antialiasing", False)),
+            compensation="antialiasing" if getattr(s, "antialiasing", False) else "none",
         )
 
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:

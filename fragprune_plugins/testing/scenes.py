@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
-from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.types import Compensation, Footprints, RasterInputs, Splats, View
+
+AnySplats = Splats | Footprints
 
 SH_DC = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -29,7 +31,9 @@ def random_scene(
     sh_degree: int = 1,
     colors: bool = False,
     cov3d: bool = False,
-    antialiasing: bool = False,
+    features: int = 0,
+    offsets: bool = False,
+    compensation: Compensation = "none",
     scale_modifier: float = 1.0,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
@@ -48,7 +52,9 @@ def random_scene(
         sh_degree: 0 to 3; ``sh`` always has all 16 coefficients.
         colors: give RGB colours instead of ``sh``.
         cov3d: give 3D covariances instead of scales and rotations.
-        antialiasing: as in ``RasterInputs``.
+        features: channels to blend beside colour; 0 for none.
+        offsets: give sample offsets of up to half a pixel.
+        compensation: as in ``RasterInputs``.
         scale_modifier: as in ``RasterInputs``.
         dtype: of every tensor.
         device: of every tensor.
@@ -71,8 +77,14 @@ def random_scene(
         splats = replace(splats, sh=None, colors=_uniform(generator, 0.0, 1.2, n, 3), sh_degree=0)
     if cov3d:
         splats = with_cov3d(splats)
+    if features:
+        splats = replace(splats, features=_uniform(generator, -1.0, 2.0, n, features))
     inputs = RasterInputs(
-        view=view, splats=splats, antialiasing=antialiasing, scale_modifier=scale_modifier
+        view=view,
+        splats=splats,
+        compensation=compensation,
+        scale_modifier=scale_modifier,
+        sample_offsets=_uniform(generator, -0.5, 0.5, height, width, 2) if offsets else None,
     )
     return cast(inputs, dtype, device)
 
@@ -190,6 +202,7 @@ def behind_camera(*, dtype: torch.dtype = torch.float32) -> RasterInputs:
     scene = one_splat(background=(0.1, 0.2, 0.3), dtype=torch.float64)
     means = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.1], [0.1, 0.0, 0.0]], dtype=torch.float64)
     splats = concatenate(concatenate(scene.splats, scene.splats), scene.splats)
+    assert isinstance(splats, Splats)
     return cast(replace(scene, splats=replace(splats, means=means)), dtype)
 
 
@@ -203,14 +216,16 @@ def empty(
 def leaves(inputs: RasterInputs) -> tuple[RasterInputs, dict[str, Tensor]]:
     """The same inputs made of fresh leaves that require gradients, and those leaves by name.
 
-    Names are the fields of ``Splats`` that are present, "background" and "means2d_hook" (zeros).
+    Names are the fields of the splats that are present and not whole numbers, "background" and
+    "means2d_hook" (zeros).
     """
     splats: dict[str, Any] = {
         name: tensor.detach().clone().requires_grad_()
         for name, tensor in _tensors(inputs.splats).items()
+        if tensor.is_floating_point()
     }
     background = inputs.view.background.detach().clone().requires_grad_()
-    hook = torch.zeros_like(inputs.splats.means).requires_grad_()
+    hook = background.new_zeros(len(inputs.splats), 3).requires_grad_()
     made = replace(
         inputs,
         splats=replace(inputs.splats, **splats),
@@ -225,20 +240,22 @@ def cast(
 ) -> RasterInputs:
     """The same inputs in another dtype, on another device."""
 
-    def convert(value: View | Splats) -> dict[str, Any]:
-        return {k: t.to(dtype).to(device).contiguous() for k, t in _tensors(value).items()}
+    def convert(value: View | AnySplats | RasterInputs) -> dict[str, Any]:
+        return {
+            name: tensor.to(device, dtype if tensor.is_floating_point() else None).contiguous()
+            for name, tensor in _tensors(value).items()
+        }
 
-    hook = inputs.means2d_hook
     return replace(
         inputs,
         view=replace(inputs.view, **convert(inputs.view)),
         splats=replace(inputs.splats, **convert(inputs.splats)),
-        means2d_hook=None if hook is None else hook.to(dtype).to(device),
+        **convert(inputs),
     )
 
 
-def concatenate(first: Splats, second: Splats) -> Splats:
-    """Both, first's rows first; they must have the same fields."""
+def concatenate(first: AnySplats, second: AnySplats) -> AnySplats:
+    """Both, first's rows first; they must be of one kind and have the same fields."""
     others = _tensors(second)
     joined: dict[str, Any] = {
         name: torch.cat([t, others[name]]) for name, t in _tensors(first).items()
@@ -351,7 +368,7 @@ def _uniform(generator: torch.Generator, low: float, high: float, *shape: int) -
     return torch.rand(*shape, generator=generator, dtype=torch.float64) * (high - low) + low
 
 
-def _tensors(value: View | Splats) -> dict[str, Any]:
+def _tensors(value: View | AnySplats | RasterInputs) -> dict[str, Any]:
     """The dataclass's fields that are tensors, by name."""
     pairs = ((f.name, getattr(value, f.name)) for f in fields(value))
     return {name: tensor for name, tensor in pairs if isinstance(tensor, Tensor)}

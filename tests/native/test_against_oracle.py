@@ -28,9 +28,9 @@ GRADIENT_TOLERANCE = 3e-4
 
 KINDS = {
     "plain": {},
-    "sh 3, antialiasing": {"sh_degree": 3, "antialiasing": True},
+    "sh 3, antialiasing": {"sh_degree": 3, "compensation": "antialiasing"},
     "cov3d": {"cov3d": True},
-    "cov3d, antialiasing": {"cov3d": True, "antialiasing": True, "sh_degree": 0},
+    "cov3d, antialiasing": {"cov3d": True, "compensation": "antialiasing", "sh_degree": 0},
     "colours, modifier": {"colors": True, "scale_modifier": 0.7},
     "odd size, sh 2": {"width": 33, "height": 17, "sh_degree": 2},
 }
@@ -169,7 +169,9 @@ def awkward_scenes(draw: st.DrawFn) -> tuple[RasterInputs, torch.Tensor | None]:
     if draw(st.booleans()):
         splats = scenes.with_cov3d(splats)
     thresholds = scenes.random_thresholds(n, n) if draw(st.booleans()) else None
-    inputs = RasterInputs(view, splats, antialiasing=draw(st.booleans()))
+    inputs = RasterInputs(
+        view, splats, compensation=draw(st.sampled_from(["none", "antialiasing"]))
+    )
     return scenes.cast(inputs, torch.float32), thresholds
 
 

@@ -14,7 +14,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines.cpu import CpuEngine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.testing import scenes
-from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.types import Compensation, RasterInputs
 
 # Enough Gaussians and tiles for several pieces of work per thread, in sorting and binning too.
 LARGE = {"n": 20_000, "width": 150, "height": 100, "scale_modifier": 0.3}
@@ -59,9 +59,11 @@ def test_two_python_threads_at_once(engine: CpuEngine) -> None:
         assert_identical(expected[i % len(cases)], result)
 
 
-@pytest.mark.parametrize("antialiasing", [False, True])
-def test_neutral_thresholds_are_no_thresholds(engine: CpuEngine, antialiasing: bool) -> None:
-    inputs = scenes.random_scene(5, 200, 70, 50, sh_degree=3, antialiasing=antialiasing)
+@pytest.mark.parametrize("compensation", ["none", "antialiasing"])
+def test_neutral_thresholds_are_no_thresholds(
+    engine: CpuEngine, compensation: Compensation
+) -> None:
+    inputs = scenes.random_scene(5, 200, 70, 50, sh_degree=3, compensation=compensation)
     neutral = torch.sigmoid(torch.full((200,), NEUTRAL_LOGIT))
     assert_identical(everything(engine, inputs, None), everything(engine, inputs, neutral))
 
@@ -134,7 +136,7 @@ def test_gradients_come_in_the_dtype_and_only_where_they_are_wanted(engine: CpuE
 
 
 def test_subsets_of_gradients_equal_the_whole(engine: CpuEngine) -> None:
-    inputs = scenes.random_scene(4, 120, 50, 40, sh_degree=2, antialiasing=True)
+    inputs = scenes.random_scene(4, 120, 50, 40, sh_degree=2, compensation="antialiasing")
     thresholds = scenes.random_thresholds(4, 120)
     made, leaves = scenes.leaves(inputs)
     tau = thresholds.clone().requires_grad_()

@@ -99,7 +99,9 @@ def without_volume(draw: st.DrawFn) -> Drawn:
     if draw(st.booleans()):
         splats = scenes.with_cov3d(splats)
     thresholds = scenes.random_thresholds(n, n) if draw(st.booleans()) else None
-    inputs = RasterInputs(view, splats, antialiasing=draw(st.booleans()))
+    inputs = RasterInputs(
+        view, splats, compensation=draw(st.sampled_from(["none", "antialiasing"]))
+    )
     return scenes.cast(inputs, torch.float32), thresholds
 
 
@@ -112,7 +114,7 @@ def test_flat_splats_needles_and_points(engine: CpuEngine, case: Drawn) -> None:
         return  # 3 sigma within rounding of an integer: a whole tile more or less, rightly
     check_images(truth, ours, same)
     inputs, _ = case
-    if inputs.antialiasing and inputs.splats.cov3d is not None:
+    if inputs.compensation != "none" and inputs.splats.cov3d is not None:
         return  # the determinant of a flat covariance is the rounding of its six numbers
     # As in test_awkward_scenes_equal_the_oracle: the gradient of a needle's rotation cancels.
     check_gradients(engine, *case, same, tolerance=2e-3)

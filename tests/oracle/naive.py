@@ -124,7 +124,7 @@ def splats_of(inputs: RasterInputs, thresholds=None) -> list[Splat]:
     for row in range(len(inputs.splats)):
         homogeneous = [*inputs.splats.means[row].tolist(), 1.0]
         point = times(homogeneous, view.viewmatrix.tolist())
-        if point[2] <= 0.2:
+        if point[2] <= inputs.near:
             continue
         clip = times(homogeneous, view.projmatrix.tolist())
         sizes = (view.width, view.height)
@@ -135,8 +135,11 @@ def splats_of(inputs: RasterInputs, thresholds=None) -> list[Splat]:
         if det == 0:
             continue
         opacity = inputs.splats.opacities[row].item()
-        if inputs.antialiasing:
+        if inputs.compensation == "antialiasing":
             opacity *= math.sqrt(max(2.5e-5, before / det))
+        elif inputs.compensation == "mip":
+            draws = before > 1e-6 and det > 1e-6
+            opacity *= math.sqrt(before / (det + 1e-6) + 1e-6) if draws else 0
         mid = (a + c) / 2
         radius = math.ceil(3 * math.sqrt(mid + math.sqrt(max(0.1, mid * mid - det))))
         low = [min(grid[k], max(0, int((at[k] - radius) / 16))) for k in (0, 1)]
@@ -152,18 +155,20 @@ def splats_of(inputs: RasterInputs, thresholds=None) -> list[Splat]:
     return sorted(found, key=lambda s: s.depth)
 
 
-def records_at(splats: list[Splat], x: int, y: int) -> tuple[list[Record], float]:
+def records_at(
+    splats: list[Splat], x: int, y: int, offset=(0.0, 0.0)
+) -> tuple[list[Record], float]:
     """The pairs visited at a pixel, in order, and the final transmittance."""
     records, light = [], 1.0
     for s in splats:
         if not (s.rect[0] <= x // 16 < s.rect[2] and s.rect[1] <= y // 16 < s.rect[3]):
             continue
         a, b, c = s.cov
-        dx, dy = s.pixel[0] - x, s.pixel[1] - y
+        dx, dy = s.pixel[0] - x - offset[0], s.pixel[1] - y - offset[1]
         q = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / (a * c - b * b)
         g = math.exp(-q / 2)
         alpha = min(0.99, s.opacity * g)
-        visible = q <= 2 * math.log(255 * s.opacity)
+        visible = s.opacity > 0 and q <= 2 * math.log(255 * s.opacity)
         drawn = visible and (s.tau is None or q <= -2 * math.log(s.tau))
         if drawn and light * (1 - alpha) < 1e-4:
             break

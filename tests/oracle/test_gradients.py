@@ -6,13 +6,25 @@ from dataclasses import replace
 
 import pytest
 import torch
+from footprints import footprints_of
 
-from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
+from fragprune_plugins.engines.reference import (
+    ReferenceEngine,
+    camera_of,
+    gaussians_of,
+    options_of,
+    projected_of,
+)
 from fragprune_plugins.testing import scenes
-from reference_renderer import Options, render
+from reference_renderer import Options, render, render_footprints
 
 F64 = torch.float64
-UNCUT = Options(alpha_min=0, transmittance_min=0, tiles=False, truncation="soft")
+
+
+def uncut(inputs) -> Options:
+    """The dialect with every cut off: differentiable everywhere."""
+    options = options_of(inputs)
+    return replace(options, alpha_min=0, transmittance_min=0, tiles=False, truncation="soft")
 
 
 def smooth_scene(n=3, **kind):
@@ -31,7 +43,8 @@ def smooth_scene(n=3, **kind):
 
 
 def outputs(drawn):
-    return drawn.image, drawn.invdepth, drawn.alpha, drawn.fragments_per_pixel
+    made = drawn.image, drawn.invdepth, drawn.alpha, drawn.fragments_per_pixel, drawn.features
+    return tuple(tensor for tensor in made if tensor is not None)
 
 
 KINDS = {
@@ -39,7 +52,10 @@ KINDS = {
     "sh degree 1": {"sh_degree": 1},
     "sh degree 3": {"sh_degree": 3},
     "colours and covariances": {"colors": True, "cov3d": True},
-    "antialiased": {"colors": True, "antialiasing": True},
+    "antialiased": {"colors": True, "compensation": "antialiasing"},
+    "mip": {"colors": True, "compensation": "mip"},
+    "mip, covariances": {"cov3d": True, "compensation": "mip", "sh_degree": 0},
+    "features at offsets": {"colors": True, "features": 3, "offsets": True},
     "scaled": {"colors": True, "scale_modifier": 1.3},
 }
 
@@ -48,7 +64,7 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_input_has_the_derivative_of_finite_differences(kind, truncated):
     scene, leaves = scenes.leaves(smooth_scene(**KINDS[kind]))
-    options = replace(UNCUT, antialiasing=scene.antialiasing, scale_modifier=scene.scale_modifier)
+    options = uncut(scene)
     hook = leaves.pop("means2d_hook")
     names = list(leaves)
     tau = torch.tensor([0.3, 0.6, 0.1], dtype=F64, requires_grad=truncated)
@@ -56,12 +72,68 @@ def test_every_input_has_the_derivative_of_finite_differences(kind, truncated):
     def drawn(*tensors):
         given = dict(zip(names, tensors[:-1], strict=True))
         camera = replace(camera_of(scene), background=given.pop("background"))
-        gaussians = replace(gaussians_of(scene), **given)
+        gaussians = replace(gaussians_of(scene.splats), **given)
         thresholds = tensors[-1] if truncated else None
         made = outputs(render(camera, gaussians, thresholds, means2d_hook=hook, options=options))
-        return made if truncated else made[:3]  # without thresholds a count is a constant
+        # Without thresholds a count is a constant.
+        return made if truncated else made[:3] + made[4:]
 
     assert torch.autograd.gradcheck(drawn, (*leaves.values(), tau), eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("features", [0, 2])
+def test_every_number_of_a_footprint_has_the_derivative_of_finite_differences(features):
+    made = footprints_of(smooth_scene(colors=True, features=features))
+    scene, leaves = scenes.leaves(made)
+    del leaves["means2d_hook"]
+    names = list(leaves)
+    tau = torch.tensor([0.3, 0.6, 0.1], dtype=F64, requires_grad=True)
+
+    def drawn(*tensors):
+        given = dict(zip(names, tensors[:-1], strict=True))
+        camera = replace(camera_of(scene), background=given.pop("background"))
+        prints = projected_of(replace(scene.splats, **given))
+        options = uncut(scene)
+        return outputs(
+            render_footprints(camera, prints, scene.splats.tiles, tensors[-1], options=options)
+        )
+
+    assert torch.autograd.gradcheck(drawn, (*leaves.values(), tau), eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+def hook_gradient(inputs, weight):
+    made, leaves = scenes.leaves(inputs)
+    drawn = ReferenceEngine().rasterize(made, None)
+    (torch.cat([drawn.image, drawn.alpha]) * weight).sum().backward()
+    return leaves["means2d_hook"].grad
+
+
+def test_the_absolute_gradient_is_the_sum_of_what_single_pixels_add():
+    scene = scenes.random_scene(3, 30, 19, 9, colors=True, dtype=F64, offsets=True)
+    weight = torch.randn(4, 9, 19, generator=torch.Generator().manual_seed(0), dtype=F64)
+    expected = torch.zeros(30, dtype=F64)
+    for y in range(9):
+        for x in range(19):
+            alone = torch.zeros_like(weight)
+            alone[:, y, x] = weight[:, y, x]
+            expected += hook_gradient(scene, alone)[:, :2].abs().sum(dim=1)
+    asked = hook_gradient(replace(scene, absolute_gradient=True), weight)
+    plain = hook_gradient(scene, weight)
+    assert torch.allclose(asked[:, 2], expected, rtol=1e-10, atol=1e-12)
+    assert torch.allclose(asked[:, :2], plain[:, :2], rtol=1e-12, atol=1e-12)
+    assert expected.max() > 1.1 * plain[:, :2].abs().sum(dim=1).max()
+    assert not plain[:, 2].any()
+
+
+@pytest.mark.parametrize(("alpha_max", "passes"), [(0.99, True), (0.99, False), (0.5, False)])
+def test_the_caps_gradient_passes_or_stops(alpha_max, passes):
+    scene = scenes.one_splat(opacity=0.999, color=(1.0, 1.0, 1.0), dtype=F64)
+    scene = replace(scene, alpha_max=alpha_max, cap_gradient=passes)
+    inputs, leaves = scenes.leaves(scene)
+    drawn = ReferenceEngine().rasterize(inputs, None)
+    assert drawn.image[0, 8, 8].item() == pytest.approx(alpha_max)
+    drawn.image[0, 8, 8].backward()
+    assert leaves["opacities"].grad.item() == (1 if passes else 0)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -75,7 +147,8 @@ def test_the_means2d_gradient_is_that_of_normalised_device_coordinates(axis):
         clip = scene.view.projmatrix
         unit = torch.eye(4, dtype=F64)[axis]
         camera = replace(camera_of(scene), projmatrix=clip + shift * clip[:, 3:] * unit)
-        drawn = render(camera, gaussians_of(scene), means2d_hook=hook, options=UNCUT)
+        options = uncut(scene)
+        drawn = render(camera, gaussians_of(scene.splats), means2d_hook=hook, options=options)
         return (drawn.image * weight).sum()
 
     hook = leaves["means2d_hook"]

@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from footprints import footprints_of
 
 import reference_renderer
 from fragprune_plugins import constants
 from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
+from fragprune_plugins.errors import InputError
 from fragprune_plugins.testing import scenes
 from reference_renderer import Options, covariance, project, scene
 from reference_renderer.fragment import fragments
@@ -22,7 +24,7 @@ F64 = torch.float64
 
 
 def draw(inputs, thresholds=None):
-    return ReferenceEngine().rasterize(inputs.with_counts(), thresholds)
+    return ReferenceEngine().rasterize(replace(inputs, counts=True, scores=True), thresholds)
 
 
 def loss(drawn):
@@ -56,6 +58,7 @@ def test_its_own_constants_are_those_of_the_core():
     assert covariance.FRUSTUM_MARGIN == constants.FRUSTUM_MARGIN
     assert project.TILE == constants.TILE
     assert project.ANTIALIASING_FLOOR == constants.ANTIALIASING_FLOOR
+    assert project.MIP_FLOOR == constants.MIP_FLOOR
     assert 1 / defaults.alpha_min == 255
 
 
@@ -98,7 +101,7 @@ def test_a_singular_footprint_is_rejected_and_breaks_no_gradient():
     flat = replace(
         flat, dilation=0.0, splats=replace(flat.splats, scales=torch.zeros(1, 3).double())
     )
-    inputs, leaves = scenes.leaves(replace(flat, antialiasing=True))
+    inputs, leaves = scenes.leaves(replace(flat, compensation="antialiasing"))
     drawn = draw(inputs)
     loss(drawn).backward()
     assert drawn.radii.tolist() == [0]
@@ -122,7 +125,7 @@ def test_radius_of_a_round_splat_carries_the_hosts_floor_under_the_root():
 def test_tile_rectangle_is_the_hosts_integer_arithmetic(x):
     inputs = scenes.one_splat((x, 8.0), sigma=(2.0, 2.0), width=40, height=20, dtype=F64)
     camera = camera_of(inputs)
-    prints = project.project(camera, gaussians_of(inputs), None, Options())
+    prints = project.project(camera, gaussians_of(inputs.splats), Options())
     # Exactly at x, so that the boundary cases are those meant.
     prints = replace(prints, mean2d=torch.tensor([[x, 8.0]], dtype=F64))
     radius = int(prints.radius.item())
@@ -185,7 +188,7 @@ def test_a_pixel_goes_on_while_enough_light_is_left():
 
 def test_a_negative_squared_distance_is_skipped_and_overflows_nothing():
     inputs = scenes.one_splat(dtype=F64)
-    prints = project.project(camera_of(inputs), gaussians_of(inputs), None, Options())
+    prints = project.project(camera_of(inputs), gaussians_of(inputs.splats), Options())
     conic = torch.tensor([[-9.0, 0.0, -9.0]], dtype=F64, requires_grad=True)
     pixels = torch.tensor([[8.0, 9.0], [20.0, 30.0]], dtype=F64)
     found = fragments(replace(prints, conic=conic), pixels, torch.tensor([0.1]).double(), Options())
@@ -230,12 +233,104 @@ def test_scale_modifier_scales_scales_and_leaves_given_covariances():
 
 def test_antialiasing_dims_by_the_root_of_the_determinants_ratio():
     base = scenes.one_splat(sigma=(0.5, 1.0), opacity=0.8, dtype=F64)
-    sharp = replace(base, antialiasing=True)
+    sharp = replace(base, compensation="antialiasing")
     factor = math.sqrt(0.25 * 1.0 / (0.55 * 1.3))
     assert draw(sharp).alpha[0, 8, 8].item() == pytest.approx(0.8 * factor, rel=1e-5)
     assert torch.equal(draw(sharp).radii, draw(base).radii)
     thin = replace(sharp, splats=replace(sharp.splats, scales=torch.full((1, 3), 1e-9).double()))
     assert draw(thin).alpha[0, 8, 8].item() == pytest.approx(0.8 * math.sqrt(2.5e-5), abs=1e-3)
+
+
+def test_mip_dims_by_its_own_ratio_and_leaves_out_what_is_too_small():
+    base = scenes.one_splat(sigma=(0.5, 1.0), opacity=0.8, dtype=F64)
+    mip = replace(base, compensation="mip", dilation=0.1)
+    factor = math.sqrt(0.25 / (0.35 * 1.1 + 1e-6) + 1e-6)
+    assert draw(mip).alpha[0, 8, 8].item() == pytest.approx(0.8 * factor, rel=1e-9)
+    for side, draws in ((0.0316, False), (0.0317, True)):  # 1e-6 is the square of 0.001
+        small = scenes.one_splat(sigma=(side, side), opacity=0.9, dtype=F64)
+        inputs, leaves = scenes.leaves(replace(small, compensation="mip", dilation=0.0))
+        drawn = draw(inputs)
+        assert (drawn.fragments.sum() > 0).item() is draws
+        assert drawn.radii.item() > 0
+        loss(drawn).backward()
+        assert (leaves["opacities"].grad != 0).item() is draws
+        assert all(leaf.grad.isfinite().all() for leaf in leaves.values())
+
+
+@pytest.mark.parametrize("near", [0.0, 0.2, 2.5])
+def test_the_near_plane_is_the_dialects(near):
+    scene = replace(scenes.stack([0.5, 0.5, 0.5], dtype=F64), near=near)  # depths 2, 2.5, 3
+    drawn = draw(scene)
+    assert (drawn.radii > 0).tolist() == [near < 2, near < 2.5, True]
+    assert drawn.fragments[8, 8] == 1 + (near < 2) + (near < 2.5)
+
+
+def test_pixels_are_sampled_at_their_offsets_and_cut_there():
+    scene = scenes.one_splat((8.0, 8.0), sigma=(2.0, 1.0), opacity=0.9, dtype=F64)
+    offsets = torch.zeros(17, 17, 2, dtype=F64)
+    offsets[8, 10] = torch.tensor([-1.5, 0.25])
+    offsets[3, 3] = torch.tensor([5.0, 5.0])
+    tau = torch.tensor([0.9], dtype=F64)
+    whole, cut = draw(replace(scene, sample_offsets=offsets)), draw(scene, tau)
+    falloff = math.exp(-(0.25 / 4.3 + 0.0625 / 1.3) / 2)
+    assert whole.alpha[0, 8, 10].item() == pytest.approx(0.9 * falloff)
+    assert whole.alpha[0, 3, 3].item() == pytest.approx(0.9)
+    assert cut.fragments.nonzero().tolist() == [[8, 8]]
+    shifted = draw(replace(scene, sample_offsets=offsets), tau)
+    assert shifted.fragments.nonzero().tolist() == [[3, 3], [8, 8], [8, 10]]
+
+
+def test_of_equal_weights_the_first_in_depth_order_wins():
+    scene = footprints_of(scenes.stack([1 / 3, 0.25, 0.4], dtype=F64))
+    scene.splats.means2d[:] = 8.0
+    scene.splats.depths[:2] = torch.tensor([2.0, 1.0])  # 1/4 of the light, 1/3 of 3/4, 2/5 of 1/2
+    drawn = draw(scene)
+    assert drawn.winners[8, 8] == 1
+    assert drawn.winners[0, 0] == -1
+    assert drawn.wins_per_gaussian.sum() == (drawn.winners >= 0).sum()
+
+
+def test_footprints_draw_what_the_splats_do_that_they_were_projected_from():
+    for seed, kind in enumerate(({}, {"compensation": "mip"}, {"features": 3, "offsets": True})):
+        scene = scenes.random_scene(seed, 60, 37, 21, dtype=F64, **kind)
+        tau = scenes.random_thresholds(seed, 60, dtype=F64)
+        whole, prints = draw(scene, tau), draw(footprints_of(scene), tau)
+        for name in ("image", "invdepth", "alpha", "fragments", "fragments_per_gaussian"):
+            assert torch.equal(getattr(whole, name), getattr(prints, name)), name
+        assert not prints.radii.any()
+
+
+def test_footprints_that_cannot_be_drawn_are_culled():
+    scene = footprints_of(scenes.stack([0.5] * 5, dtype=F64))
+    splats = scene.splats
+    splats.conics[0, 0] = -1.0
+    splats.conics[1, 1] = 9.0
+    splats.depths[2] = 0.0
+    splats.tiles[3] = torch.tensor([1, 1, 1, 2], dtype=torch.int32)
+    drawn = draw(scene)
+    assert (drawn.fragments_per_gaussian > 0).tolist() == [False, False, False, False, True]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"near": -1.0},
+        {"near": math.nan},
+        {"alpha_max": 1.1},
+        {"compensation": "some"},
+        {"sample_offsets": torch.zeros(17, 16, 2)},
+        {"absolute_gradient": True, "means2d_hook": torch.zeros(1, 2)},
+    ],
+)
+def test_inputs_of_no_dialect_are_refused(change):
+    with pytest.raises(InputError):
+        replace(scenes.one_splat(), **change)
+
+
+@pytest.mark.parametrize("channels", [0, 9])
+def test_features_are_one_to_eight(channels):
+    with pytest.raises(InputError, match="1 to 8"):
+        replace(scenes.one_splat().splats, features=torch.zeros(1, channels))
 
 
 def test_quaternions_are_used_as_given():

@@ -42,9 +42,9 @@ def loss_of(drawn):
 
 def eligible(inputs, thresholds):
     """(K, H W) bool: the pairs that thresholds and the 1/255 skip let through, tiles aside."""
-    camera, gaussians, options = camera_of(inputs), gaussians_of(inputs), Options()
+    camera, gaussians, options = camera_of(inputs), gaussians_of(inputs.splats), Options()
     rows = project.rows_in_front(camera, gaussians.means, options.near)
-    prints = project.project(camera, gaussians.take(rows), None, options)
+    prints = project.project(camera, gaussians.take(rows), options)
     ys, xs = torch.arange(HEIGHT, dtype=F64), torch.arange(WIDTH, dtype=F64)
     pixels = torch.cartesian_prod(ys, xs).flip(1)
     return fragments(prints, pixels, thresholds[rows], options).drawn
@@ -61,8 +61,9 @@ def test_raising_thresholds_never_makes_a_pair_eligible(seed, rise):
     assert not (eligible(inputs, high) & ~eligible(inputs, low)).any()
     # With the pixel's stop out of the way, drawn is eligible in the host's tiles.
     options = Options(transmittance_min=0)
+    gaussians = gaussians_of(inputs.splats)
     counts = [
-        render(camera_of(inputs), gaussians_of(inputs), tau, options=options).fragments_per_gaussian
+        render(camera_of(inputs), gaussians, tau, options=options).fragments_per_gaussian
         for tau in (low, high)
     ]
     assert (counts[1] <= counts[0]).all()
@@ -106,7 +107,8 @@ def test_thresholds_act_on_falloff_and_not_on_opacity():
 
 
 def test_the_visibility_skip_uses_the_compensated_opacity():
-    scene = replace(scenes.one_splat(sigma=(0.6, 0.6), opacity=0.5, dtype=F64), antialiasing=True)
+    scene = scenes.one_splat(sigma=(0.6, 0.6), opacity=0.5, dtype=F64)
+    scene = replace(scene, compensation="antialiasing")
     dim = 0.5 * 0.36 / 0.66
     reach = math.sqrt(0.66 * 2 * math.log(255 * dim))
     inside = sum(math.hypot(x - 8, y - 8) <= reach for x in range(17) for y in range(17))
@@ -164,9 +166,9 @@ def explicit_gradients(inputs, tau, pressure):
 
 @pytest.mark.parametrize("pressure", [0.0, 300.0])
 @pytest.mark.parametrize("seed", [11, 12])
-@pytest.mark.parametrize("antialiasing", [False, True])
-def test_the_threshold_gradient_is_the_explicit_rim_sum(seed, pressure, antialiasing):
-    inputs = scene_of(seed, antialiasing=antialiasing)
+@pytest.mark.parametrize("compensation", ["none", "antialiasing", "mip"])
+def test_the_threshold_gradient_is_the_explicit_rim_sum(seed, pressure, compensation):
+    inputs = scene_of(seed, compensation=compensation)
     tau = scenes.random_thresholds(seed, N, dtype=F64).requires_grad_()
     drawn = draw(inputs, tau)
     (loss_of(drawn) + pressure * drawn.fragments_per_pixel).backward()
