@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -51,6 +51,47 @@ class FixedPressure:
 
     def observe(self, progress: float, ratio: float) -> None:
         """A fixed pressure learns nothing."""
+
+
+@dataclass
+class StepViews:
+    """The views that one training step draws: a host that trains in batches draws several.
+
+    It divides each view's loss by their number, so the pressure must be their mean as well. How
+    many there will be shows only in the end: the step before tells, and the first step takes one.
+
+    Attributes:
+        expected: views a step.
+    """
+
+    expected: int = 1
+    _fragments: list[float] = field(default_factory=list)
+    _losses: list[float] = field(default_factory=list)
+
+    def begin(self) -> None:
+        """A new step."""
+        self.expected = len(self._fragments) or self.expected
+        self._fragments, self._losses = [], []
+
+    def draw(self, fragments: float) -> None:
+        """A view was drawn with gradients, so many fragments per pixel."""
+        self._fragments.append(fragments)
+        self._losses.append(math.nan)
+
+    def lose(self, loss: float) -> None:
+        """The loss of the view drawn last went backward."""
+        self._losses[-1:] = [loss]
+
+    @property
+    def fragments(self) -> float:
+        """Per pixel, the mean over the views so far."""
+        return sum(self._fragments) / len(self._fragments)
+
+    @property
+    def loss(self) -> float:
+        """The sum over the views so far, of those whose loss is known."""
+        known = [loss for loss in self._losses if not math.isnan(loss)]
+        return sum(known) if known else math.nan
 
 
 class PressureController:

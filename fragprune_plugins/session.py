@@ -36,6 +36,7 @@ from fragprune_plugins.pressure import (
     TARGET_TOLERANCE,
     FixedPressure,
     Pressure,
+    StepViews,
     calibrate,
 )
 from fragprune_plugins.schedule import Schedule, Settings, StepPlan
@@ -61,10 +62,10 @@ class StepStats:
 
     Attributes:
         step: of the learning, from 1.
-        fragments_per_pixel: drawn in this step's view.
+        fragments_per_pixel: drawn, mean over this step's views.
         pressure: lambda used.
         threshold_median: over all Gaussians, in falloff.
-        loss: the host's own, without the pressure.
+        loss: the host's own, without the pressure, summed over this step's views.
     """
 
     step: int
@@ -113,6 +114,7 @@ class _ModelState:
     drawn: dict[int, float] = field(default_factory=dict)  # view -> fragments/px, last visit
     views: dict[int, Callable[[], Any]] = field(default_factory=dict)  # view -> its last render
     last_drawn: float = 0.0
+    step_views: StepViews = field(default_factory=StepViews)
     held: bool = False  # thresholds met their target and stay
     loaded: weakref.ReferenceType[Any] | None = None  # the means a sidecar's thresholds came with
     stats: StepStats | None = None
@@ -454,6 +456,7 @@ class Session:
         if state is None or not self.learn:
             return result
         self._report(state)
+        state.step_views.begin()
         state.steps += 1
         step = state.steps - self.from_step
         state.plan = self.schedule.at(step) if step > 0 else None
@@ -566,22 +569,25 @@ class Session:
         plan = state.plan
         assert plan is not None
         fragments = state.drawn[view] = state.last_drawn
+        state.step_views.draw(fragments)
         self.pressure.observe(plan.progress, fragments / max(state.baseline[view], 1e-9))
         state.stats = StepStats(
             step=state.steps - self.from_step,
-            fragments_per_pixel=fragments,
+            fragments_per_pixel=state.step_views.fragments,
             pressure=self.pressure.value,
             threshold_median=float(state.store.values.detach().median()),
+            loss=state.step_views.loss,
         )
         if self.pressure.value == 0 or state.held or not outputs.image.requires_grad:
             return outputs
-        term = outputs.fragments_per_pixel * self.pressure.value
+        term = outputs.fragments_per_pixel * (self.pressure.value / state.step_views.expected)
         return replace(outputs, image=_AddToLoss.apply(outputs.image, term))  # type: ignore[no-untyped-call]
 
     def _on_loss(self, seam: Seam, wrapped: Any, tensor: Any, args: Any, kwargs: Any) -> Any:
         state = self._last_state
         if state is not None and state.stats is not None and tensor.numel() == 1:
-            state.stats = replace(state.stats, loss=float(tensor.detach()))
+            state.step_views.lose(float(tensor.detach()))
+            state.stats = replace(state.stats, loss=state.step_views.loss)
         return wrapped(*args, **kwargs)
 
     def _on_metric(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:

@@ -63,3 +63,42 @@ def test_more_pressure_means_fewer_fragments():
                 host.step(model, camera, iteration)
             drawn.append(host.finish().fragments_after)
     assert drawn[1] < 0.8 * drawn[0]
+
+
+def gradients(host, model, cameras, iteration):
+    """Of thresholds and opacities, after one step's views; the loss is the mean over them."""
+    model.update_learning_rate(iteration)
+    store = host.store(model)
+    with torch.no_grad():
+        store.logits.copy_(torch.linspace(-3, 0, len(store)))
+    leaves = [store.logits, model._opacity]
+    for leaf in leaves:
+        leaf.grad = None
+    for camera in cameras:
+        image = host.render(camera, model)["render"]
+        ((image - camera.original_image).abs().mean() / len(cameras)).backward()
+    return [leaf.grad.clone() for leaf in leaves]
+
+
+def test_a_step_of_several_views_feels_the_mean_of_their_pressures():
+    with joint(Settings(iterations=9, pressure=0.02)) as host:
+        model = host.model(40)
+        views = [host.camera(), host.camera(side=0.4), host.camera(side=-0.4)]
+        alone = []
+        for number, view in enumerate(views, 1):
+            gradients(host, model, [view], number)  # so that the next step expects one view
+            alone.append(gradients(host, model, [view], number))
+        gradients(host, model, views, 7)
+        together = gradients(host, model, views, 8)
+        for index, grad in enumerate(together):
+            expected = torch.stack([grads[index] for grads in alone]).mean(dim=0)
+            torch.testing.assert_close(grad, expected, rtol=1e-5, atol=1e-9)
+        host.finish()
+        single, batch = host.curves[-3:-1], host.curves[-1]
+        assert batch["fragments_per_pixel"] == pytest.approx(
+            sum(host.curves[i]["fragments_per_pixel"] for i in (1, 3, 5)) / 3
+        )
+        assert batch["loss"] == pytest.approx(
+            sum(host.curves[i]["loss"] for i in (1, 3, 5)) / 3, rel=1e-5
+        )
+        assert len(single) == 2
