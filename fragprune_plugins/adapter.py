@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -70,6 +71,20 @@ class HostCall:
     def __getitem__(self, name: str) -> Tensor:
         value: Tensor = self.arguments[name]
         return value
+
+
+@dataclass
+class RowTrace:
+    """Where rows came from, once a host has rearranged them.
+
+    Attributes:
+        origins: (M,) int64, for each row of the model as it is now, the row it was or was copied
+            from; None where nothing happened.
+        fresh: (M,) bool, True for rows that are new Gaussians or were made over.
+    """
+
+    origins: Tensor | None = None
+    fresh: Tensor | None = None
 
 
 class Dialect(ABC):
@@ -204,9 +219,23 @@ class HostAdapter(ABC):
     def opacities(self, model: Any) -> Tensor:
         """(N,) activated opacities."""
 
+    def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
+        """The model that a seam's call is about: what the method was called on, unless a host has
+        trainers, or functions, that change models."""
+        return instance
+
     @abstractmethod
-    def optimizers(self, model: Any) -> list[Any]:
-        """The host's optimizers of this model, the main one first."""
+    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
+        """The host's optimizers of a model, the main one first.
+
+        Args:
+            model: that is trained.
+            arguments: of the ATTACH seam's call, which is over, "self" among them.
+        """
+
+    def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
+        """What a param group is called in ``trained_groups``; None for one without a name."""
+        return group.get("name")
 
     @abstractmethod
     def trained_groups(self, train: str) -> frozenset[str] | None:
@@ -219,6 +248,20 @@ class HostAdapter(ABC):
     @abstractmethod
     def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
         """Whether appended rows are copies of those parents; asked before they are appended."""
+
+    def stand_still(self, wrapped: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+        """What a STILL seam returns in stage 2 in place of the host's call, which is not made."""
+        return None
+
+    @contextmanager
+    def tracing(self, model: Any, arguments: Mapping[str, Any]) -> Iterator[RowTrace]:
+        """Around the call of a REARRANGE seam: have the host's own code carry row numbers along.
+
+        Yields:
+            The trace; it must be complete once the block is left.
+        """
+        raise NotImplementedError(f"{self.name} has a REARRANGE seam and no tracing()")
+        yield
 
     @abstractmethod
     def checkpoint_state(self, capture: Any) -> dict[str, Any]:

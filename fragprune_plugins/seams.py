@@ -25,6 +25,7 @@ class Role(Enum):
     APPEND = "append rows"
     CHOICE = "note the rows the host has drawn as parents of what it appends or overwrites next"
     COPY = "overwrite rows with copies of others; stands still in stage 2"
+    REARRANGE = "keep, copy and append rows in one call; stands still in stage 2"
     FORGET = "drop the moments of rows"
     STILL = "stand still in stage 2: what would change frozen parameters or rows"
     SAVE = "write the sidecar beside the model's file"

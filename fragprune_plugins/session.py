@@ -109,6 +109,7 @@ class _ModelState:
     plan: StepPlan | None = None
     pending_parents: Tensor | None = None
     prepared: bool = False
+    optimizers: list[weakref.ReferenceType[Any]] = field(default_factory=list)
     base_rates: dict[str, float] = field(default_factory=dict)
     baseline: dict[int, float] = field(default_factory=dict)  # view -> untruncated fragments/px
     drawn: dict[int, float] = field(default_factory=dict)  # view -> fragments/px, last visit
@@ -135,6 +136,13 @@ class _AddToLoss(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
         (grad,) = grads
         return grad, torch.ones(ctx.term_shape, dtype=grad.dtype, device=grad.device)
+
+
+def _named(function: Any, args: Any, kwargs: Any) -> dict[str, Any]:
+    """The arguments of a call by name, those left out included; "self" is what it was called on."""
+    bound = signature(function).bind(*args, **kwargs)
+    bound.apply_defaults()
+    return {"self": getattr(function, "__self__", None), **bound.arguments}
 
 
 def _mean(figures: dict[int, float]) -> float | None:
@@ -223,7 +231,7 @@ class Session:
         try:
             self._install_stand_ins()
             for seam in self.adapter.seams_for(self.repo):
-                self._ledger.wrap(seam, partial(_HANDLERS[seam.role], self, seam))
+                self._ledger.wrap(seam, partial(self._enter, seam))
         except BaseException:
             self._take_back()
             raise
@@ -353,6 +361,13 @@ class Session:
 
     # -- roles -----------------------------------------------------------------------------------
 
+    def _enter(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
+        """Hand a call to the handler of its role: as it is, or with the model it is about."""
+        if seam.role in _OF_CALLS:
+            return _OF_CALLS[seam.role](self, seam, wrapped, instance, args, kwargs)
+        model = self.adapter.model_of(instance, _named(wrapped, args, kwargs))
+        return _OF_MODELS[seam.role](self, seam, wrapped, model, args, kwargs)
+
     def _learned(self, state: _ModelState) -> int:
         return max(0, state.steps - self.from_step) if self.learn else 0
 
@@ -373,6 +388,7 @@ class Session:
         state = self._models.get(model)
         kept = state is not None and self._is_followed(model, state)  # before a new optimizer
         result = wrapped(*args, **kwargs)
+        optimizers = self.adapter.optimizers(model, _named(wrapped, args, kwargs))
         rows = self.adapter.rows(model)
         if state is not None and not kept:
             before = len(state.store)
@@ -386,11 +402,8 @@ class Session:
             )
             state = self._models[model] = _ModelState(store)
         self._follow(model, state)
-        state.base_rates = {
-            group["name"]: group["lr"]
-            for group in self.adapter.optimizers(model)[0].param_groups
-            if "name" in group
-        }
+        state.optimizers = [weakref.ref(optimizer) for optimizer in optimizers]
+        state.base_rates = {name: group["lr"] for name, group in self._groups(model, state) if name}
         self._hook_optimizers(model, state)
         self.hook.fragprune_attached(model=model, store=state.store)
         return result
@@ -398,41 +411,42 @@ class Session:
     def _is_followed(self, model: Any, state: _ModelState) -> bool:
         """Whether the means are the very tensor that was loaded, or trained until now."""
         means = self.adapter.means(model)
-        optimizers = [each for each in self.adapter.optimizers(model) if each is not None]
-        groups = [group for optimizer in optimizers for group in optimizer.param_groups]
         known = [state.loaded() if state.loaded else None]
-        known += [parameter for group in groups for parameter in group["params"]]
+        known += [each for _, group in self._groups(model, state) for each in group["params"]]
         return any(each is means for each in known)
+
+    def _groups(self, model: Any, state: _ModelState) -> list[tuple[str | None, dict[str, Any]]]:
+        """Param groups of every optimizer, the main one's first, with the adapter's names."""
+        optimizers = [optimizer for each in state.optimizers if (optimizer := each()) is not None]
+        groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+        return [(self.adapter.group_name(model, group), group) for group in groups]
 
     def _follow(self, model: Any, state: _ModelState) -> None:
         self._last, self._last_state = weakref.ref(model), state
 
     def _hook_optimizers(self, model: Any, state: _ModelState) -> None:
         reference = weakref.ref(model)
-        for index, optimizer in enumerate(self.adapter.optimizers(model)):
-            if optimizer in state.hooked:
+        for optimizer in (each() for each in state.optimizers):
+            if optimizer is None or optimizer in state.hooked:
                 continue
             state.hooked.add(optimizer)
-            pre = partial(self._before_step, reference, index == 0)
-            state.hooks.append(optimizer.register_step_pre_hook(pre))
-            if index == 0:
-                post = partial(self._after_step, reference)
-                state.hooks.append(optimizer.register_step_post_hook(post))
+            before = partial(self._before_step, reference)
+            state.hooks.append(optimizer.register_step_pre_hook(before))
+            after = partial(self._after_step, reference)
+            state.hooks.append(optimizer.register_step_post_hook(after))
 
-    def _before_step(self, reference: Any, main: bool, optimizer: Any, *_: Any) -> None:
+    def _before_step(self, reference: Any, optimizer: Any, *_: Any) -> None:
         """Stage 2: parameters that do not train get no gradient, so no optimizer touches them."""
         model = reference()
         if model is None or not self._standing_still(model):
             return
         trained = self.adapter.trained_groups(self.settings.train)
-        if trained is None and not main:
-            return
         plan = self._models[model].plan
         rates = self._models[model].base_rates
         decay = 0.1**plan.progress if plan else 1.0
         for group in optimizer.param_groups:
-            name = group.get("name")
-            if trained is not None and (not main or name not in trained):
+            name = self.adapter.group_name(model, group)
+            if trained is not None and name not in trained:
                 for parameter in group["params"]:
                     parameter.grad = None
             elif name == "opacity" and plan and plan.opacity_lr is not None:
@@ -441,13 +455,13 @@ class Session:
                 group["lr"] = rates[name] * decay
 
     def _after_step(self, reference: Any, *_: Any) -> None:
-        """The store steps once per counted step, however often the host's hook fires."""
+        """The store steps once per counted step, however many optimizers the host steps."""
         model = reference()
         state = self._models.get(model) if model is not None else None
-        if state is None or state.plan is None or state.stepped == state.steps:
+        if state is None or state.stepped == state.steps:
             return
         state.stepped = state.steps
-        if state.plan.learn and self.settings.truncate and not state.held:
+        if state.plan and state.plan.learn and self.settings.truncate and not state.held:
             state.store.step(state.plan.threshold_lr)
 
     def _on_step(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
@@ -497,9 +511,9 @@ class Session:
         trained = self.adapter.trained_groups(self.settings.train)
         if trained is None:
             return
-        for group in self.adapter.optimizers(model)[0].param_groups:
+        for name, group in self._groups(model, self._models[model]):
             for parameter in group["params"]:
-                parameter.requires_grad_(group.get("name") in trained)
+                parameter.requires_grad_(name in trained)
 
     def _report(self, state: _ModelState) -> None:
         stats, state.stats = state.stats, None  # first, so that an observer may raise
@@ -508,8 +522,9 @@ class Session:
             self.hook.fragprune_step(stats=stats)
 
     def _on_view(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
-        arguments = signature(wrapped).bind(*args, **kwargs).arguments
-        camera, model = (arguments[name] for name in seam.needs[:2])
+        arguments = _named(wrapped, args, kwargs)
+        camera = arguments[seam.needs[0]]
+        model = arguments[seam.needs[1]] if len(seam.needs) > 1 else instance
         state, view = self._models.get(model), self.adapter.view(camera)
         again = partial(self._render, wrapped, model, view, args, kwargs)
         measured = self.settings.target_speedup is not None  # keeps the model alive: only if needed
@@ -656,8 +671,8 @@ class Session:
             source, state.pending_parents = state.pending_parents, None
         if source is None:  # nothing to overwrite, or nothing to copy
             return result
-        groups = self.adapter.optimizers(model)[0].param_groups
-        rows = {group["name"]: group["params"][0].detach()[target] for group in groups}
+        groups = [(name, group) for name, group in self._groups(model, state) if name]
+        rows = {name: group["params"][0].detach()[target] for name, group in groups}
         if len(source) != len(target) or not self.adapter.check_children(model, rows, source):
             raise AlignmentError(
                 str(seam),
@@ -688,12 +703,29 @@ class Session:
             self._changed(state.store, "keep", before)
         return result
 
+    def _on_rearrange(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+        if self._standing_still(model):
+            return None
+        state = self._models.get(model)
+        if state is None:
+            return wrapped(*args, **kwargs)
+        with self.adapter.tracing(model, _named(wrapped, args, kwargs)) as trace:
+            result = wrapped(*args, **kwargs)
+        if trace.origins is not None and trace.fresh is not None:
+            before = len(state.store)
+            state.store.rearrange(trace.origins, trace.fresh)
+            self._changed(state.store, "rearrange", before)
+        self._expect_rows(model, state, str(seam))
+        return result
+
     def _changed(self, store: ThresholdStore, operation: str, before: int) -> None:
         change = PopulationChange(operation, before, len(store))
         self.hook.fragprune_population_changed(store=store, change=change)
 
     def _on_still(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
-        return None if self._standing_still(model) else wrapped(*args, **kwargs)
+        if self._standing_still(model):
+            return self.adapter.stand_still(wrapped, _named(wrapped, args, kwargs))
+        return wrapped(*args, **kwargs)
 
     def _on_save(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         result = wrapped(*args, **kwargs)
@@ -763,19 +795,23 @@ class Session:
             )
 
 
-_HANDLERS: dict[Role, Callable[..., Any]] = {
+_OF_CALLS: dict[Role, Callable[..., Any]] = {
     Role.SCENE: Session._on_scene,
-    Role.ATTACH: Session._on_attach,
-    Role.STEP: Session._on_step,
     Role.VIEW: Session._on_view,
     Role.RASTERIZE: Session._on_rasterize,
     Role.LOSS: Session._on_loss,
     Role.METRIC: Session._on_metric,
+}
+
+_OF_MODELS: dict[Role, Callable[..., Any]] = {
+    Role.ATTACH: Session._on_attach,
+    Role.STEP: Session._on_step,
     Role.PARENTS: Session._on_parents,
     Role.KEEP: Session._on_keep,
     Role.APPEND: Session._on_append,
     Role.CHOICE: Session._on_choice,
     Role.COPY: Session._on_copy,
+    Role.REARRANGE: Session._on_rearrange,
     Role.FORGET: Session._on_forget,
     Role.STILL: Session._on_still,
     Role.SAVE: Session._on_save,

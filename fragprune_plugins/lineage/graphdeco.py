@@ -198,7 +198,7 @@ class GraphdecoAdapter(HostAdapter):
         opacities: Tensor = model.get_opacity
         return opacities.detach().reshape(-1)
 
-    def optimizers(self, model: Any) -> list[Any]:
+    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
         """The main one, and the exposures' where the revision has it."""
         extra = getattr(model, "exposure_optimizer", None)
         return [model.optimizer, *([extra] if extra is not None else [])]
