@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -118,6 +119,13 @@ class Dialect(ABC):
             draw: answers a host call without thresholds.
         """
 
+    def present(self, package: str) -> bool:
+        """Whether the host can import this compiled package of its own here."""
+        try:
+            return find_spec(package) is not None
+        except ValueError:  # a module without a spec is a stand-in somebody else put there
+            return True
+
     def spares(self) -> dict[str, ModuleType]:
         """Stand-ins for what the host imports and can do without, used on a CPU where absent."""
         return {}
@@ -128,7 +136,8 @@ class CommandLine:
     """How a host's training script is told what we need to tell it.
 
     Attributes:
-        scripts: file names of training scripts; others (render.py) only get thresholds applied.
+        scripts: paths of training scripts in the checkout, the usual one first; others (render.py)
+            only get thresholds applied.
         iterations: flag of the total number of iterations.
         output: flags of the output folder.
         source: flags of the data folder.
@@ -161,6 +170,9 @@ class HostAdapter(ABC):
     name: str
     info: HostInfo
     seams: tuple[Seam, ...]
+    steps_by_rendering = False
+    """The host does not call the STEP seam in every iteration: where it did not, the first view
+    that it draws with gradients begins the step."""
 
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
         """The seams of this revision; all of ``seams`` unless a host says otherwise."""
@@ -242,8 +254,13 @@ class HostAdapter(ABC):
         """Names of param groups that stage 2 trains for ``--train``; None for all of them."""
 
     @abstractmethod
-    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
-        """Rows that a densify method is about to copy, one per row it will append."""
+    def parents(
+        self, model: Any, method: str, arguments: Mapping[str, Any]
+    ) -> Tensor | tuple[Tensor, ...]:
+        """Rows that a densify method is about to copy, one per row it will append.
+
+        A tuple where the method appends several times, in its order.
+        """
 
     @abstractmethod
     def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:

@@ -107,7 +107,8 @@ class _ModelState:
     store: ThresholdStore
     steps: int = 0
     plan: StepPlan | None = None
-    pending_parents: Tensor | None = None
+    begun: bool = False  # a step whose loss has not gone backward yet
+    pending_parents: list[Tensor] = field(default_factory=list)  # of each append to come
     prepared: bool = False
     optimizers: list[weakref.ReferenceType[Any]] = field(default_factory=list)
     base_rates: dict[str, float] = field(default_factory=dict)
@@ -332,10 +333,7 @@ class Session:
         for name, module in self._dialect.modules(self._draw).items():
             package = name.split(".")[0]
             if self._drop_in is None and package not in self._stand_ins:
-                try:
-                    wanted = find_spec(package) is None
-                except ValueError:  # a module without a spec is a stand-in somebody else put there
-                    wanted = False
+                wanted = not self._dialect.present(package)
             else:
                 wanted = package in self._stand_ins if self._drop_in is None else self._drop_in
             if not wanted:
@@ -469,8 +467,14 @@ class Session:
         state = self._models.get(model)
         if state is None or not self.learn:
             return result
+        if not (self.adapter.steps_by_rendering and state.begun):
+            self._begin_step(model, state)
+        return self.adapter.still_rate(result) if self._standing_still(model) else result
+
+    def _begin_step(self, model: Any, state: _ModelState) -> None:
         self._report(state)
         state.step_views.begin()
+        state.begun = True
         state.steps += 1
         step = state.steps - self.from_step
         state.plan = self.schedule.at(step) if step > 0 else None
@@ -479,11 +483,9 @@ class Session:
                 self.adapter.prepare_stage2(model, self.output)
                 state.prepared = True
             self._freeze(model)
-            result = self.adapter.still_rate(result)
         if state.plan and state.plan.learn and self.settings.truncate:
             state.store.open(self.adapter.opacities(model))
             self._meet_target(state)
-        return result
 
     def _meet_target(self, state: _ModelState) -> None:
         """Late in the run, and once more at its end, shift all thresholds onto the target."""
@@ -526,6 +528,9 @@ class Session:
         camera = arguments[seam.needs[0]]
         model = arguments[seam.needs[1]] if len(seam.needs) > 1 else instance
         state, view = self._models.get(model), self.adapter.view(camera)
+        learning = self.learn and state is not None and torch.is_grad_enabled()
+        if learning and self.adapter.steps_by_rendering and not state.begun:
+            self._begin_step(model, state)
         again = partial(self._render, wrapped, model, view, args, kwargs)
         measured = self.settings.target_speedup is not None  # keeps the model alive: only if needed
         if measured and state is not None and state.plan is not None and torch.is_grad_enabled():
@@ -600,9 +605,11 @@ class Session:
 
     def _on_loss(self, seam: Seam, wrapped: Any, tensor: Any, args: Any, kwargs: Any) -> Any:
         state = self._last_state
-        if state is not None and state.stats is not None and tensor.numel() == 1:
-            state.step_views.lose(float(tensor.detach()))
-            state.stats = replace(state.stats, loss=state.step_views.loss)
+        if state is not None and tensor.numel() == 1:
+            state.begun = False
+            if state.stats is not None:
+                state.step_views.lose(float(tensor.detach()))
+                state.stats = replace(state.stats, loss=state.step_views.loss)
         return wrapped(*args, **kwargs)
 
     def _on_metric(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
@@ -619,18 +626,19 @@ class Session:
         bound = signature(wrapped).bind(*args, **kwargs)
         bound.apply_defaults()
         method = seam.attribute.split(".")[-1]
-        state.pending_parents = self.adapter.parents(model, method, bound.arguments)
+        parents = self.adapter.parents(model, method, bound.arguments)
+        state.pending_parents = list(parents) if isinstance(parents, tuple) else [parents]
         try:
             return wrapped(*args, **kwargs)
         finally:
-            state.pending_parents = None
+            state.pending_parents = []
 
     def _on_append(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         state = self._models.get(model)
         if state is None:
             return wrapped(*args, **kwargs)
         tensors = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
-        parents, state.pending_parents = state.pending_parents, None
+        parents = state.pending_parents.pop(0) if state.pending_parents else None
         count = len(next(iter(tensors.values())))
         copies = parents is None or (
             len(parents) == count and self.adapter.check_children(model, tensors, parents)
@@ -653,7 +661,7 @@ class Session:
         state = self._models.get(model)
         if state is not None:
             chosen = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
-            state.pending_parents = chosen.detach().clone()
+            state.pending_parents = [chosen.detach().clone()]
         return result
 
     def _on_copy(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
@@ -664,13 +672,14 @@ class Session:
             return wrapped(*args, **kwargs)
         mask = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
         target = mask.nonzero()[:, 0]
-        state.pending_parents = None
+        state.pending_parents = []
         try:
             result = wrapped(*args, **kwargs)
         finally:
-            source, state.pending_parents = state.pending_parents, None
-        if source is None:  # nothing to overwrite, or nothing to copy
+            drawn, state.pending_parents = state.pending_parents, []
+        if not drawn:  # nothing to overwrite, or nothing to copy
             return result
+        (source,) = drawn
         groups = [(name, group) for name, group in self._groups(model, state) if name]
         rows = {name: group["params"][0].detach()[target] for name, group in groups}
         if len(source) != len(target) or not self.adapter.check_children(model, rows, source):
