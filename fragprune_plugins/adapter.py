@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -132,33 +133,65 @@ class Dialect(ABC):
 
 
 @dataclass(frozen=True)
+class ConfigFile:
+    """A file whose values win over a host's command line; JSON, one object.
+
+    Attributes:
+        flag: that names it.
+    """
+
+    flag: str
+
+    def read(self, path: Path) -> dict[str, Any]:
+        """Values by argument name; OSError or ValueError where there is nothing to be read."""
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return values
+
+    def overrule(self, text: str, values: dict[str, Any]) -> str:
+        """The file's text with these values in place of its own."""
+        return json.dumps(json.loads(text) | values)
+
+
+@dataclass(frozen=True)
 class CommandLine:
     """How a host's training script is told what we need to tell it.
 
     Attributes:
         scripts: paths of training scripts in the checkout, the usual one first; others (render.py)
             only get thresholds applied.
-        iterations: flag of the total number of iterations.
+        iterations: flag, or its several spellings, of the total number of iterations.
         output: flags of the output folder.
         source: flags of the data folder.
         save_checkpoints: flag listing iterations to checkpoint at.
-        resume: flag naming the checkpoint to resume from.
+        resume: flag, or its several spellings, naming the file to resume from.
         default_iterations: of the host, read from its source.
         continues: those of the scripts that work on a checkpoint they are given: where ``resume``
             names one it is stage 1's, not ours to start stage 2 from.
-        config: flag naming a JSON file whose values the host puts over its command line; "" for
-            none.
+        config: the file whose values the host puts over its command line, where it has one.
+        save_models: flag listing the iterations to save the model at, where the host's own last one
+            is not to be relied on; "" where it is.
+        skipped: iterations that a run, fresh or resumed, counts and does not execute.
+        restarts: there are no checkpoints: ``resume`` names a model's PLY, from which a new run
+            begins. It counts from 0 and empties its output folder, so stage 2 gets one of its own.
     """
 
     scripts: tuple[str, ...]
-    iterations: str
+    iterations: str | tuple[str, ...]
     output: tuple[str, ...]
     source: tuple[str, ...]
     save_checkpoints: str
-    resume: str
+    resume: str | tuple[str, ...]
     default_iterations: int
     continues: tuple[str, ...] = ()
-    config: str = ""
+    config: ConfigFile | None = None
+    save_models: str = ""
+    skipped: int = 0
+    restarts: bool = False
+
+    def spellings(self, field: str) -> tuple[str, ...]:
+        """Every spelling of a flag, the one to use last."""
+        flags = getattr(self, field)
+        return (flags,) if isinstance(flags, str) else flags
 
 
 class HostAdapter(ABC):
@@ -170,9 +203,13 @@ class HostAdapter(ABC):
     name: str
     info: HostInfo
     seams: tuple[Seam, ...]
+    installed: tuple[str, ...] = ()
+    """Import names of the packages that are the host, where it is installed, not checked out."""
     steps_by_rendering = False
     """The host does not call the STEP seam in every iteration: where it did not, the first view
     that it draws with gradients begins the step."""
+    gradients_read: frozenset[str] = frozenset()
+    """Param groups whose gradient the host reads in every iteration: frozen, they get zeros."""
 
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
         """The seams of this revision; all of ``seams`` unless a host says otherwise."""
@@ -231,6 +268,14 @@ class HostAdapter(ABC):
     def opacities(self, model: Any) -> Tensor:
         """(N,) activated opacities."""
 
+    def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
+        """Rows (M,) int64 of the model that a rasterizer call draws, in its order; None for all.
+
+        Raises:
+            AlignmentError: the call's Gaussians cannot be told to be those rows.
+        """
+        return None
+
     def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
         """The model that a seam's call is about: what the method was called on, unless a host has
         trainers, or functions, that change models."""
@@ -253,14 +298,13 @@ class HostAdapter(ABC):
     def trained_groups(self, train: str) -> frozenset[str] | None:
         """Names of param groups that stage 2 trains for ``--train``; None for all of them."""
 
-    @abstractmethod
-    def parents(
-        self, model: Any, method: str, arguments: Mapping[str, Any]
-    ) -> Tensor | tuple[Tensor, ...]:
-        """Rows that a densify method is about to copy, one per row it will append.
+    def elsewhere(self, model: Any) -> list[Tensor]:
+        """Parameters moved by an optimizer that is out of our reach; frozen as the rest is."""
+        return []
 
-        A tuple where the method appends several times, in its order.
-        """
+    @abstractmethod
+    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
+        """Rows that a densify method is about to copy, one per row it will append, in order."""
 
     @abstractmethod
     def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:

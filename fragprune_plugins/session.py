@@ -108,7 +108,7 @@ class _ModelState:
     steps: int = 0
     plan: StepPlan | None = None
     begun: bool = False  # a step whose loss has not gone backward yet
-    pending_parents: list[Tensor] = field(default_factory=list)  # of each append to come
+    pending_parents: Tensor | None = None
     prepared: bool = False
     optimizers: list[weakref.ReferenceType[Any]] = field(default_factory=list)
     base_rates: dict[str, float] = field(default_factory=dict)
@@ -516,6 +516,10 @@ class Session:
         for name, group in self._groups(model, self._models[model]):
             for parameter in group["params"]:
                 parameter.requires_grad_(name in trained)
+                if name not in trained and name in self.adapter.gradients_read:
+                    parameter.grad = torch.zeros_like(parameter)
+        for parameter in self.adapter.elsewhere(model):
+            parameter.requires_grad_(False)
 
     def _report(self, state: _ModelState) -> None:
         stats, state.stats = state.stats, None  # first, so that an observer may raise
@@ -528,9 +532,9 @@ class Session:
         camera = arguments[seam.needs[0]]
         model = arguments[seam.needs[1]] if len(seam.needs) > 1 else instance
         state, view = self._models.get(model), self.adapter.view(camera)
-        learning = self.learn and state is not None and torch.is_grad_enabled()
-        if learning and self.adapter.steps_by_rendering and not state.begun:
-            self._begin_step(model, state)
+        if self.adapter.steps_by_rendering and state is not None and not state.begun:
+            if self.learn and torch.is_grad_enabled():
+                self._begin_step(model, state)
         again = partial(self._render, wrapped, model, view, args, kwargs)
         measured = self.settings.target_speedup is not None  # keeps the model alive: only if needed
         if measured and state is not None and state.plan is not None and torch.is_grad_enabled():
@@ -552,12 +556,13 @@ class Session:
         if rendering is None or state is None or self._paused.get():
             return wrapped(*args, **kwargs)
         call = HostCall.bind(wrapped, rasterizer.raster_settings, args, kwargs, str(seam))
-        means = call["means3D"]
-        if len(means) != len(state.store):
+        rows = self.adapter.rows_drawn(rendering[0], call)
+        means, expected = call["means3D"], len(state.store if rows is None else rows)
+        if len(means) != expected:
             raise AlignmentError(
                 f"{self.adapter.name}: rasterizer call",
                 f"{len(means)} Gaussians",
-                f"{len(state.store)}, one per threshold, or a row map",
+                f"{expected} of {len(state.store)}, one per threshold that is drawn",
                 "Report this with the host's commit.",
             )
         if state.store.neutral:
@@ -566,6 +571,7 @@ class Session:
         thresholds = self.hook.fragprune_truncate(inputs=inputs, store=state.store)
         if thresholds is None:
             return wrapped(*args, **kwargs)
+        thresholds = thresholds if rows is None else thresholds[rows]
         draw = partial(self._rasterize, state, rendering[1], thresholds)
         return self._dialect.answer(call, inputs, draw)
 
@@ -626,42 +632,48 @@ class Session:
         bound = signature(wrapped).bind(*args, **kwargs)
         bound.apply_defaults()
         method = seam.attribute.split(".")[-1]
-        parents = self.adapter.parents(model, method, bound.arguments)
-        state.pending_parents = list(parents) if isinstance(parents, tuple) else [parents]
+        state.pending_parents = self.adapter.parents(model, method, bound.arguments)
         try:
-            return wrapped(*args, **kwargs)
+            result = wrapped(*args, **kwargs)
+            left = 0 if state.pending_parents is None else len(state.pending_parents)
+            self._expect_children(seam, f"{left} selected parents without a child", not left)
+            return result
         finally:
-            state.pending_parents = []
+            state.pending_parents = None
 
     def _on_append(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         state = self._models.get(model)
         if state is None:
             return wrapped(*args, **kwargs)
         tensors = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
-        parents = state.pending_parents.pop(0) if state.pending_parents else None
-        count = len(next(iter(tensors.values())))
-        copies = parents is None or (
-            len(parents) == count and self.adapter.check_children(model, tensors, parents)
-        )
-        if not copies:
-            raise AlignmentError(
-                str(seam),
-                f"{count} new rows that are not copies of the selected parents",
-                "one child per selected parent and repeat, in the host's order",
-                "Report this with the host's commit: its densification differs.",
-            )
+        count, parents = len(next(iter(tensors.values()))), state.pending_parents
+        if parents is not None:
+            parents, rest = parents[:count], parents[count:]
+            state.pending_parents = rest if len(rest) else None  # of what is appended next
+            copies = len(parents) == count and self.adapter.check_children(model, tensors, parents)
+            what = f"{count} new rows that are not copies of the selected parents"
+            self._expect_children(seam, what, copies)
         result = wrapped(*args, **kwargs)
         before = len(state.store)
         state.store.append(count, parents)
         self._changed(state.store, "append", before)
         return result
 
+    def _expect_children(self, seam: Seam, found: str, right: bool) -> None:
+        if not right:
+            raise AlignmentError(
+                str(seam),
+                found,
+                "one child per selected parent and repeat, in the host's order",
+                "Report this with the host's commit: its densification differs.",
+            )
+
     def _on_choice(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         result = wrapped(*args, **kwargs)
         state = self._models.get(model)
         if state is not None:
             chosen = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
-            state.pending_parents = [chosen.detach().clone()]
+            state.pending_parents = chosen.detach().clone()
         return result
 
     def _on_copy(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
@@ -672,14 +684,13 @@ class Session:
             return wrapped(*args, **kwargs)
         mask = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
         target = mask.nonzero()[:, 0]
-        state.pending_parents = []
+        state.pending_parents = None
         try:
             result = wrapped(*args, **kwargs)
         finally:
-            drawn, state.pending_parents = state.pending_parents, []
-        if not drawn:  # nothing to overwrite, or nothing to copy
+            source, state.pending_parents = state.pending_parents, None
+        if source is None:  # nothing to overwrite, or nothing to copy
             return result
-        (source,) = drawn
         groups = [(name, group) for name, group in self._groups(model, state) if name]
         rows = {name: group["params"][0].detach()[target] for name, group in groups}
         if len(source) != len(target) or not self.adapter.check_children(model, rows, source):
