@@ -168,8 +168,7 @@ class CommandLine:
         continues: those of the scripts that work on a checkpoint they are given: where ``resume``
             names one it is stage 1's, not ours to start stage 2 from.
         config: the file whose values the host puts over its command line, where it has one.
-        save_models: flag listing the iterations to save the model at, where the host's own last one
-            is not to be relied on; "" where it is.
+        checkpoints_only: no other file holds the model, so every stage asks for a last one.
         skipped: iterations that a run, fresh or resumed, counts and does not execute.
         restarts: there are no checkpoints: ``resume`` names a model's PLY, from which a new run
             begins. It counts from 0 and empties its output folder, so stage 2 gets one of its own.
@@ -184,7 +183,7 @@ class CommandLine:
     default_iterations: int
     continues: tuple[str, ...] = ()
     config: ConfigFile | None = None
-    save_models: str = ""
+    checkpoints_only: bool = False
     skipped: int = 0
     restarts: bool = False
 

@@ -10,17 +10,18 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
-import json
 import logging
+import os
 import runpy
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
-from fragprune_plugins.adapter import CommandLine, HostAdapter
-from fragprune_plugins.detect import HostRepo, locate
+from fragprune_plugins.adapter import CommandLine, ConfigFile, HostAdapter
+from fragprune_plugins.detect import HostRepo, choose, locate
 from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
 from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.schedule import JointSchedule, Schedule, Settings
@@ -106,19 +107,30 @@ class RunSummary:
 
 @dataclass(frozen=True)
 class _Invocation:
-    """The host's command, taken apart."""
+    """The host's command, taken apart; ``module`` where it was ``python -m module``."""
 
     script: Path
     arguments: list[str]
     flags: argparse.Namespace
     line: CommandLine
+    module: str = ""
 
-    def with_flags(self, **extra: Any) -> list[str]:
-        """Arguments with flags appended; argparse lets the last one win."""
+    def with_flags(self, scratch: Path, **extra: Any) -> list[str]:
+        """Arguments with flags appended; argparse lets the last one win.
+
+        Args:
+            scratch: folder for a copy of the host's configuration file, which wins over flags.
+            extra: values by fields of the command line.
+        """
+        given = {self.line.spellings(name)[-1]: value for name, value in extra.items()}
         out = list(self.arguments)
-        for flag, value in extra.items():
+        if self.line.config and self.flags.config:
+            copy = scratch / self.flags.config.name
+            overrule(self.line.config, self.flags.config, copy, given)
+            return [*out, self.line.config.flag, str(copy)]
+        for flag, value in given.items():
             values = value if isinstance(value, list) else [value]
-            out += [getattr(self.line, flag), *map(str, values)]
+            out += [flag, *map(str, values)]
         return out
 
 
@@ -139,25 +151,31 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     import time
 
     options = options or RunOptions()
-    script, arguments = _split(command)
+    script, arguments, module = _split(command)
     plugins = load_plugins()
     for finding in plugins.findings:
         if finding.level != "info":
             log.warning("%s", finding)
     tie = plugins.manager.hook.fragprune_select_adapter
-    repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
-    host = _parse(script, arguments, adapter.command_line(repo))
-    device = _device(options.device)
-    runner = _Runner(host, repo, adapter, plugins, options, device)
-    started = time.perf_counter()
-    if script.name not in host.line.scripts or options.stage == "off":
-        runner.observe()
-    elif options.stage == "joint":
-        runner.joint()
-    elif options.stage == "finetune":
-        runner.finetune()
+    package = HostRepo.installed(module.split(".")[0]) if module else None
+    if package is not None:
+        repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
     else:
-        runner.train_then_finetune()
+        repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
+    host = _parse(script, arguments, adapter.command_line(repo), module)
+    device = _device(options.device)
+    started = time.perf_counter()
+    trains = script.relative_to(repo.root).as_posix() in host.line.scripts
+    with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
+        runner = _Runner(host, repo, adapter, plugins, options, device, Path(scratch))
+        if not trains or options.stage == "off":
+            runner.observe()
+        elif options.stage == "joint":
+            runner.joint()
+        elif options.stage == "finetune":
+            runner.finetune()
+        else:
+            runner.train_then_finetune()
     return runner.summary(time.perf_counter() - started)
 
 
@@ -172,9 +190,10 @@ class _Runner:
         plugins: Any,
         options: RunOptions,
         device: str,
+        scratch: Path,
     ) -> None:
         self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
-        self.options, self.device = options, device
+        self.options, self.device, self.scratch = options, device, scratch
         self.output = Path(host.flags.output) if host.flags.output else None
         self.trained: int | None = None  # iterations of stage 1, once it is over
         self.before: Path | None = None
@@ -190,11 +209,11 @@ class _Runner:
         """Thresholds learn beside everything else."""
         total = self._iterations()
         start = self.options.from_iter if self.options.from_iter is not None else total // 2
-        settings = _with_iterations(self.options.settings, total)
+        settings = _with_iterations(self.options.settings, total - self.host.line.skipped)
         schedule = JointSchedule(settings, start, self.options.alternate)
         resumed = self.host.flags.resume
         self._execute(
-            self.host.arguments,
+            self._saving(total),
             learn=True,
             freeze=False,
             start=_iteration_of(Path(resumed)) if resumed else 0,
@@ -207,10 +226,11 @@ class _Runner:
         """Stage 1 with a checkpoint at its end, then stage 2 from there."""
         if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
             return self.finetune()
+        self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
         total = self._iterations()
-        checkpoints = sorted({*(self.host.flags.save_checkpoints or []), total})
         log.info("stage 1: the host's own training, %d iterations", total)
-        self._execute(self.host.with_flags(save_checkpoints=checkpoints), learn=False)
+        arguments = self.host.with_flags(self.scratch, save_checkpoints=self._checkpoints(total))
+        self._execute(arguments, learn=False)
         saved = self.adapter.saved_iterations(self.output) if self.output else []
         if total not in (iteration for iteration, _ in saved):  # hosts refuse with exit code 0 too
             raise HostFailed(
@@ -227,20 +247,24 @@ class _Runner:
         settings = self.options.settings
         if self.options.from_iter is not None:
             start, total = self.options.from_iter, self._iterations()
-            settings = _with_iterations(settings, max(1, total - start))
-            self._execute(self.host.arguments, learn=True, from_step=start, settings=settings)
+            learned = max(1, total - start - self.host.line.skipped)
+            settings = _with_iterations(settings, learned)
+            self._execute(self._saving(total), learn=True, from_step=start, settings=settings)
             self._note_after(total)
             return
         resumed = self.adapter.resumed_by(self.host.script, self.host.arguments)
-        self.host = _parse(*resumed, self.host.line)
+        self.host = _parse(*resumed, self.host.line, self.host.module)
         with self._checkpoint() as (iteration, checkpoint):
             self._note_before(iteration)
-            total = iteration + settings.iterations
+            start = 0 if self.host.line.restarts else iteration
+            total = start + settings.iterations + self.host.line.skipped
             log.info("stage 2: %d iterations from %s", settings.iterations, checkpoint)
-            arguments = self.host.with_flags(iterations=total, resume=checkpoint)
-            if self.output is not None and not self.host.flags.output:
-                arguments += [self.host.line.output[-1], str(self.output)]  # the host named it
-            self._execute(arguments, learn=True, start=iteration)
+            extra = {"iterations": total, "resume": str(checkpoint)}
+            if self.host.line.restarts and self.output is not None:
+                self.output = self.output / "finetuned"
+            if self.output is not None and str(self.output) != self.host.flags.output:
+                extra["output"] = str(self.output)
+            self._execute(self._saving(total, **extra), learn=True, start=start)
             self._note_after(total)
 
     @contextlib.contextmanager
@@ -248,7 +272,7 @@ class _Runner:
         """The checkpoint to resume from; one made from a PLY is removed afterwards."""
         if self.host.flags.resume and self.trained is None:
             path = Path(self.host.flags.resume)
-            yield _iteration_of(path), path
+            yield (0 if self.host.line.restarts else _iteration_of(path)), path
             return
         saved = self.adapter.saved_iterations(self.output) if self.output else []
         if self.trained is not None:  # the folder may hold later ones of another run
@@ -257,12 +281,12 @@ class _Runner:
             raise UsageError(
                 "--stage finetune",
                 f"nothing to start from in {self.output or 'no output folder'}",
-                f"{self.host.line.resume} FILE, or {self.host.line.output[-1]} DIR of a finished "
-                "training",
+                f"{self.host.line.spellings('resume')[-1]} FILE, or {self.host.line.output[-1]} "
+                "DIR of a finished training",
                 "Name one of them in the host's command.",
             )
         iteration, path = saved[-1]
-        if path.suffix != ".ply":
+        if path.suffix != ".ply" or self.host.line.restarts:
             yield iteration, path
             return
         made = path.with_name(f".fragprune_{iteration}.pth")
@@ -301,9 +325,12 @@ class _Runner:
         )
         known = set(sys.modules)
         try:
-            with session, _host_process(self.host.script, arguments, self.device):
+            with session, _host_process(self.host, arguments, self.device):
                 try:
-                    runpy.run_path(str(self.host.script), run_name="__main__")
+                    if self.host.module:
+                        runpy.run_module(self.host.module, run_name="__main__", alter_sys=True)
+                    else:
+                        runpy.run_path(str(self.host.script), run_name="__main__")
                 except KeyboardInterrupt as error:  # here, where saving still writes the sidecar
                     saved = session.save_interrupted() if learn else None
                     raise Interrupted(
@@ -324,7 +351,7 @@ class _Runner:
                 ) from error
         finally:
             self.output = session.output or self.output
-            _forget_modules(self.repo.root, known)
+            _forget_modules(self.repo.root, self.adapter.installed, known)
             if learn:
                 self.learned = session.finish()
                 self.curves = session.curves
@@ -350,6 +377,16 @@ class _Runner:
             drawing=self.adapter.drawing(self.repo, self.host.arguments),
         )
 
+    def _checkpoints(self, total: int) -> list[int]:
+        """Iterations to write a checkpoint at: the command's, and the last."""
+        return sorted({*(self.host.flags.save_checkpoints or []), total})
+
+    def _saving(self, total: int, **extra: Any) -> list[str]:
+        """The host's arguments with more flags, and told to save its model in the end."""
+        if self.host.line.checkpoints_only:
+            extra["save_checkpoints"] = self._checkpoints(total)
+        return self.host.with_flags(self.scratch, **extra) if extra else self.host.arguments
+
     def _iterations(self) -> int:
         return self.host.flags.iterations or self.host.line.default_iterations
 
@@ -362,16 +399,18 @@ class _Runner:
         self.after = path if path and path.exists() else None
 
 
-def _split(command: list[str]) -> tuple[Path, list[str]]:
-    """Script and its arguments; a leading interpreter is dropped."""
+def _split(command: list[str]) -> tuple[Path, list[str], str]:
+    """Script, its arguments, and the module where it is one; a leading interpreter is dropped."""
     words = list(command)
     if words and Path(words[0]).name.startswith("python"):
         words = words[1:]
+    if words[:1] == ["-m"] and len(words) > 1:
+        return _script_of(words[1]), words[2:], words[1]
     if not words or not words[0].endswith(".py"):
         raise UsageError(
             "command",
             repr(" ".join(command)) if command else "none",
-            "-- python train.py ... (a script of the host)",
+            "-- python train.py ... (a script of the host), or -- python -m package.module ...",
             "Put the host's own training command after --.",
         )
     script = Path(words[0]).resolve()
@@ -379,7 +418,21 @@ def _split(command: list[str]) -> tuple[Path, list[str]]:
         raise UsageError(
             str(script), "no such file", "the host's training script", "Check the path."
         )
-    return script, words[1:]
+    return script, words[1:], ""
+
+
+def _script_of(module: str) -> Path:
+    """The file of an installed module, found without importing its package."""
+    repo = HostRepo.installed(module.split(".")[0])
+    script = repo.path(module) if repo else None
+    if script is None:
+        raise UsageError(
+            f"python -m {module}",
+            "no such module",
+            "one of an installed package",
+            "Install the package, or check the name.",
+        )
+    return script
 
 
 class _Flags(argparse.ArgumentParser):
@@ -391,37 +444,46 @@ class _Flags(argparse.ArgumentParser):
         )
 
 
-def _parse(script: Path, arguments: list[str], line: CommandLine) -> _Invocation:
+def _parse(script: Path, arguments: list[str], line: CommandLine, module: str = "") -> _Invocation:
     """Read the few flags we need; the host parses them all itself."""
     parser = _Flags(add_help=False)
-    parser.add_argument(line.iterations, dest="iterations", type=int)
+    parser.add_argument(*line.spellings("iterations"), dest="iterations", type=int)
     parser.add_argument(*line.output, dest="output")
     parser.add_argument(*line.source, dest="source")
     parser.add_argument(line.save_checkpoints, dest="save_checkpoints", type=int, nargs="*")
-    parser.add_argument(line.resume, dest="resume")
+    parser.add_argument(*line.spellings("resume"), dest="resume")
     if line.config:
-        parser.add_argument(line.config, dest="config")
+        parser.add_argument(line.config.flag, dest="config", type=Path)
     flags, _ = parser.parse_known_args(arguments)
     if line.config and flags.config:
-        _refuse_overrides(Path(flags.config), line)
-    return _Invocation(script, arguments, flags, line)
+        values = read_config(line.config, flags.config)
+        for name in set(vars(flags)) - {"config"}:
+            key = line.spellings(name)[-1].lstrip("-")
+            setattr(flags, name, values.get(key, getattr(flags, name)))
+    return _Invocation(script, arguments, flags, line, module)
 
 
-def _refuse_overrides(config: Path, line: CommandLine) -> None:
-    """A configuration file wins over the command line: it must leave alone what we put there."""
-    ours = (*line.output, line.iterations, line.save_checkpoints, line.resume)
+def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
+    """What a configuration file says, by argument name."""
     try:
-        values = json.loads(config.read_text())
+        return config.read(path)
     except (OSError, ValueError) as error:
         raise UsageError(
-            f"{line.config} {config}", str(error), "a readable JSON file", "Correct the command."
+            f"{config.flag} {path}", str(error), "a file the host can read", "Correct the command."
         ) from error
-    if taken := sorted({flag.lstrip("-") for flag in ours} & set(values)):
+
+
+def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) -> None:
+    """Write a copy of a configuration file with other values, and see that it says so."""
+    values = {flag.lstrip("-"): value for flag, value in given.items()}
+    copy.write_text(config.overrule(path.read_text(encoding="utf-8"), values), encoding="utf-8")
+    said = read_config(config, copy)
+    if ignored := sorted(name for name in values if said.get(name) != values[name]):
         raise UsageError(
-            f"{line.config} {config}",
-            f"sets {', '.join(taken)}, over whatever the command says",
-            "these on the command line, where stage 2 can change them",
-            "Move them there.",
+            f"{config.flag} {path}",
+            f"a layout that {', '.join(ignored)} cannot be added to",
+            "that of the host's own examples",
+            "Write it like these.",
         )
 
 
@@ -469,13 +531,13 @@ def _host_checkpoints() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _host_process(script: Path, arguments: list[str], device: str) -> Iterator[None]:
+def _host_process(host: _Invocation, arguments: list[str], device: str) -> Iterator[None]:
     """What a fresh interpreter would give the script, put back afterwards."""
     from fragprune_plugins.device import cpu_only
 
     saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
-    sys.argv = [str(script), *arguments]
-    sys.path.insert(0, str(script.parent))
+    sys.argv = [str(host.script), *arguments]
+    sys.path.insert(0, os.getcwd() if host.module else str(host.script.parent))
     try:
         with contextlib.ExitStack() as stack:
             stack.enter_context(_host_checkpoints())
@@ -486,10 +548,20 @@ def _host_process(script: Path, arguments: list[str], device: str) -> Iterator[N
         sys.argv, sys.path[:], sys.stdout, sys.stderr = saved
 
 
-def _forget_modules(root: Path, known: set[str]) -> None:
-    """Drop the host's own modules, so that its script runs again as if for the first time."""
+def _forget_modules(root: Path, packages: tuple[str, ...], known: set[str]) -> None:
+    """Drop the host's own modules, so that its script runs again as if for the first time.
+
+    Args:
+        root: of a checkout, which may hold an environment with packages that are not its own.
+        packages: that are the host, where it is installed; their compiled modules stay.
+        known: names of modules that were there before the host ran.
+    """
     for name in sys.modules.keys() - known:
-        file = getattr(sys.modules[name], "__file__", None)
-        if file and Path(file).is_relative_to(root) and "site-packages" not in file:
+        file = getattr(sys.modules[name], "__file__", None) or ""
+        if name.split(".")[0] in packages:
+            own = not file or file.endswith(".py")
+        else:
+            own = file != "" and Path(file).is_relative_to(root) and "site-packages" not in file
+        if own:
             del sys.modules[name]
     gc.collect()  # closes what module globals held, the viewer's socket among them

@@ -209,6 +209,7 @@ class Session:
         self._dialect = adapter.dialect(repo)
         self._ledger: PatchLedger | None = None
         self._stand_ins: dict[str, ModuleType] = {}
+        self._absent: set[Seam] = set()  # metrics without their weights
         self._models: weakref.WeakKeyDictionary[Any, _ModelState] = weakref.WeakKeyDictionary()
         self._last: weakref.ReferenceType[Any] | None = None
         self._last_state: _ModelState | None = None  # outlives the host's model
@@ -619,11 +620,13 @@ class Session:
         return wrapped(*args, **kwargs)
 
     def _on_metric(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
-        try:
-            return wrapped(*args, **kwargs)
-        except OSError as error:  # the download failed; a run of hours should not end on it
-            log.warning("%s: its weights are not to be had (%s); NaN stands for it", seam, error)
-            return torch.tensor(math.nan)
+        if seam not in self._absent:
+            try:
+                return wrapped(*args, **kwargs)
+            except OSError as error:  # the download failed; a run of hours should not end on it
+                log.warning("%s: its weights cannot be had (%s); NaN stands for it", seam, error)
+                self._absent.add(seam)
+        return torch.tensor(math.nan)
 
     def _on_parents(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         state = self._models.get(model)

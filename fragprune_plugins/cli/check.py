@@ -40,7 +40,7 @@ def command(host: Path, adapter: str | None) -> Report:
     lines, data, fitting = [], [], []
     for candidate in adapters:
         match = candidate.match(repo)
-        fitting += [candidate.name] if match.fits else []
+        fitting += [candidate] if match.fits else []
         lines.append(f"{candidate.name}: {'fits' if match.fits else 'does not fit'}")
         lines += [f"  {finding}" for finding in match.findings]
         places = []
@@ -61,7 +61,8 @@ def command(host: Path, adapter: str | None) -> Report:
                 "seams": places,
             }
         )
-    verdict = fitting[0] if len(fitting) == 1 else None
-    lines.append(f"Use: fragprune run -- python {host / 'train.py'} ..." if verdict else "No fit.")
+    verdict = fitting[0].name if len(fitting) == 1 else None
+    scripts = [host / fit.command_line(repo).scripts[0] for fit in fitting]
+    lines.append(f"Use: fragprune run -- python {scripts[0]} ..." if verdict else "No fit.")
     report = {"host": str(host), "commit": repo.commit, "fits": verdict, "adapters": data}
     return Report(report, "\n".join(lines), exit_code=0 if verdict else 1)

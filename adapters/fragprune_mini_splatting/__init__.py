@@ -1,0 +1,139 @@
+"""fatPeter/mini-splatting: few Gaussians, placed anew from depth and sampled by importance.
+
+Its training scripts lie in folders of their own, gs, ms and ms_d, and its functions import one of
+two rasterizers at every call: vanilla's, or one that also scores every Gaussian by what it adds to
+the picture and tells where the rays meet them. New points, simplification and splitting follow
+these scores, so with thresholds active they count what is left after truncation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.seams import Role, Seam
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
+SCORING = "diff_gaussian_rasterization_ms"
+FORWARD, DEPTH = "GaussianRasterizer.forward", "GaussianRasterizer.render_depth"
+MASKED_SPLIT = "densify_and_split_mask"
+SCRIPTS = ("ms/train.py", "ms_d/train.py", "gs/train.py")
+
+
+@dataclass(frozen=True)
+class MiniSplattingDialect(GraphdecoDialect):
+    """Vanilla's call of 2023 in one package, and with scores or depth in the other."""
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Scores are asked for where the host's own rasterizer gives them."""
+        inputs = super().unpack(call)
+        scoring = call.entry.startswith(SCORING)
+        return replace(inputs, counts=True, scores=True) if scoring else inputs
+
+    def answer(
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
+    ) -> Any:
+        """``render_depth`` draws some pixels again; see there."""
+        if not call.entry.endswith(DEPTH):
+            return super().answer(call, inputs, draw)
+        from fragprune_mini_splatting.depth import render_depth
+
+        return render_depth(inputs, draw)
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
+        """(colour (3, H, W), radii (P,)); scoring, three more (P,).
+
+        They are the sum of the weights alpha T, how many fragments were drawn (int32), and at how
+        many pixels no other Gaussian weighs more (float32, as the host's). No gradients.
+        """
+        drawn = super().pack(outputs, call)
+        wins = outputs.wins_per_gaussian
+        if wins is None:
+            return drawn
+        return (*drawn, outputs.weights_per_gaussian, outputs.fragments_per_gaussian, wins.float())
+
+    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
+        """The lineage's stand-ins and the scoring rasterizer's."""
+        from fragprune_plugins.lineage import stand_ins
+
+        scoring = stand_ins.rasterizer(SCORING, self.settings, False, draw, also=("render_depth",))
+        return {**super().modules(draw), SCORING: scoring}
+
+
+class MiniSplatting(GraphdecoAdapter):
+    """Mini-Splatting and Mini-Splatting-D."""
+
+    name = "mini-splatting"
+    info = HostInfo(
+        "Mini-Splatting", repo="fatPeter/mini-splatting", states="gs, ms, ms_d and ms_c"
+    )
+    scripts = SCRIPTS
+    seams = (
+        *GraphdecoAdapter.seams,
+        Seam(Role.VIEW, RENDERER, "render_imp", ("viewpoint_camera", "pc")),
+        Seam(Role.VIEW, RENDERER, "render_depth", ("viewpoint_camera", "pc")),
+        *(
+            Seam(Role.RASTERIZE, SCORING, name, ("means3D", "means2D", "opacities"), external=True)
+            for name in (FORWARD, DEPTH)
+        ),
+        Seam(
+            Role.PARENTS,
+            MODEL,
+            f"GaussianModel.{MASKED_SPLIT}",
+            ("grads", "grad_threshold", "scene_extent", "mask", "N"),
+        ),
+        Seam(Role.STILL, MODEL, "GaussianModel.densify_and_prune_split"),
+        Seam(Role.STILL, MODEL, "GaussianModel.prune_points", ("mask",)),
+        Seam(Role.STILL, MODEL, "GaussianModel.reinitial_pts", ("pts", "rgb")),
+        Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """The training scripts in their folders."""
+        missing = [name for name in self.scripts if not (repo.root / name).is_file()]
+        if not missing:
+            return super().fingerprint(repo)
+        return [
+            *super().fingerprint(repo),
+            Finding(
+                "error",
+                "other-host",
+                str(repo.root),
+                f"no {', no '.join(missing)}",
+                "a Mini-Splatting checkout",
+                "Use the adapter of that host.",
+            ),
+        ]
+
+    def dialect(self, repo: HostRepo) -> MiniSplattingDialect:
+        """As the lineage reads it from ``render``."""
+        return MiniSplattingDialect(**vars(super().dialect(repo)))
+
+    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
+        """The masked split takes the rows under the mask besides."""
+        if method != MASKED_SPLIT:
+            return super().parents(model, method, arguments)
+        mask = arguments["mask"].bool()
+        selected = mask.new_zeros(self.rows(model))
+        selected[: len(mask)] = mask
+        split = {**arguments, "N": 1}
+        selected[super().parents(model, "densify_and_split", split)] = True
+        rows: Tensor = selected.nonzero()[:, 0]
+        return rows.repeat(arguments["N"])
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Offer Mini-Splatting."""
+    register(MiniSplatting())

@@ -1,0 +1,141 @@
+"""``render_depth``: where each pixel's ray passes the Gaussian that weighs most in it.
+
+The host places new points there. For a Gaussian of mean m, rotation R and scales s it takes the
+ellipsoid at three scales and the middle of the ray's way through it: with W = diag(1 / 3s) R^T and
+a ray o + t d, d reaching view depth 1, that is t = -(W d)(W (o - m)) / |W d|^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from fragprune_plugins.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs, RasterOutputs, View
+
+TILE = 16
+"""Pixels; a Gaussian reaches at most its radius and the rest of a tile."""
+
+
+@torch.no_grad()
+def render_depth(
+    inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
+) -> dict[str, Tensor]:
+    """The host's six pictures.
+
+    Where that middle lies behind the camera, the host lets a fragment colour the pixel, but neither
+    win it nor hide what follows. Such fragments are found, and their pixels drawn again without
+    them: winner and transmittance are the host's, only ``render`` lacks their colour.
+
+    Args:
+        inputs: of one view, with scores.
+        draw: rasterizes.
+
+    Returns:
+        ``render`` (3, H, W), ``out_pts`` (3, H, W) world, ``rendered_depth``, ``discriminants`` and
+        ``accum_alpha`` (1, H, W), the latter the transmittance left, despite its name, and
+        ``gidx`` (1, H, W) int32. Where nothing is drawn: zeros, and all of the transmittance.
+
+    Raises:
+        InputError: the host gave covariances in place of scales and rotations.
+    """
+    splats = inputs.splats
+    if splats.scales is None or splats.rotations is None:
+        raise InputError(
+            "render_depth",
+            "precomputed covariances",
+            "scales and rotations, which the host's own rasterizer reads here",
+            "Leave out --compute_cov3D_python.",
+        )
+    drawn = draw(inputs)
+    winners, left, image = drawn.winners, 1 - drawn.alpha[0], drawn.image
+    assert winners is not None  # scores were asked for
+    directions = _directions(inputs.view)
+    whiten = _whiten(splats.scales.double(), splats.rotations.double())
+    offset = inputs.view.campos.double() - splats.means.double()  # (N, 3) from the mean to the eye
+    start = (whiten @ offset[:, :, None])[:, :, 0]
+    normals = (whiten.transpose(1, 2) @ start[:, :, None])[:, :, 0]
+    for rows, where in _behind(inputs, drawn.radii, directions, normals):
+        opacities = splats.opacities.clone()
+        opacities[rows] = 0.0
+        again = draw(replace(inputs, splats=replace(splats, opacities=opacities)))
+        assert again.winners is not None
+        winners = torch.where(where, again.winners, winners)
+        left = torch.where(where, 1 - again.alpha[0], left)
+        image = torch.where(where, again.image, image)
+    won = winners >= 0
+    rows = winners.clamp_min(0).long()
+    along = (whiten[rows] @ directions[..., None])[..., 0]
+    begin = start[rows]
+    a, b = along.square().sum(-1), (along * begin).sum(-1)
+    c = begin.square().sum(-1) - 1
+    depth = torch.where(won, -b / a, 0)
+    points = inputs.view.campos.double() + depth[..., None] * directions
+    discriminant = 4 * (b * b - a * c) / directions.square().sum(-1)
+    return {
+        "render": image,
+        "out_pts": torch.where(won[..., None], points, 0).permute(2, 0, 1).float(),
+        "rendered_depth": depth[None].float(),
+        "discriminants": torch.where(won, discriminant, 0)[None].float(),
+        "gidx": rows[None].int(),
+        "accum_alpha": left[None],
+    }
+
+
+def _directions(view: View) -> Tensor:
+    """(H, W, 3) float64: from the eye to the pixels' centres at view depth 1, in the world."""
+    size = {"dtype": torch.float64, "device": view.viewmatrix.device}
+    x = ((2 * torch.arange(view.width, **size) + 1) / view.width - 1) * view.tan_fov_x
+    y = ((2 * torch.arange(view.height, **size) + 1) / view.height - 1) * view.tan_fov_y
+    rows, columns = torch.meshgrid(y, x, indexing="ij")
+    camera = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
+    return camera @ view.viewmatrix[:3, :3].double().T
+
+
+def _whiten(scales: Tensor, rotations: Tensor) -> Tensor:
+    """(N, 3, 3): world to a frame where the ellipsoid at three scales is the unit sphere."""
+    w, x, y, z = rotations.unbind(-1)
+    columns = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
+        torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1),
+        torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1),
+    ]
+    return torch.stack(columns, dim=-2) / (3 * scales[:, :, None])
+
+
+def _behind(
+    inputs: RasterInputs, radii: Tensor, directions: Tensor, normals: Tensor
+) -> list[tuple[Tensor, Tensor]]:
+    """Which Gaussians' middles lie behind the camera, and at which pixels.
+
+    t < 0 where the ray's direction has a positive product with a vector of the Gaussian's own: a
+    half plane of the image. A linear function is largest at a corner, so four products rule out
+    nearly all Gaussians.
+
+    Returns:
+        (rows (M,), where (H, W) bool): pixels at which exactly these rows are to be left out.
+    """
+    height, width = directions.shape[:2]
+    corners = directions[:: max(1, height - 1), :: max(1, width - 1)].reshape(-1, 3)
+    rows = ((corners @ normals.T > 0).any(dim=0) & (radii > 0)).nonzero()[:, 0]
+    if not len(rows):
+        return []
+    means = inputs.splats.means[rows]
+    clip = torch.cat([means, torch.ones_like(means[:, :1])], dim=1) @ inputs.view.projmatrix
+    ndc = clip[:, :2] / (clip[:, 3:] + 1e-7)
+    reach = radii[rows] + TILE
+    x, y = ((ndc[:, 0] + 1) * width - 1) / 2, ((ndc[:, 1] + 1) * height - 1) / 2
+    columns = torch.arange(width, device=x.device)[:, None]
+    lines = torch.arange(height, device=x.device)[:, None]
+    touched = ((lines - y).abs() <= reach)[:, None] & ((columns - x).abs() <= reach)[None]
+    behind = touched & (directions @ normals[rows].T > 0)  # (H, W, M)
+    patterns, kind = behind.reshape(-1, len(rows)).unique(dim=0, return_inverse=True)
+    kind = kind.reshape(height, width)
+    return [(rows[p], kind == i) for i, p in enumerate(patterns) if bool(p.any())]
