@@ -16,8 +16,8 @@ from fragprune_plugins.session import Session
 
 
 def activate(
-    *,
     adapter: str | None = None,
+    *,
     host: str | Path | None = None,
     stage: Literal["finetune", "joint", "off"] = "finetune",
     from_iter: int = 0,

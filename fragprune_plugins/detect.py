@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -57,15 +60,23 @@ class Match:
 
 
 class HostRepo:
-    """A host's checkout, read as text.
+    """A host's checkout, or installed package, read as text.
 
     Args:
-        root: the folder its entry scripts lie in.
+        root: the folder its entry scripts lie in, or the one that its package lies in.
+        package: import name of the installed package; "" for a checkout.
     """
 
-    def __init__(self, root: Path) -> None:
-        self.root = Path(root).resolve()
+    def __init__(self, root: Path, package: str = "") -> None:
+        self.root, self.package = Path(root).resolve(), package
         self._trees: dict[str, ast.Module | None] = {}
+
+    @classmethod
+    def installed(cls, package: str) -> HostRepo | None:
+        """The package that an import of this top-level name would find; None without one."""
+        spec = find_spec(package) if package.isidentifier() else None
+        folders = spec.submodule_search_locations if spec else None
+        return cls(Path(next(iter(folders))).parent, package) if folders else None
 
     def path(self, module: str) -> Path | None:
         """The file a dotted module name would be imported from, or None."""
@@ -144,9 +155,28 @@ class HostRepo:
                     seen.setdefault(str(name), f"{module}:{getattr(node, 'lineno', 0)}")
         return seen
 
+    def imports(self, package: str) -> bool:
+        """Whether a script right in the folder imports a top-level package."""
+        for script in self.root.glob("*.py"):
+            tree = self.tree(script.stem)
+            for node in ast.walk(tree) if tree else ():
+                if isinstance(node, ast.Import):
+                    names = [alias.name for alias in node.names]
+                else:
+                    names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+                if any(name.split(".")[0] == package for name in names):
+                    return True
+        return False
+
     @cached_property
     def commit(self) -> str:
-        """The checkout's commit, read from .git without running git; "" when there is none."""
+        """The checkout's commit, read from .git without running git; "" when there is none.
+
+        An installed package has its distributions and their versions instead.
+        """
+        if self.package:
+            names = packages_distributions().get(self.package, ())
+            return ", ".join(f"{name} {version(name)}" for name in sorted(set(names)))
         git = self.root / ".git"
         try:
             head = (git / "HEAD").read_text().strip()
@@ -192,15 +222,26 @@ def locate(
     name: str | None = None,
     select: Callable[..., str | None] | None = None,
 ) -> tuple[HostRepo, HostAdapter]:
-    """The checkout that a script's folder is, or lies in, and its adapter; see ``choose``."""
+    """The checkout that a script's folder is, or lies in, and its adapter; see ``choose``.
+
+    Where that is no host but its scripts import one that is installed, or ``name`` is the adapter
+    of such a one, the installed package.
+    """
     repo, above = HostRepo(folder), HostRepo(folder.resolve().parent)
     try:
         return repo, choose(repo, adapters, name, select)
-    except UnknownHostError as error:
-        try:
-            return above, choose(above, adapters, name, select)
-        except UnknownHostError:
-            raise error from None
+    except UnknownHostError:
+        used = [
+            package
+            for adapter in adapters
+            for package in adapter.installed[:1]
+            if (name.replace("_", "-") == adapter.name if name else repo.imports(package))
+        ]
+        packages = [package for each in used if (package := HostRepo.installed(each))]
+        for candidate in (above, *packages):
+            with contextlib.suppress(UnknownHostError):
+                return candidate, choose(candidate, adapters, name, select)
+        raise
 
 
 def choose(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from skeleton import SETTINGS, STATES, skeleton
 
-from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.detect import HostRepo, Match, choose, locate
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_vanilla_3dgs import OTHER_HOSTS, Vanilla3DGS
 
@@ -135,3 +135,54 @@ print(json.dumps([adapter.name, "torch" in sys.modules, "scene" in sys.modules])
         tmp_path,
     )
     assert found == ["vanilla-3dgs", False, False]
+
+
+class Installed(Vanilla3DGS):
+    """A host that is a package; whatever bears its name fits."""
+
+    name = "toy-host"
+    installed = ("toyhost_of_tests",)
+
+    def match(self, repo):
+        return Match(self.name, "known" if repo.package in self.installed else "none")
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    folder = tmp_path / "packages" / "toyhost_of_tests"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").write_text("raise RuntimeError('imported')")
+    monkeypatch.syspath_prepend(folder.parent)
+    return folder
+
+
+def test_an_installed_package_is_read_where_it_lies_and_not_imported(package):
+    repo = HostRepo.installed("toyhost_of_tests")
+    assert (repo.root, repo.package) == (package.parent, "toyhost_of_tests")
+    assert repo.path("toyhost_of_tests") == package / "__init__.py"
+    assert HostRepo.installed("nothing_of_this_name") is None
+    assert HostRepo.installed("numpy").commit.startswith("numpy ")
+
+
+@pytest.mark.parametrize(
+    ("code", "name", "found"),
+    [
+        ("import toyhost_of_tests.train", None, True),
+        ("from toyhost_of_tests import train", None, True),
+        ("import numpy", None, False),
+        ("import numpy", "toy_host", True),
+    ],
+)
+def test_a_script_that_imports_an_installed_host_is_its_script(
+    tmp_path, package, code, name, found
+):
+    scripts = tmp_path / "own"
+    scripts.mkdir()
+    (scripts / "mine.py").write_text(code)
+    adapters = [Vanilla3DGS(), Installed()]
+    if found:
+        repo, adapter = locate(scripts, adapters, name)
+        assert (repo.root, adapter.name) == (package.parent, "toy-host")
+    else:
+        with pytest.raises(UnknownHostError):
+            locate(scripts, adapters, name)

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from skeleton import skeleton
 
 from fragprune_plugins.errors import Interrupted, UnknownHostError, UsageError
-from fragprune_plugins.launch import HostFailed, RunOptions, _parse, _split, run
+from fragprune_plugins.launch import (
+    HostFailed,
+    RunOptions,
+    _forget_modules,
+    _parse,
+    _split,
+    run,
+)
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 CPU = RunOptions(stage="off", device="cpu")
@@ -37,7 +46,45 @@ def parsed(repo, *arguments):
 @pytest.mark.parametrize("interpreter", [[], ["python"], ["python3.11"], ["/usr/bin/python3"]])
 def test_an_interpreter_in_front_may_be_left_out(host, interpreter):
     script = host("")
-    assert _split([*interpreter, script, "-s", "x"]) == (Path(script), ["-s", "x"])
+    assert _split([*interpreter, script, "-s", "x"]) == (Path(script), ["-s", "x"], "")
+
+
+def test_a_module_is_found_without_importing_its_package(tmp_path, monkeypatch):
+    package = tmp_path / "toyhost_of_tests"
+    package.mkdir()
+    (package / "__init__.py").write_text("raise RuntimeError('imported')")
+    (package / "train.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    split = _split(["python", "-m", "toyhost_of_tests.train", "-i", "3"])
+    assert split == (package / "train.py", ["-i", "3"], "toyhost_of_tests.train")
+    with pytest.raises(UsageError, match="no such module"):
+        _split(["python", "-m", "toyhost_of_tests.evaluate"])
+
+
+def test_modules_of_an_installed_host_are_forgotten_and_its_compiled_ones_kept(
+    tmp_path, monkeypatch
+):
+    root = tmp_path / "site-packages"
+    files = {"toy": "toy/__init__.py", "toy.train": "toy/train.py", "toy._C": "toy/_C.so"}
+    for name, file in {**files, "other": "other.py"}.items():
+        module = ModuleType(name)
+        module.__file__ = str(root / file)
+        monkeypatch.setitem(sys.modules, name, module)
+    _forget_modules(root, ("toy",), sys.modules.keys() - {*files, "other"})
+    assert {"toy", "toy.train"} & sys.modules.keys() == set()
+    assert {"toy._C", "other"} <= sys.modules.keys()
+
+
+def test_any_spelling_of_a_flag_is_read_and_the_last_is_written(tmp_path):
+    line = replace(
+        Vanilla3DGS().command_line(skeleton(tmp_path)),
+        iterations=("-i", "--iteration"),
+        resume=("-l", "--load_ply"),
+    )
+    host = _parse(Path("train.py"), ["-i", "7", "-l", "a.ply"], line)
+    assert (host.flags.iterations, host.flags.resume) == (7, "a.ply")
+    written = [line.spellings(field)[-1] for field in ("iterations", "output", "resume")]
+    assert written == ["--iteration", "--model_path", "--load_ply"]
 
 
 @pytest.mark.parametrize(
