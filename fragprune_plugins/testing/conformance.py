@@ -1,0 +1,138 @@
+"""What an adapter inherits to be tested: a test for each invariant, on every host there is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+
+from fragprune_plugins.adapter import HostAdapter
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.testing import invariants
+from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
+from fragprune_plugins.testing.host import Host
+from fragprune_plugins.testing.invariants import Case
+
+MINIATURE = "miniature"
+
+
+class AdapterConformance:
+    """Inherit, name the adapter and how to drive its host: every invariant is then a test.
+
+    Each test runs in a process of its own, on the miniature that ``host`` writes and on every
+    checkout in the folder ``FRAGPRUNE_HOSTS`` that the adapter fits.
+
+    Attributes:
+        adapter: name of an installed one, or the object itself.
+        host: how to drive its host.
+        examples: sequences of row operations that are tried.
+        longest_order: of import, activation and deactivation, 1 to 5.
+    """
+
+    adapter: ClassVar[str | HostAdapter]
+    host: ClassVar[type[Host]] = Host
+    examples: ClassVar[int] = 20
+    longest_order: ClassVar[int] = 3
+
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        """One set of tests a host."""
+        if "place" in metafunc.fixturenames:
+            found = _checkouts(os.environ.get("FRAGPRUNE_HOSTS", ""))
+            fitting = [
+                path for path in found if found_adapter(self.adapter).match(HostRepo(path)).fits
+            ]
+            names = [path.name for path in fitting]
+            metafunc.parametrize("place", [None, *fitting], ids=[MINIATURE, *names])
+
+    @pytest.fixture
+    def case(self, place: Path | None, tmp_path: Path) -> Case:
+        """Adapter and host; the miniature is written anew for each test."""
+        driver = self.host()
+        if place is None:
+            driver.write(tmp_path)
+        return Case(
+            found_adapter(self.adapter),
+            driver,
+            place or tmp_path,
+            examples=self.examples,
+            longest=self.longest_order,
+        )
+
+    @pytest.fixture
+    def check(self, request: pytest.FixtureRequest) -> Callable[..., None]:
+        """Run checks in fresh processes and note what they covered."""
+
+        def run(*calls: tuple[Any, ...]) -> None:
+            covered = []
+            for call in calls:
+                try:
+                    covered.append(fresh(*call))
+                except NotApplicable as reason:
+                    pytest.skip(str(reason))
+                except FreshProcessError as error:
+                    pytest.fail(str(error), pytrace=False)
+            note = f"{len(calls)} orders; " if len(calls) > 2 else ""
+            request.node.user_properties.append(("fragprune covered", note + covered[-1]))
+
+        return run
+
+    def test_off_is_off(self, case: Case, check: Any) -> None:
+        """In every order of import, activation and deactivation."""
+        each = [(invariants.off_is_off, case, order) for order in invariants.orders(case.longest)]
+        check(*each, (invariants.nothing_stays, case))
+
+    def test_neutral_is_the_host(self, case: Case, check: Any) -> None:
+        """To the bit: parameters, random streams, pictures."""
+        check((invariants.neutral_is_the_host, case))
+
+    def test_alignment(self, case: Case, check: Any) -> None:
+        """Through any sequence of row operations."""
+        check((invariants.alignment, case))
+
+    def test_monotone(self, case: Case, check: Any) -> None:
+        """Truncation only takes away, and takes all."""
+        check((invariants.monotone, case))
+
+    def test_round_trip(self, case: Case, check: Any) -> None:
+        """What is saved is loaded."""
+        check((invariants.round_trip, case))
+
+    def test_freeze(self, case: Case, check: Any) -> None:
+        """Stage 2 moves what it names."""
+        check((invariants.freeze, case))
+
+    def test_refuse(self, case: Case, check: Any) -> None:
+        """A changed host is refused by what changed."""
+        check((invariants.refuse, case))
+
+    def test_same_picture(self, case: Case, check: Any) -> None:
+        """Whatever the engine."""
+        check((invariants.same_picture, case))
+
+
+def found_adapter(adapter: str | HostAdapter) -> HostAdapter:
+    """An adapter by name, or itself.
+
+    Raises:
+        LookupError: no installed adapter has the name.
+    """
+    if isinstance(adapter, HostAdapter):
+        return adapter
+    installed = {each.name: each for each in load_plugins().adapters}
+    if adapter not in installed:
+        raise LookupError(f"adapter {adapter!r}: none of {', '.join(installed) or 'no adapters'}")
+    return installed[adapter]
+
+
+@cache
+def _checkouts(folder: str) -> list[Path]:
+    """Folders that may be checkouts of hosts: the one named, and those in it."""
+    if not folder:
+        return []
+    root = Path(folder)
+    return [path for path in (root, *sorted(root.iterdir())) if path.is_dir()]

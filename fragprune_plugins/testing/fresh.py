@@ -1,0 +1,109 @@
+"""Runs a function in a process of its own: no host imported, no session, nothing left over.
+
+A server imports torch once and forks for every call, so a fresh process costs milliseconds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import multiprocessing
+import pickle
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from typing import Any
+
+_PRELOAD = ["torch._dynamo", "scipy.spatial", "plyfile", "fragprune_plugins.testing.invariants"]
+
+
+class FreshProcessError(AssertionError):
+    """What a fresh process raised, as text; or that it died, or took too long."""
+
+
+class NotApplicable(Exception):  # noqa: N818 - a result, not a fault
+    """A check has nothing to check here; says why."""
+
+
+def fresh(function: Callable[..., Any], *arguments: Any, seconds: float = 240.0) -> Any:
+    """Call a function in a fresh process and return what it returns.
+
+    Args:
+        function: importable by its module's name, in the kit or installed.
+        arguments: pickled; modules of their classes may be files that only pytest has imported.
+        seconds: after which the process is ended.
+
+    Raises:
+        NotApplicable: the function raised it.
+        FreshProcessError: it raised anything else, died, or took longer.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(_PRELOAD)
+    ours, theirs = context.Pipe(duplex=False)
+    task = pickle.dumps((function, arguments))
+    process = context.Process(target=_serve, args=(theirs, _files_of(arguments), task))
+    process.start()
+    theirs.close()
+    try:
+        if not ours.poll(seconds):
+            raise FreshProcessError(f"took longer than {seconds:g} seconds")
+        kind, value = ours.recv()
+    except EOFError:
+        process.join()
+        raise FreshProcessError(f"the process died, exit code {process.exitcode}") from None
+    finally:
+        ours.close()
+        if process.is_alive():
+            process.join(5)
+            process.kill()
+    if kind == "skipped":
+        raise NotApplicable(value)
+    if kind == "failed":
+        raise FreshProcessError(value)
+    return value
+
+
+def _files_of(arguments: Sequence[Any]) -> dict[str, str]:
+    """Files of modules that the arguments' classes come from, by module name."""
+    files = {}
+    for argument in arguments:
+        for value in (argument, *vars(argument).values()) if hasattr(argument, "__dict__") else ():
+            for kind in type(value).__mro__:
+                module = sys.modules.get(kind.__module__)
+                file = getattr(module, "__file__", None)
+                if file and kind.__module__ != "__main__":
+                    files[kind.__module__] = file
+    return files
+
+
+def _serve(answer: Connection, files: dict[str, str], task: bytes) -> None:
+    """In the fresh process: run the task; what it prints is shown only when it fails."""
+    import torch
+
+    torch.set_num_threads(1)  # the same sums in the same order
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            for name, file in files.items():
+                _import(name, file)
+            function, arguments = pickle.loads(task)
+            answer.send(("done", function(*arguments)))
+    except NotApplicable as reason:
+        answer.send(("skipped", str(reason)))
+    except BaseException as error:  # whatever it is, it is the result
+        text = "".join(traceback.format_exception(error, chain=False))
+        answer.send(("failed", f"{said.getvalue()[-2000:]}\n{text}"))
+
+
+def _import(name: str, file: str) -> None:
+    """Import a module by name, or from its file where its folder is not on the path."""
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError:
+        spec = importlib.util.spec_from_file_location(name, file)
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[name] = module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)

@@ -1,0 +1,430 @@
+"""A host as the conformance kit drives it, and a host under a session.
+
+The kit knows no training script. It makes a model and a camera, draws, takes a step, and calls the
+methods that add, remove and overwrite rows; a ``Host`` says how. Its defaults are those of the
+codebases that descend from 3DGS of 2023, so a descendant states only what it has otherwise.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import math
+import shutil
+import sys
+from argparse import ArgumentParser
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fragprune_plugins import demo
+from fragprune_plugins.adapter import HostAdapter
+from fragprune_plugins.constants import NEUTRAL_LOGIT
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.device import cpu_only
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.schedule import JointSchedule, Settings
+from fragprune_plugins.session import Session
+from fragprune_plugins.types import View
+
+MINIATURE = Path(demo.__file__).with_name("host")
+"""The demo's training repository: vanilla 3DGS of 2023 by its interface, small."""
+
+
+@dataclass(frozen=True)
+class Chance:
+    """What one action draws from; the same chance does the same again.
+
+    Attributes:
+        seed: of everything drawn.
+        share: about how many of the rows, in (0, 1).
+    """
+
+    seed: int
+    share: float
+    generator: torch.Generator = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        generator = torch.Generator().manual_seed(self.seed)
+        object.__setattr__(self, "generator", generator)
+        torch.manual_seed(self.seed)  # hosts draw parents and offsets from the global stream
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Numbers in [0, 1)."""
+        return torch.rand(*shape, generator=self.generator)
+
+    def rows(self, count: int, share: float | None = None) -> Tensor:
+        """(count,) bool: each row with a probability of ``share``, this chance's by default."""
+        return self.uniform(count) < (self.share if share is None else share)
+
+    @property
+    def heads(self) -> bool:
+        """A coin."""
+        return bool(self.seed % 2)
+
+
+Action = Callable[[Any, Any, Chance], None]
+"""Called with a model, the training arguments and a chance; changes the model's rows."""
+
+
+class Host:
+    """How to drive one host; override what it has otherwise than vanilla 3DGS of 2023.
+
+    ``write`` makes a miniature of it, for where no checkout is at hand; everything else must work
+    on a real checkout too.
+    """
+
+    opacity: frozenset[str] = frozenset({"opacity"})
+    """Parameters that ``--train opacity`` moves; all others stand still."""
+    colour: frozenset[str] = frozenset({"f_dc", "f_rest"})
+    """Those that ``--train appearance`` moves besides."""
+    routine: tuple[str, ...] = ("densify and prune", "reset opacity", "another band")
+    """Actions of the host's own training loop; none may have an effect in stage 2."""
+    scale: float = 3.0
+    """Extent of the scene in the host's densification, world units."""
+
+    def write(self, root: Path) -> None:
+        """Write a miniature into an empty folder."""
+        shutil.copytree(MINIATURE, root, dirs_exist_ok=True)
+
+    # -- making things ---------------------------------------------------------------------------
+
+    def arguments(self) -> Any:
+        """What the training script hands ``training_setup``: the host's own defaults."""
+        parser = ArgumentParser()
+        group = import_module("arguments").OptimizationParams(parser)
+        return group.extract(parser.parse_args([]))
+
+    def new_model(self, degree: int) -> Any:
+        """An empty model with SH bands up to ``degree``."""
+        return import_module("scene.gaussian_model").GaussianModel(degree)
+
+    def fill(self, model: Any, cloud: Any) -> None:
+        """Begin from a cloud: ``points``, ``colors``, ``normals`` (N, 3) and ``time`` (N, 1)."""
+        given = {"pcd": cloud, "cam_infos": [SimpleNamespace(image_name="photo")]}
+        names = inspect.signature(model.create_from_pcd).parameters
+        model.create_from_pcd(**{name: given.get(name, 1.0) for name in names})
+
+    def model(self, arguments: Any, count: int, *, seed: int, degree: int, setup: bool) -> Any:
+        """A model of random points in front of the camera, opacities from a half to 0.98."""
+        generator = np.random.default_rng(seed)
+        spread = generator.uniform(-1, 1, (count, 3)) * (0.9, 0.6, 0.5)
+        cloud = SimpleNamespace(
+            points=spread,
+            colors=generator.uniform(0, 1, (count, 3)),
+            normals=np.zeros((count, 3)),
+            time=generator.uniform(-0.4, 0.4, (count, 1)),
+        )
+        model = self.new_model(degree)
+        self.fill(model, cloud)
+        with torch.no_grad():
+            model._opacity += torch.linspace(0.5, 4.0, count)[:, None]
+        if setup:
+            model.training_setup(arguments)
+        return model
+
+    def camera(self, width: int, height: int, *, side: float = 0.0) -> Any:
+        """A camera three units in front of the points, with a photograph."""
+        pixels = np.random.default_rng(7).integers(0, 255, (3, height, width), dtype=np.uint8)
+        fov_x, fov_y = 0.8, 0.6
+        view = View.pinhole(
+            torch.eye(3),
+            torch.tensor([side, 0.0, 3.0]),
+            width=width,
+            height=height,
+            fx=width / (2 * math.tan(fov_x / 2)),
+            fy=height / (2 * math.tan(fov_y / 2)),
+        )
+        return SimpleNamespace(
+            uid=int(10 * side),
+            image_name="photo",
+            image_width=width,
+            image_height=height,
+            FoVx=fov_x,
+            FoVy=fov_y,
+            world_view_transform=view.viewmatrix,
+            full_proj_transform=view.projmatrix,
+            camera_center=view.campos,
+            original_image=torch.from_numpy(pixels).float() / 255,
+        )
+
+    # -- drawing and learning --------------------------------------------------------------------
+
+    def pipe(self) -> Any:
+        """The options that hosts pass to ``render``."""
+        return SimpleNamespace(
+            debug=False,
+            compute_cov3D_python=False,
+            convert_SHs_python=False,
+            antialiasing=False,
+        )
+
+    def render(self, camera: Any, model: Any, background: Tensor) -> dict[str, Any]:
+        """The host's function as scripts hold it: "render" (3, H, W) and whatever else."""
+        draw = import_module("gaussian_renderer").render
+        package: dict[str, Any] = draw(camera, model, self.pipe(), background)
+        return package
+
+    def step(self, model: Any, camera: Any, iteration: int, background: Tensor) -> float:
+        """One iteration in the host's order, densification left out; returns the loss."""
+        model.update_learning_rate(iteration)
+        package = self.render(camera, model, background)
+        loss = (package["render"] - camera.original_image).abs().mean()
+        loss.backward()
+        with torch.no_grad():
+            self.gather(model, package)
+            self.descend(model)
+        return float(loss.detach())
+
+    def gather(self, model: Any, package: dict[str, Any]) -> None:
+        """Note what the host densifies by."""
+        model.add_densification_stats(package["viewspace_points"], package["visibility_filter"])
+
+    def descend(self, model: Any) -> None:
+        """The optimizers' step."""
+        model.optimizer.step()
+        model.optimizer.zero_grad(set_to_none=True)
+
+    def parameters(self, model: Any) -> dict[str, Tensor]:
+        """Every trained tensor by the name of its param group."""
+        return {group["name"]: group["params"][0] for group in model.optimizer.param_groups}
+
+    # -- rows ------------------------------------------------------------------------------------
+
+    def actions(self) -> Mapping[str, Action]:
+        """Everything that changes rows, by name; sequences of these are tried."""
+        return {
+            "prune": prune,
+            "clone": clone,
+            "split": split,
+            "densify and prune": densify_and_prune,
+            "reset opacity": lambda model, arguments, chance: model.reset_opacity(),
+            "another band": lambda model, arguments, chance: model.oneupSHdegree(),
+            "restore": self.restore_from_file,
+            "training setup": lambda model, arguments, chance: model.training_setup(arguments),
+        }
+
+    def restore_from_file(self, model: Any, arguments: Any, chance: Chance) -> None:
+        """Through a checkpoint and back into the same model."""
+        file = io.BytesIO()
+        torch.save((self.capture(model), 7), file)
+        file.seek(0)
+        self.restore(model, torch.load(file, weights_only=False)[0], arguments)
+
+    def mark(self, model: Any, numbers: Tensor) -> None:
+        """Write a number (N,) into each row, where the host copies it from parents to children."""
+        with torch.no_grad():
+            model._features_dc[:, 0, 0] = numbers
+
+    def marks(self, model: Any) -> Tensor:
+        """(N,) int64 the numbers as they are now; -1 for rows that descend from nobody."""
+        numbers: Tensor = model._features_dc.detach()[:, 0, 0].round().long()
+        return numbers
+
+    def hide(self, model: Any, row: int) -> None:
+        """Make one Gaussian so faint that it is never drawn."""
+        with torch.no_grad():
+            self.parameters(model)["opacity"][row] = -30.0
+
+    # -- files -----------------------------------------------------------------------------------
+
+    def save(self, model: Any, path: Path) -> None:
+        """The host's own way to save a model."""
+        model.save_ply(str(path))
+
+    def load(self, model: Any, path: Path) -> None:
+        """The host's own way to load it into an empty model."""
+        model.load_ply(str(path))
+
+    def capture(self, model: Any) -> Any:
+        """What the host puts into a checkpoint."""
+        return model.capture()
+
+    def restore(self, model: Any, captured: Any, arguments: Any) -> None:
+        """Take it up again."""
+        model.restore(captured, arguments)
+
+
+def prune(model: Any, arguments: Any, chance: Chance) -> None:
+    """Remove rows, by a mask of torch's or, as some hosts have it, of NumPy's."""
+    gone = chance.rows(len(model.get_xyz))
+    model.prune_points(gone.numpy() if chance.heads else gone)
+
+
+def clone(model: Any, arguments: Any, chance: Chance) -> None:
+    """Copy small rows with large gradients."""
+    _densify(model.densify_and_clone, model, 1e6, chance)
+
+
+def split(model: Any, arguments: Any, chance: Chance) -> None:
+    """Divide large rows with large gradients."""
+    _densify(model.densify_and_split, model, 1e-6, chance)
+
+
+def _densify(method: Any, model: Any, all_rows: float, chance: Chance) -> None:
+    grads = chance.uniform(len(model.get_xyz), 1)
+    method(grads, 1 - chance.share, all_rows if chance.seed % 3 else 3.0)
+
+
+def densify_and_prune(model: Any, arguments: Any, chance: Chance) -> None:
+    """What the training loop calls: clone, split, then prune the faint and the large."""
+    n = len(model.get_xyz)
+    model.xyz_gradient_accum = chance.uniform(n, 1)
+    model.denom = chance.rows(n, 0.8)[:, None].float()
+    with torch.no_grad():
+        model._opacity[chance.rows(n, chance.share / 2)] = -9.0
+    model.max_radii2D = 40 * chance.uniform(n)
+    largest = 20 if chance.heads else None
+    radii = [torch.ones(n)] if _takes_radii(model.densify_and_prune) else []
+    model.densify_and_prune(1 - chance.share, 0.005, 3.0, largest, *radii)
+
+
+def _takes_radii(method: Any) -> bool:
+    return "radii" in inspect.signature(method).parameters
+
+
+@dataclass
+class Running:
+    """A host under a session, and the handful of things a training loop does with it."""
+
+    session: Session
+    driver: Host
+    arguments: Any
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.session, name)
+
+    def model(self, count: int = 30, *, seed: int = 0, degree: int = 1, setup: bool = True) -> Any:
+        """A model of random points in front of the camera."""
+        return self.driver.model(self.arguments, count, seed=seed, degree=degree, setup=setup)
+
+    def camera(self, width: int = 24, height: int = 18, *, side: float = 0.0) -> Any:
+        """A camera three units in front of the points."""
+        return self.driver.camera(width, height, side=side)
+
+    def render(self, camera: Any, model: Any, background: Tensor | None = None) -> dict[str, Any]:
+        """The host's own function, as its scripts hold it."""
+        background = torch.zeros(3) if background is None else background
+        return self.driver.render(camera, model, background)
+
+    def step(self, model: Any, camera: Any, iteration: int) -> float:
+        """One iteration in the hosts' order; returns the loss."""
+        return self.driver.step(model, camera, iteration, torch.zeros(3))
+
+
+@contextlib.contextmanager
+def imported(path: Path) -> Iterator[None]:
+    """A host's folder first on the path; its modules are forgotten afterwards."""
+    known = set(sys.modules)
+    sys.path.insert(0, str(path))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(path))
+        for name in sys.modules.keys() - known:
+            file = getattr(sys.modules[name], "__file__", None) or ""
+            if Path(file).is_relative_to(path):
+                del sys.modules[name]
+
+
+@contextlib.contextmanager
+def running(
+    settings: Settings | None = None,
+    *,
+    adapter: HostAdapter,
+    path: Path = MINIATURE,
+    driver: Host | None = None,
+    plugins: Any = None,
+    active: bool = True,
+    **options: Any,
+) -> Iterator[Running]:
+    """The host in this process, imported under a session (activated unless told otherwise).
+
+    Args:
+        settings: of the fine-tuning.
+        adapter: of the host.
+        path: its folder.
+        driver: how to drive it.
+        plugins: objects with hooks to register besides.
+        active: False makes the session and leaves its activation to the caller.
+        options: of the session; our stand-ins are used unless these say otherwise.
+    """
+    loaded = load_plugins()
+    for index, plugin in enumerate(plugins or ()):
+        loaded.manager.register(plugin, f"test-{index}")
+    settings, driver = settings or Settings(iterations=20), driver or Host()
+    session = Session(adapter, HostRepo(path), loaded, settings, **({"drop_in": True} | options))
+    with imported(path), cpu_only():
+        if active:
+            session.activate()
+        try:
+            yield Running(session, driver, driver.arguments())
+        finally:
+            session.deactivate()
+
+
+def joint(settings: Settings | None = None, **options: Any) -> Any:
+    """The host under a session that learns from the first step and freezes nothing."""
+    settings = settings or Settings(iterations=20)
+    schedule = JointSchedule(settings, 1)
+    return running(settings, freeze=False, schedule=schedule, **options)
+
+
+def tensors(driver: Host, model: Any) -> dict[str, Tensor]:
+    """Copies of the model's parameters by the names of its param groups."""
+    return {name: value.detach().clone() for name, value in driver.parameters(model).items()}
+
+
+def logits_of(marks: Tensor) -> Tensor:
+    """The threshold logit that ``label`` gives the bearer of a mark."""
+    return -3 + marks.float() / 8
+
+
+def label(host: Running, model: Any) -> None:
+    """Mark row i with i, and give it a threshold and moments that only i has."""
+    numbers = torch.arange(host.adapter.rows(model))
+    host.driver.mark(model, numbers)
+    host.store(model).load_state_dict(
+        {
+            "logits": logits_of(numbers),
+            "exp_avg": numbers.float() + 1,
+            "exp_avg_sq": numbers.float() + 1,
+            "adam_step": 2.0,
+            "steps": 2,
+        }
+    )
+
+
+def expect_ancestors(host: Running, model: Any) -> None:
+    """Every row has the threshold of the row it descends from, and its moments or none.
+
+    The marks are the shadow model: the host itself copies them from parents to children.
+
+    Raises:
+        AssertionError: with the first row that has another's threshold.
+    """
+    store, marks = host.store(model), host.driver.marks(model)
+    rows, state = host.adapter.rows(model), store.state_dict()
+    if not len(store) == rows == len(marks):
+        raise AssertionError(f"{len(store)} thresholds for {rows} Gaussians")
+    neutral = torch.full((rows,), NEUTRAL_LOGIT)
+    expected = torch.where(marks >= 0, logits_of(marks), neutral)
+    moments = state["exp_avg"]
+    own = torch.where(marks >= 0, marks.float() + 1, 0.0)
+    right = (state["logits"] == expected) & ((moments == 0) | (moments == own))
+    right &= state["exp_avg_sq"] == moments  # children start without, as the hosts' do
+    if not right.all():
+        row = int((~right).nonzero()[0])
+        raise AssertionError(
+            f"row {row} of {rows} descends from {marks[row]} and must have the logit "
+            f"{expected[row]:g} and moments {own[row]:g} or 0; it has {state['logits'][row]:g} "
+            f"and {moments[row]:g}"
+        )

@@ -1,0 +1,31 @@
+"""The promises that every adapter keeps, each as a check of one host.
+
+A check runs in a process of its own, returns what it has covered in a few words, and raises
+AssertionError with what was found where the promise is broken.
+"""
+
+from __future__ import annotations
+
+from fragprune_plugins.testing.invariants.alignment import alignment
+from fragprune_plugins.testing.invariants.case import Case
+from fragprune_plugins.testing.invariants.freeze import freeze
+from fragprune_plugins.testing.invariants.monotone import monotone
+from fragprune_plugins.testing.invariants.neutral import neutral_is_the_host
+from fragprune_plugins.testing.invariants.off import nothing_stays, off_is_off, orders
+from fragprune_plugins.testing.invariants.picture import same_picture
+from fragprune_plugins.testing.invariants.refuse import refuse
+from fragprune_plugins.testing.invariants.round_trip import round_trip
+
+__all__ = [
+    "Case",
+    "alignment",
+    "freeze",
+    "monotone",
+    "neutral_is_the_host",
+    "nothing_stays",
+    "off_is_off",
+    "orders",
+    "refuse",
+    "round_trip",
+    "same_picture",
+]

@@ -1,0 +1,83 @@
+"""What a check is given, and what checks share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.adapter import HostAdapter
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.testing.host import Host, Running
+
+COUNT = 16
+
+
+@dataclass(frozen=True)
+class Case:
+    """An adapter and a host to try it on.
+
+    Attributes:
+        adapter: under test.
+        driver: how the host is driven.
+        root: the host's folder, a miniature or a checkout; it is only read.
+        examples: sequences of actions to try.
+        longest: order of import, activation and deactivation to try.
+    """
+
+    adapter: HostAdapter
+    driver: Host
+    root: Path
+    examples: int = 20
+    longest: int = 3
+
+    @property
+    def repo(self) -> HostRepo:
+        """The host's source."""
+        return HostRepo(self.root)
+
+    @property
+    def seams(self) -> tuple[Seam, ...]:
+        """Of this revision."""
+        return self.adapter.seams_for(self.repo)
+
+    def has(self, role: Role) -> bool:
+        """Whether the adapter wraps anything for a role."""
+        return any(seam.role is role for seam in self.seams)
+
+    def options(self) -> dict[str, Any]:
+        """For ``running`` and ``joint``."""
+        return {"adapter": self.adapter, "path": self.root, "driver": self.driver}
+
+
+def require(condition: object, found: str) -> None:
+    """Raise AssertionError with what was found, unless the condition holds."""
+    if not condition:
+        raise AssertionError(found)
+
+
+class FixedThresholds:
+    """A plugin that answers with the thresholds it holds and remembers what was drawn."""
+
+    def __init__(self, values: Tensor | None = None) -> None:
+        self.values, self.inputs, self.calls = values, None, 0
+
+    @hookimpl(tryfirst=True)
+    def fragprune_truncate(self, inputs: Any, store: Any) -> Tensor | None:
+        """The thresholds held; those learned when there are none."""
+        self.inputs = inputs
+        self.calls += 1
+        return self.values
+
+
+def open_all(host: Running, model: Any) -> Any:
+    """Thresholds between 0.02 and 0.4, unequal; returns the store."""
+    store = host.store(model)
+    with torch.no_grad():
+        store.logits.copy_(torch.logit(torch.linspace(0.02, 0.4, len(store))))
+    return store

@@ -1,0 +1,77 @@
+"""Invariant 4: truncation only takes away, and takes all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.schedule import Settings
+from fragprune_plugins.testing.host import Chance, Running, joint
+from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, open_all, require
+
+
+def monotone(case: Case) -> str:
+    """A raised threshold adds no fragment; a Gaussian cut to nothing leaves no trace."""
+    fragments = 0
+    for seed in range(5):
+        fixed = FixedThresholds()
+        with joint(plugins=[fixed], **case.options()) as host:
+            model, camera = host.model(24, seed=seed), host.camera()
+            open_all(host, model)
+            chance = Chance(seed, 0.5)
+            low, raised = 0.5 * chance.uniform(24), chance.rows(24)
+            high = torch.where(raised, low + 0.4 * chance.uniform(24), low)
+            before, after = (_counted(host, fixed, model, camera, tau) for tau in (low, high))
+            own = before.fragments_per_gaussian
+            require((after.fragments_per_gaussian <= own).all(), "a raised threshold added some")
+            require(
+                torch.equal(after.fragments_per_gaussian[~raised], own[~raised]),
+                "a threshold that stood still drew other fragments",
+            )
+            require((after.fragments <= before.fragments).all(), "a pixel has more fragments")
+            require(
+                torch.equal(after.radii, before.radii), "radii, by which hosts densify, changed"
+            )
+            require(after.fragments.sum() < before.fragments.sum(), "nothing was truncated")
+            fragments += int(before.fragments.sum())
+    _no_trace(case)
+    return f"{fragments} fragments in 5 pictures"
+
+
+def _counted(host: Running, fixed: FixedThresholds, model: Any, camera: Any, tau: Tensor) -> Any:
+    """Draw through the host with thresholds, then the same once more, counting."""
+    fixed.values = tau
+    host.render(camera, model)
+    assert fixed.inputs is not None
+    with torch.no_grad():
+        return host.engine(tau.device).rasterize(fixed.inputs.with_counts(), tau)
+
+
+def _no_trace(case: Case) -> None:
+    """Row 0 cut to nothing: picture and gradients are those of a scene where it is invisible."""
+    results = []
+    for cut in (True, False):
+        fixed = FixedThresholds()
+        with joint(Settings(iterations=9, pressure=0.0), plugins=[fixed], **case.options()) as host:
+            model, camera = host.model(24), host.camera()
+            open_all(host, model)
+            # No pixel's falloff comes within the surrogate's reach of the highest threshold.
+            tau = torch.full((24,), 1e-3)
+            if cut:
+                tau[0] = 1 - 1e-6
+            else:
+                host.driver.hide(model, 0)
+            fixed.values = tau.requires_grad_()
+            package = host.render(camera, model)
+            package["render"].square().sum().backward()
+            gradients = {
+                n: p.grad for n, p in host.driver.parameters(model).items() if p.grad is not None
+            }
+            results.append((package["render"].detach(), gradients))
+    (image, gradients), (without, expected) = results
+    torch.testing.assert_close(image, without, rtol=0, atol=1e-6)
+    for name, gradient in gradients.items():
+        require((gradient[0] == 0).all(), f"{name}: a truncated Gaussian still has a gradient")
+        torch.testing.assert_close(gradient[1:], expected[name][1:], rtol=1e-4, atol=1e-6)

@@ -1,0 +1,93 @@
+"""Invariant 2: neutral thresholds change no bit."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from fragprune_plugins.schedule import Schedule, Settings
+from fragprune_plugins.testing.host import Chance, Running, joint, running, tensors
+from fragprune_plugins.testing.invariants.case import COUNT, Case, require
+
+
+class NeverLearning(Schedule):
+    """Follows everything and learns nothing."""
+
+    def at(self, step: int) -> Any:
+        """The plan, without learning."""
+        return replace(super().at(step), learn=False)
+
+
+def neutral_is_the_host(case: Case) -> str:
+    """Followed but not learning, parameters and random streams are the host's own to the bit."""
+    never = NeverLearning(Settings(iterations=20))
+    with running(active=False, **case.options()) as host:
+        host.session._install_stand_ins()  # the compiled packages a host cannot do without
+        alone = _lifetime(host)
+    with running(never.settings, schedule=never, freeze=False, **case.options()) as host:
+        followed = _lifetime(host)
+        require(host._last_state is not None, "the session never saw the model")
+        require(host._last_state.steps == _STEPS, f"{host._last_state.steps} steps were counted")
+    _compare(alone, followed)
+    pixels, gradients = _opened_changes_nothing(case)
+    return f"{len(alone)} tensors after {_STEPS} steps; {pixels} pixels, {gradients} gradients"
+
+
+_STEPS = 6
+
+
+def _lifetime(host: Running) -> dict[str, Any]:
+    """Steps with everything the training loop does between; what came of it."""
+    torch.manual_seed(3)
+    np.random.seed(3)
+    random.seed(3)
+    model, camera = host.model(COUNT), host.camera()
+    actions = host.driver.actions()
+    losses = []
+    for iteration in range(1, _STEPS + 1):
+        losses.append(host.step(model, camera, iteration))
+        name = host.driver.routine[iteration % len(host.driver.routine)]
+        actions[name](model, host.arguments, Chance(iteration, 0.3))
+    return {
+        **tensors(host.driver, model),
+        "torch's random stream": torch.get_rng_state(),
+        "numpy's random stream": torch.from_numpy(
+            np.random.get_state(legacy=False)["state"]["key"].astype(np.int64)
+        ),
+        "python's random stream": torch.tensor(random.getstate()[1]),
+        "losses": torch.tensor(losses),
+    }
+
+
+def _compare(alone: dict[str, Any], followed: dict[str, Any]) -> None:
+    require(alone.keys() == followed.keys(), f"{sorted(alone)} became {sorted(followed)}")
+    for name, value in alone.items():
+        require(torch.equal(value, followed[name]), f"{name} differ from the host's own")
+
+
+def _opened_changes_nothing(case: Case) -> tuple[int, int]:
+    """Freshly opened thresholds change no pixel, and gradients only in their rounding."""
+    pictures, gradients = [], []
+    for opened in (False, True):
+        with joint(Settings(iterations=9, pressure=0.0), **case.options()) as host:
+            model, camera = host.model(40), host.camera()
+            if opened:
+                host.store(model).open(host.adapter.opacities(model))
+            package = host.render(camera, model)
+            (package["render"] - camera.original_image).square().sum().backward()
+            pictures.append(package["render"].detach())
+            gradients.append(
+                {n: p.grad for n, p in host.driver.parameters(model).items() if p.grad is not None}
+            )
+            require(host.store(model).neutral != opened, "thresholds did not open")
+    require(torch.equal(*pictures), "freshly opened thresholds change the picture")
+    require(gradients[0].keys() == gradients[1].keys(), "gradients reach other parameters")
+    for name, gradient in gradients[0].items():
+        # The same terms in the same order; the compiler may fuse them otherwise: a few roundings.
+        same = torch.allclose(gradients[1][name], gradient, rtol=1e-6, atol=1e-9)
+        require(same, f"freshly opened thresholds change the gradient of {name}")
+    return pictures[0][0].numel(), len(gradients[0])

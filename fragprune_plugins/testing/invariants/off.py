@@ -1,0 +1,108 @@
+"""Invariant 1: installed but not active, every object of the host is its own."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from itertools import product
+from typing import Any
+
+import torch
+import wrapt
+
+from fragprune_plugins import session as sessions
+from fragprune_plugins.device import cpu_only
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.seams import Seam
+from fragprune_plugins.session import Session
+from fragprune_plugins.testing.host import imported, joint
+from fragprune_plugins.testing.invariants.case import (
+    COUNT,
+    Case,
+    FixedThresholds,
+    open_all,
+    require,
+)
+
+
+def orders(longest: int) -> list[str]:
+    """Orders of I, which imports the host, A, which activates, and D, which deactivates."""
+    return [
+        "".join(order)
+        for length in range(1, longest + 1)
+        for order in product("IAD", repeat=length)
+        if order.count("I") == 1 and order.count("A") <= 2
+    ]
+
+
+def off_is_off(case: Case, order: str) -> str:
+    """Whenever we are not active, every object of the host is its own, in this order of events."""
+    compiled = case.adapter.dialect(case.repo).modules(_never_drawn)
+    sys.modules.update(compiled)  # as a host's own compiled packages, which outlast us
+    originals: dict[Seam, Any] = {}
+    session = Session(case.adapter, case.repo, load_plugins(), drop_in=False)
+    with imported(case.root), cpu_only():
+        for number, event in enumerate(order):
+            where = f"{order} after {order[: number + 1]}"
+            active = sessions.active_session() is session
+            if event == "I":
+                for seam in case.seams:
+                    import_module(seam.module)
+                originals = {seam: _pure(seam, active) for seam in case.seams}
+            elif event == "A" and not active:
+                session.activate()
+            elif event == "D" and active:
+                findings = session.deactivate()
+                require(not findings, f"{where}: {[str(f) for f in findings]}")
+            active = sessions.active_session() is session
+            for seam, original in originals.items():
+                ours = _found(seam) is not original
+                require(ours == active, f"{where}: {seam} is {'ours' if ours else 'its own'}")
+    return f"{len(originals)} seams"
+
+
+def _never_drawn(call: Any) -> Any:
+    raise AssertionError("the host drew while only its modules were imported")
+
+
+def _found(seam: Seam) -> Any:
+    """The object at a seam, as its module or class holds it."""
+    value: Any = sys.modules[seam.module]
+    for name in seam.attribute.split("."):
+        value = vars(value)[name] if isinstance(value, type) else getattr(value, name)
+    return value
+
+
+def _pure(seam: Seam, active: bool) -> Any:
+    """What the host itself defined there, below every wrapper of ours."""
+    value = _found(seam)
+    while active and isinstance(value, wrapt.FunctionWrapper):
+        value = value.__wrapped__
+    return value
+
+
+def nothing_stays(case: Case) -> str:
+    """After a session with learned thresholds the host draws, and computes, as it would alone."""
+    names = list(case.adapter.dialect(case.repo).modules(_never_drawn))
+    fixed = FixedThresholds()
+    with joint(plugins=[fixed], **case.options()) as host:
+        model, camera = host.model(COUNT), host.camera()
+        open_all(host, model)
+        with torch.no_grad():
+            truncated = host.render(camera, model)["render"]
+            require(fixed.calls == 1, f"one picture asked {fixed.calls} times for thresholds")
+            with host.paused():
+                alone = host.render(camera, model)["render"]
+        require(not torch.equal(truncated, alone), "paused, thresholds were still applied")
+        require(not host.deactivate(), "something could not be restored")
+        require(not host.deactivate(), "deactivating twice is not harmless")
+        left = [name for name in names if name in sys.modules]
+        require(not left, f"stand-ins left in sys.modules: {left}")
+        again = sessions.active_session()
+        require(again is None, "a session is still active")
+        with torch.no_grad():
+            require(
+                torch.equal(host.render(camera, model)["render"], alone),
+                "deactivated, the host's picture is not its own",
+            )
+    return f"{len(names)} stand-ins"

@@ -1,0 +1,75 @@
+"""Invariant 8: every engine draws the same picture."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.errors import FragpruneError
+from fragprune_plugins.schedule import Settings
+from fragprune_plugins.testing.fresh import NotApplicable
+from fragprune_plugins.testing.host import Chance, joint
+from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, open_all, require
+
+IMAGE_TOLERANCE = 2e-5
+"""About 2^-23 times the fragments of a pixel, with room for terms of both signs."""
+
+GRADIENT_TOLERANCE = 1e-3
+"""Of a tensor's largest entry: float32 sums over all pixels, divided by 1 - alpha >= 0.01."""
+
+
+def same_picture(case: Case) -> str:
+    """The engines of this machine agree on the host's picture and on every gradient."""
+    others = []
+    for name in ("cpu", "cuda"):
+        try:
+            create_engine(name)
+        except FragpruneError:
+            continue
+        others.append(name)
+    if not others:
+        raise NotApplicable("no engine but the reference runs here")
+    for seed in range(3):
+        truth, counts = _drawn_by(case, "reference", seed, None)
+        for name in others:
+            ours, own = _drawn_by(case, name, seed, None)
+            same = counts == own  # a fragment on a cut may fall either way by rounding
+            require((~same).sum() <= 1 + same.numel() // 500, f"{name}: other fragments drawn")
+            ours, _ = _drawn_by(case, name, seed, same)
+            truth, _ = _drawn_by(case, "reference", seed, same)
+            for key, expected in truth.items():
+                limit = IMAGE_TOLERANCE if key == "picture" else GRADIENT_TOLERANCE
+                scale = (
+                    max(1.0, float(expected.abs().max()))
+                    if key == "picture"
+                    else (float(expected.abs().max()) + 1e-3)
+                )
+                away = float((ours[key] - expected).abs().max()) / scale
+                require(away < limit, f"{name}: {key} differs by {away:.2g}, more than {limit:g}")
+    return f"{', '.join(others)} against the reference: {len(truth) - 1} gradients, 3 scenes"
+
+
+def _drawn_by(
+    case: Case, engine: str, seed: int, mask: Tensor | None
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Picture and gradients where the mask holds, and drawn fragments (H, W), of one engine."""
+    fixed = FixedThresholds()
+    settings = Settings(iterations=9, pressure=0.0)
+    with joint(settings, plugins=[fixed], engine=engine, **case.options()) as host:
+        model, camera = host.model(24, seed=seed), host.camera(33, 17)
+        store = open_all(host, model)
+        package = host.render(camera, model)
+        image = package["render"]
+        with torch.no_grad():
+            assert fixed.inputs is not None
+            drawn = host.engine(image.device).rasterize(fixed.inputs.with_counts(), store.values)
+        mask = torch.ones_like(drawn.fragments, dtype=torch.bool) if mask is None else mask
+        weights = Chance(seed, 0.5).uniform(*image.shape) - 0.5
+        (image * weights * mask).sum().backward()
+        gradients = {
+            f"gradient of {n}": p.grad
+            for n, p in (*host.driver.parameters(model).items(), ("thresholds", store.logits))
+            if p.grad is not None
+        }
+    return {"picture": (image * mask).detach(), **gradients}, drawn.fragments

@@ -1,0 +1,96 @@
+"""Invariant 5: what is saved is loaded, bit for bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+
+from fragprune_plugins import sidecar
+from fragprune_plugins.errors import SidecarError
+from fragprune_plugins.seams import Role
+from fragprune_plugins.testing.fresh import NotApplicable
+from fragprune_plugins.testing.host import Running, joint, running, tensors
+from fragprune_plugins.testing.invariants.case import Case, require
+
+
+def round_trip(case: Case) -> str:
+    """What is saved is loaded bit for bit, and the host's files stay the host's."""
+    parts = []
+    with TemporaryDirectory() as folder:
+        if case.has(Role.SAVE) and case.has(Role.LOAD):
+            _through_a_model_file(case, Path(folder) / "point_cloud.ply")
+            parts.append("model file")
+        if case.has(Role.CAPTURE) and case.has(Role.RESTORE):
+            _through_a_checkpoint(case, Path(folder) / "chkpnt3.pth")
+            parts.append("checkpoint")
+    if not parts:
+        raise NotApplicable("the adapter wraps neither saving and loading nor checkpoints")
+    return " and ".join(parts)
+
+
+def _trained(host: Running, count: int = 20) -> Any:
+    model, camera = host.model(count), host.camera()
+    for iteration in (1, 2, 3):
+        host.step(model, camera, iteration)
+    return model
+
+
+def _require_same(state: dict[str, Any], other: dict[str, Any], what: str) -> None:
+    for key, value in state.items():
+        same = torch.equal(value, other[key]) if torch.is_tensor(value) else value == other[key]
+        require(same, f"{key} {what} differ from those saved")
+
+
+def _through_a_model_file(case: Case, path: Path) -> None:
+    with joint(**case.options()) as host:
+        model = _trained(host)
+        host.driver.save(model, path)
+        state = host.store(model).state_dict()
+        with torch.no_grad():
+            picture = host.render(host.camera(), model)["render"]
+        bands = getattr(model, "active_sh_degree", None)
+        ours = path.read_bytes()
+        host.deactivate()
+        host.driver.save(model, path)
+        require(path.read_bytes() == ours, "the host's own file is not what the host writes alone")
+        stale = sidecar.path_beside(path)
+        require(stale.exists(), "no sidecar was written")
+    with running(learn=False, **case.options()) as host:  # as a host's render script does
+        loaded = host.model(5, setup=False)
+        host.driver.load(loaded, path)
+        _require_same(state, host.store(loaded).state_dict(), "of a loaded model")
+        if bands is not None:
+            loaded.active_sh_degree = bands  # load_ply uses every band; training was not so far
+        with torch.no_grad():
+            again = host.render(host.camera(), loaded)["render"]
+        require(torch.equal(again, picture), "a loaded model's picture is not the saved one's")
+        other = host.model(20, seed=4, setup=False)
+        host.driver.save(other, path)  # trained again, without us
+        try:
+            host.driver.load(host.model(5, setup=False), path)
+        except SidecarError:
+            return
+        raise AssertionError("the sidecar of another file was taken")
+
+
+def _through_a_checkpoint(case: Case, path: Path) -> None:
+    with joint(**case.options()) as host:
+        model = _trained(host)
+        state, parameters = host.store(model).state_dict(), tensors(host.driver, model)
+        torch.save((host.driver.capture(model), 3), path)
+    with joint(**case.options()) as host:
+        model = host.model(5)
+        captured, _ = torch.load(path, weights_only=False)
+        host.driver.restore(model, captured, host.arguments)
+        _require_same(state, host.store(model).state_dict(), "of a restored model")
+        _require_same(parameters, tensors(host.driver, model), "of a restored model")
+        host.step(model, host.camera(), 4)
+    with running(active=False, **case.options()) as host:
+        host.session._install_stand_ins()
+        model = host.model(5)
+        captured, _ = torch.load(path, weights_only=False)
+        host.driver.restore(model, captured, host.arguments)  # the host alone reads it too
+        _require_same(parameters, tensors(host.driver, model), "restored without us")

@@ -1,0 +1,52 @@
+"""Changes one thing in a host's source, as its authors might; for checks that must notice."""
+
+from __future__ import annotations
+
+import ast
+import shutil
+from pathlib import Path
+
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.seams import Seam
+
+RENAMED = "renamed_by_the_conformance_kit"
+
+
+def copy_source(root: Path, target: Path) -> HostRepo:
+    """A copy of a host's Python files, and nothing else of it."""
+    for file in root.rglob("*.py"):
+        if ".git" not in file.parts:
+            copied = target / file.relative_to(root)
+            copied.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, copied)
+    return HostRepo(target)
+
+
+def rename_function(repo: HostRepo, seam: Seam) -> None:
+    """The seam's function is called something else."""
+    path, function = _definition(repo, seam)
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    line = lines[function.lineno - 1]
+    lines[function.lineno - 1] = line.replace(f"def {function.name}", f"def {RENAMED}", 1)
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def rename_parameter(repo: HostRepo, seam: Seam, name: str) -> None:
+    """One of the seam's parameters is called something else; its body is left to fail."""
+    path, function = _definition(repo, seam)
+    given = function.args
+    (parameter,) = (
+        each for each in (*given.posonlyargs, *given.args, *given.kwonlyargs) if each.arg == name
+    )
+    lines = path.read_bytes().splitlines(keepends=True)  # columns of the syntax tree count bytes
+    line, start = lines[parameter.lineno - 1], parameter.col_offset
+    end = start + len(name.encode())
+    lines[parameter.lineno - 1] = line[:start] + RENAMED.encode() + line[end:]
+    path.write_bytes(b"".join(lines))
+
+
+def _definition(repo: HostRepo, seam: Seam) -> tuple[Path, ast.FunctionDef | ast.AsyncFunctionDef]:
+    path, function = repo.path(seam.module), repo.function(seam.module, seam.attribute)
+    if path is None or function is None:
+        raise AssertionError(f"{seam} is not in the source, yet the adapter says that it fits")
+    return path, function

@@ -1,0 +1,106 @@
+"""The kit's pytest plugin: a table of adapters and invariants at the end, and as a file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+RESULTS = pytest.StashKey[list[dict[str, Any]]]()
+WHAT, COVERED = "fragprune invariant", "fragprune covered"
+_SIGNS = {"passed": "ok", "failed": "FAILED", "skipped": "skipped"}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--fragprune-report``."""
+    parser.getgroup("fragprune").addoption(
+        "--fragprune-report",
+        metavar="FILE",
+        help="Write what the conformance kit found, adapter by invariant, as JSON.",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Begin with no results."""
+    config.stash[RESULTS] = []
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Note whose invariant a test is, for its report."""
+    kind: Any = getattr(item, "cls", None)
+    place = getattr(item, "callspec", None)
+    if hasattr(kind, "longest_order") and place is not None and "place" in place.params:
+        adapter = kind.adapter if isinstance(kind.adapter, str) else kind.adapter.name
+        name = getattr(item, "originalname", item.name)
+        invariant = name.removeprefix("test_").replace("_", " ")
+        item.user_properties.append((WHAT, [adapter, place.id, invariant]))
+
+
+class _Collector:
+    """Turns reports of tests into results."""
+
+    def __init__(self, results: list[dict[str, Any]]) -> None:
+        self.results = results
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Keep what the test itself said, or the set-up that failed."""
+        properties: dict[str, Any] = dict(report.user_properties)
+        if WHAT not in properties or (report.when != "call" and report.passed):
+            return
+        adapter, host, invariant = properties[WHAT]
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longreprtext
+        self.results.append(
+            {
+                "adapter": adapter,
+                "host": host,
+                "invariant": invariant,
+                "outcome": report.outcome,
+                "covered": properties.get(COVERED, ""),
+                "reason": "" if report.passed else str(reason).strip(),
+                "seconds": round(report.duration, 2),
+            }
+        )
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Listen."""
+    session.config.pluginmanager.register(_Collector(session.config.stash[RESULTS]))
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Adapters down, invariants across; reasons of what was skipped below."""
+    results = config.stash[RESULTS]
+    if not results:
+        return
+    if target := config.getoption("--fragprune-report"):
+        Path(target).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    terminalreporter.section("fragprune conformance")
+    for line in table(results):
+        terminalreporter.line(line)
+    for result in results:
+        if result["outcome"] == "skipped":
+            terminalreporter.line(
+                "skipped: {adapter} on {host}, {invariant}: {reason}".format(**result)
+            )
+
+
+def table(results: list[dict[str, Any]]) -> list[str]:
+    """The results as lines of text, one an adapter and host."""
+    columns = list(dict.fromkeys(result["invariant"] for result in results))
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for result in results:
+        row = rows.setdefault((result["adapter"], result["host"]), {})
+        row[result["invariant"]] = _SIGNS[result["outcome"]]
+    heads = ("adapter", "host")
+    widths = [max(len(head), *(len(key[i]) for key in rows)) + 2 for i, head in enumerate(heads)]
+    cells = [max(len(column), 7) + 2 for column in columns]
+
+    def line(names: tuple[str, str], values: list[str]) -> str:
+        left = "".join(f"{name:<{width}}" for name, width in zip(names, widths, strict=True))
+        right = "".join(f"{value:<{width}}" for value, width in zip(values, cells, strict=True))
+        return (left + right).rstrip()
+
+    body = [line(key, [row.get(column, "-") for column in columns]) for key, row in rows.items()]
+    return [line(heads, columns), *body]

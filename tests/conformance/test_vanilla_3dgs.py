@@ -1,0 +1,7 @@
+from __future__ import annotations
+
+from fragprune_plugins.testing import AdapterConformance
+
+
+class TestVanilla3DGS(AdapterConformance):
+    adapter = "vanilla-3dgs"
