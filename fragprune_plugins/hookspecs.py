@@ -46,7 +46,8 @@ def fragprune_select_adapter(repo: HostRepo, matches: Sequence[Match]) -> str | 
 def fragprune_truncate(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
     """Give the thresholds (N,) in falloff to apply to one rasterization: learned, fixed, your own.
 
-    :param inputs: camera and the N Gaussians about to be drawn.
+    :param inputs: camera and the Gaussians about to be drawn: the model's N, or those of them that
+        the host picked; their thresholds are picked alike.
     :param store: the learned thresholds of the model being drawn.
     """
 

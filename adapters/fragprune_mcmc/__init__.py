@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import CommandLine, HostAdapter, HostCall, HostInfo
+from fragprune_plugins.adapter import CommandLine, ConfigFile, HostAdapter, HostCall, HostInfo
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.hookspecs import hookimpl
 from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
@@ -101,7 +101,7 @@ class MCMC(GraphdecoAdapter):
 
     def command_line(self, repo: HostRepo) -> CommandLine:
         """The lineage's, and a configuration file whose values win over the flags."""
-        return replace(super().command_line(repo), config="--config")
+        return replace(super().command_line(repo), config=ConfigFile("--config"))
 
     def still_rate(self, rate: Any) -> float:
         """No rate, no noise: the host multiplies what it adds to the positions by it."""

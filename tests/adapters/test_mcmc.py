@@ -338,20 +338,21 @@ def test_a_host_that_ends_early_with_success_is_a_stated_failure(mini, photograp
     assert "scene" not in sys.modules
 
 
-@pytest.mark.parametrize("key", ["iterations", "checkpoint_iterations", "start_checkpoint"])
-def test_a_configuration_file_may_not_overrule_what_we_set(mini, photographs, tmp_path, key):
-    config = tmp_path / "scene.json"
-    config.write_text(json.dumps({"cap_max": 170, key: 5}))
-    flags = ("--config", config)
-    with pytest.raises(UsageError, match=f"sets {key}, over whatever the command says"):
-        run(command(mini, photographs, tmp_path / "out", 12, *flags), OPTIONS)
-    config.write_text("{")
-    with pytest.raises(UsageError, match="a readable JSON file"):
-        run(command(mini, photographs, tmp_path / "out", 12, *flags), OPTIONS)
-
-
-def test_a_configuration_file_of_other_values_is_the_hosts_affair(mini, photographs, tmp_path):
-    config = tmp_path / "scene.json"
-    config.write_text(json.dumps({"cap_max": 170, "noise_lr": 1.0}))
-    summary = run(command(mini, photographs, tmp_path / "out", 12, "--config", config), OPTIONS)
+def test_what_stage_two_changes_wins_over_the_configuration_file(mini, photographs, tmp_path):
+    config, out = tmp_path / "scene.json", tmp_path / "out"
+    values = {"cap_max": 170, "iterations": 12, "model_path": str(out), "noise_lr": 1.0}
+    config.write_text(json.dumps(values))
+    summary = run(command(mini, photographs, "elsewhere", 5, "--config", config), OPTIONS)
+    assert summary.model_before == out / "point_cloud" / "iteration_12" / "point_cloud.ply"
+    assert summary.model_after == out / "point_cloud" / "iteration_20" / "point_cloud.ply"
     assert 150 < summary.gaussians <= 170
+    assert json.loads(config.read_text()) == values
+
+
+@pytest.mark.parametrize("text", [None, "{"], ids=["missing", "broken"])
+def test_a_configuration_file_that_cannot_be_read_is_refused(mini, photographs, tmp_path, text):
+    config = tmp_path / "scene.json"
+    if text:
+        config.write_text(text)
+    with pytest.raises(UsageError, match="a file the host can read"):
+        run(command(mini, photographs, tmp_path / "out", 12, "--config", config), OPTIONS)
