@@ -110,7 +110,6 @@ class _ModelState:
     begun: bool = False  # a step whose loss has not gone backward yet
     pending_parents: Tensor | None = None
     prepared: bool = False
-    optimizers: list[weakref.ReferenceType[Any]] = field(default_factory=list)
     base_rates: dict[str, float] = field(default_factory=dict)
     baseline: dict[int, float] = field(default_factory=dict)  # view -> untruncated fragments/px
     drawn: dict[int, float] = field(default_factory=dict)  # view -> fragments/px, last visit
@@ -211,6 +210,9 @@ class Session:
         self._stand_ins: dict[str, ModuleType] = {}
         self._absent: set[Seam] = set()  # metrics without their weights
         self._models: weakref.WeakKeyDictionary[Any, _ModelState] = weakref.WeakKeyDictionary()
+        self._optimizers: weakref.WeakKeyDictionary[Any, list[weakref.ReferenceType[Any]]] = (
+            weakref.WeakKeyDictionary()
+        )
         self._last: weakref.ReferenceType[Any] | None = None
         self._last_state: _ModelState | None = None  # outlives the host's model
         self._rendering: ContextVar[tuple[Any, int] | None] = ContextVar("rendering", default=None)
@@ -388,6 +390,7 @@ class Session:
         kept = state is not None and self._is_followed(model, state)  # before a new optimizer
         result = wrapped(*args, **kwargs)
         optimizers = self.adapter.optimizers(model, _named(wrapped, args, kwargs))
+        self._optimizers[model] = [weakref.ref(optimizer) for optimizer in optimizers]
         rows = self.adapter.rows(model)
         if state is not None and not kept:
             before = len(state.store)
@@ -401,8 +404,7 @@ class Session:
             )
             state = self._models[model] = _ModelState(store)
         self._follow(model, state)
-        state.optimizers = [weakref.ref(optimizer) for optimizer in optimizers]
-        state.base_rates = {name: group["lr"] for name, group in self._groups(model, state) if name}
+        state.base_rates = {name: group["lr"] for name, group in self._groups(model) if name}
         self._hook_optimizers(model, state)
         self.hook.fragprune_attached(model=model, store=state.store)
         return result
@@ -411,12 +413,13 @@ class Session:
         """Whether the means are the very tensor that was loaded, or trained until now."""
         means = self.adapter.means(model)
         known = [state.loaded() if state.loaded else None]
-        known += [each for _, group in self._groups(model, state) for each in group["params"]]
+        known += [each for _, group in self._groups(model) for each in group["params"]]
         return any(each is means for each in known)
 
-    def _groups(self, model: Any, state: _ModelState) -> list[tuple[str | None, dict[str, Any]]]:
+    def _groups(self, model: Any) -> list[tuple[str | None, dict[str, Any]]]:
         """Param groups of every optimizer, the main one's first, with the adapter's names."""
-        optimizers = [optimizer for each in state.optimizers if (optimizer := each()) is not None]
+        known = (each() for each in self._optimizers.get(model, ()))
+        optimizers = [optimizer for optimizer in known if optimizer is not None]
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
         return [(self.adapter.group_name(model, group), group) for group in groups]
 
@@ -425,7 +428,7 @@ class Session:
 
     def _hook_optimizers(self, model: Any, state: _ModelState) -> None:
         reference = weakref.ref(model)
-        for optimizer in (each() for each in state.optimizers):
+        for optimizer in (each() for each in self._optimizers[model]):
             if optimizer is None or optimizer in state.hooked:
                 continue
             state.hooked.add(optimizer)
@@ -514,7 +517,7 @@ class Session:
         trained = self.adapter.trained_groups(self.settings.train)
         if trained is None:
             return
-        for name, group in self._groups(model, self._models[model]):
+        for name, group in self._groups(model):
             for parameter in group["params"]:
                 parameter.requires_grad_(name in trained)
                 if name not in trained and name in self.adapter.gradients_read:
@@ -694,7 +697,7 @@ class Session:
             source, state.pending_parents = state.pending_parents, None
         if source is None:  # nothing to overwrite, or nothing to copy
             return result
-        groups = [(name, group) for name, group in self._groups(model, state) if name]
+        groups = [(name, group) for name, group in self._groups(model) if name]
         rows = {name: group["params"][0].detach()[target] for name, group in groups}
         if len(source) != len(target) or not self.adapter.check_children(model, rows, source):
             raise AlignmentError(
