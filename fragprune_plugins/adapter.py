@@ -61,9 +61,9 @@ class HostCall:
         kwargs: dict[str, Any],
         entry: str = "",
     ) -> HostCall:
-        """Name every argument by the function's signature."""
-        bound = inspect.signature(function).bind(*args, **kwargs)
-        return cls(settings, bound.arguments, entry)
+        """Name every argument by the function's signature; what it takes as ``**more`` as given."""
+        bound = inspect.signature(function).bind(*args, **kwargs).arguments
+        return cls(settings, bound | bound.get("more", {}), entry)
 
     def get(self, name: str) -> Tensor | None:
         """A tensor argument; None when it is absent, None or empty (hosts pass all three)."""

@@ -90,6 +90,8 @@ _SUBSTITUTES: dict[str, Any] = {
     "memory_allocated": _zero,
     "max_memory_allocated": _zero,
     "memory_reserved": _zero,
+    "FloatTensor": torch.FloatTensor,
+    "IntTensor": torch.IntTensor,
 }
 
 

@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NoReturn
+from unittest import mock
 
 from fragprune_plugins.adapter import CommandLine, ConfigFile, HostAdapter
 from fragprune_plugins.detect import HostRepo, choose, locate
@@ -531,6 +532,22 @@ def _host_checkpoints() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def _host_pictures() -> Iterator[None]:
+    """Let Pillow take signed bytes, as hosts that read Blender scenes give it; it used to."""
+    import numpy as np
+    from PIL import Image
+
+    fromarray = Image.fromarray
+
+    def from_bytes(array: Any, mode: str | None = None) -> Any:
+        signed = isinstance(array, np.ndarray) and array.dtype == np.int8
+        return fromarray(array.view(np.uint8) if signed else array, mode)
+
+    with mock.patch.object(Image, "fromarray", from_bytes):
+        yield
+
+
+@contextlib.contextmanager
 def _host_process(host: _Invocation, arguments: list[str], device: str) -> Iterator[None]:
     """What a fresh interpreter would give the script, put back afterwards."""
     from fragprune_plugins.device import cpu_only
@@ -541,6 +558,7 @@ def _host_process(host: _Invocation, arguments: list[str], device: str) -> Itera
     try:
         with contextlib.ExitStack() as stack:
             stack.enter_context(_host_checkpoints())
+            stack.enter_context(_host_pictures())
             if device == "cpu":
                 stack.enter_context(cpu_only())
             yield

@@ -64,6 +64,7 @@ def rasterizer(
             rotations: Tensor | None = None,
             cov3D_precomp: Tensor | None = None,
             dc: Tensor | None = None,
+            **more: Any,
         ) -> Any:
             """Draw; see the adapter's dialect for what comes back."""
             arguments = {
@@ -76,6 +77,7 @@ def rasterizer(
                 "rotations": rotations,
                 "cov3D_precomp": cov3D_precomp,
                 "dc": dc,
+                **more,
             }
             where = f"{package}:GaussianRasterizer.{name}"
             return draw(HostCall(self.raster_settings, arguments, where))
