@@ -115,7 +115,7 @@ def test_the_few_flags_we_need_are_read_as_the_host_will(tmp_path, words, extra)
 def test_added_flags_come_last_and_so_win(tmp_path):
     host = parsed(skeleton(tmp_path), "--iterations", 5, "--checkpoint_iterations", 2, 3)
     assert host.flags.save_checkpoints == [2, 3]
-    words = host.with_flags(iterations=9, save_checkpoints=[2, 3, 5])
+    words = host.with_flags(tmp_path, iterations=9, save_checkpoints=[2, 3, 5])
     assert words[-6:] == ["--iterations", "9", "--checkpoint_iterations", "2", "3", "5"]
     assert host.arguments[-1] == "3"
 
