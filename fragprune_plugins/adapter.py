@@ -323,6 +323,19 @@ class HostAdapter(ABC):
         raise NotImplementedError(f"{self.name} has a REARRANGE seam and no tracing()")
         yield
 
+    def packed(self, arguments: Mapping[str, Any], result: Any) -> tuple[Path, Tensor] | None:
+        """The file that a PACK seam's call has written or an UNPACK seam's has read.
+
+        Args:
+            arguments: of the call, by name.
+            result: that it returned.
+
+        Returns:
+            The path and the means (M, 3) that are in it, in its order and bit for bit the model's;
+            None where the call was about something else.
+        """
+        return None
+
     @abstractmethod
     def checkpoint_state(self, capture: Any) -> dict[str, Any]:
         """The dict inside the host's checkpoint tuple that tolerates a key of ours."""

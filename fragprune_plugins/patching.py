@@ -131,6 +131,7 @@ class PatchLedger:
             name
             for name, other in list(sys.modules.items())
             if other is not module
+            and not (seam.external and name.startswith(f"{seam.module}."))  # its own affair
             and original is not None
             and getattr(other, "__dict__", {}).get(head) is original
         ]

@@ -30,6 +30,8 @@ class Role(Enum):
     STILL = "stand still in stage 2: what would change frozen parameters or rows"
     SAVE = "write the sidecar beside the model's file"
     LOAD = "read the sidecar beside the model's file"
+    PACK = "write the sidecar of a file that holds the model's Gaussians in an order of its own"
+    UNPACK = "read that sidecar for the model that will be made of the file"
     CAPTURE = "put thresholds into the host's checkpoint"
     RESTORE = "take thresholds out of the host's checkpoint"
 

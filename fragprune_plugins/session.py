@@ -20,6 +20,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -208,6 +209,7 @@ class Session:
         self._dialect = adapter.dialect(repo)
         self._ledger: PatchLedger | None = None
         self._stand_ins: dict[str, ModuleType] = {}
+        self._unpacked: tuple[Tensor, ThresholdStore] | None = None  # not yet a model's
         self._absent: set[Seam] = set()  # metrics without their weights
         self._models: weakref.WeakKeyDictionary[Any, _ModelState] = weakref.WeakKeyDictionary()
         self._optimizers: weakref.WeakKeyDictionary[Any, list[weakref.ReferenceType[Any]]] = (
@@ -535,6 +537,8 @@ class Session:
         arguments = _named(wrapped, args, kwargs)
         camera = arguments[seam.needs[0]]
         model = arguments[seam.needs[1]] if len(seam.needs) > 1 else instance
+        if self._unpacked is not None and model not in self._models:
+            self._adopt(model, *self._unpacked)
         state, view = self._models.get(model), self.adapter.view(camera)
         if self.adapter.steps_by_rendering and state is not None and not state.begun:
             if self.learn and torch.is_grad_enabled():
@@ -763,15 +767,18 @@ class Session:
                 # A sidecar of an earlier model under this name would now be refused as stale.
                 sidecar.path_beside(path).unlink(missing_ok=True)
             else:
-                written = sidecar.save(
-                    path,
-                    state.store,
-                    adapter=self.adapter.name,
-                    host_commit=self.repo.commit,
-                    settings=self.settings.as_dict(),
-                )
-                self.hook.fragprune_saved(path=written)
+                self._save(path, state.store)
         return result
+
+    def _save(self, path: Path, store: ThresholdStore) -> None:
+        written = sidecar.save(
+            path,
+            store,
+            adapter=self.adapter.name,
+            host_commit=self.repo.commit,
+            settings=self.settings.as_dict(),
+        )
+        self.hook.fragprune_saved(path=written)
 
     def _on_load(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         result = wrapped(*args, **kwargs)
@@ -786,6 +793,45 @@ class Session:
         else:
             self._models.pop(model, None)  # another population: what we knew is not about it
         return result
+
+    def _on_pack(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        packed = self.adapter.packed(_named(wrapped, args, kwargs), result)
+        model = self._last() if self._last else None
+        state = self._models.get(model) if model is not None else None
+        if packed is None or state is None or state.store.neutral:
+            return result
+        path, means = packed
+        rows = _rows_of(means, self.adapter.means(model), str(seam))
+        store = ThresholdStore(0)
+        store.load_state_dict(state.store.state_dict())
+        store.rearrange(rows, torch.zeros(len(rows), dtype=torch.bool))
+        self._save(path, store)
+        return result
+
+    def _on_unpack(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
+        result = wrapped(*args, **kwargs)
+        packed = self.adapter.packed(_named(wrapped, args, kwargs), result)
+        if packed is not None and sidecar.path_beside(packed[0]).exists():
+            self._unpacked = packed[1], sidecar.load(packed[0])[0]
+        return result
+
+    def _adopt(self, model: Any, expected: Tensor, store: ThresholdStore) -> None:
+        """Thresholds of an unpacked file go to the model made of it, which is drawn next."""
+        means = self.adapter.means(model)
+        if not torch.equal(means.detach().cpu(), expected):
+            raise AlignmentError(
+                f"{self.adapter.name}: unpacked model",
+                f"{len(means)} Gaussians that are not the unpacked file's",
+                f"its {len(expected)}, in its order",
+                "Report this with the host's commit: it draws another model after unpacking.",
+            )
+        placed = ThresholdStore(0, means.device)
+        placed.load_state_dict(store.state_dict())
+        self._models[model] = _ModelState(placed, loaded=weakref.ref(means))
+        self._follow(model, self._models[model])
+        self.hook.fragprune_attached(model=model, store=placed)
+        self._unpacked = None
 
     def _on_capture(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         result = wrapped(*args, **kwargs)
@@ -821,12 +867,30 @@ class Session:
             )
 
 
+def _rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
+    """(M,) for each mean (M, 3) the first row among (N, 3) with the same bits."""
+    known, wanted = among.detach().cpu().numpy(), means.numpy()
+    both = np.concatenate([known, wanted])
+    _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    rows = first[which.reshape(-1)[len(known) :]]
+    if (rows >= len(known)).any():
+        raise AlignmentError(
+            where,
+            f"{int((rows >= len(known)).sum())} of {len(wanted)} positions that no Gaussian has",
+            f"positions of the {len(known)} Gaussians",
+            "Report this with the host's commit: it packs another model.",
+        )
+    return torch.from_numpy(rows)
+
+
 _OF_CALLS: dict[Role, Callable[..., Any]] = {
     Role.SCENE: Session._on_scene,
     Role.VIEW: Session._on_view,
     Role.RASTERIZE: Session._on_rasterize,
     Role.LOSS: Session._on_loss,
     Role.METRIC: Session._on_metric,
+    Role.PACK: Session._on_pack,
+    Role.UNPACK: Session._on_unpack,
 }
 
 _OF_MODELS: dict[Role, Callable[..., Any]] = {

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 SCORING = "diff_gaussian_rasterization_ms"
 FORWARD, DEPTH = "GaussianRasterizer.forward", "GaussianRasterizer.render_depth"
 MASKED_SPLIT = "densify_and_split_mask"
+COMPRESSED = "compressed_gs.npz"
 SCRIPTS = ("ms/train.py", "ms_d/train.py", "gs/train.py")
 
 
@@ -58,10 +60,11 @@ class MiniSplattingDialect(GraphdecoDialect):
         many pixels no other Gaussian weighs more (float32, as the host's). No gradients.
         """
         drawn = super().pack(outputs, call)
-        wins = outputs.wins_per_gaussian
-        if wins is None:
+        weights, wins = outputs.weights_per_gaussian, outputs.wins_per_gaussian
+        count = outputs.fragments_per_gaussian
+        if weights is None or wins is None or count is None:
             return drawn
-        return (*drawn, outputs.weights_per_gaussian, outputs.fragments_per_gaussian, wins.float())
+        return (*drawn, weights, count, wins.float())
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The lineage's stand-ins and the scoring rasterizer's."""
@@ -97,6 +100,8 @@ class MiniSplatting(GraphdecoAdapter):
         Seam(Role.STILL, MODEL, "GaussianModel.prune_points", ("mask",)),
         Seam(Role.STILL, MODEL, "GaussianModel.reinitial_pts", ("pts", "rgb")),
         Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
+        Seam(Role.PACK, "numpy", "savez_compressed", ("file", "args"), external=True),
+        Seam(Role.UNPACK, "numpy", "load", ("file",), external=True),
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
@@ -131,6 +136,16 @@ class MiniSplatting(GraphdecoAdapter):
         selected[super().parents(model, "densify_and_split", split)] = True
         rows: Tensor = selected.nonzero()[:, 0]
         return rows.repeat(arguments["N"])
+
+    def packed(self, arguments: Mapping[str, Any], result: Any) -> tuple[Path, Tensor] | None:
+        """What ms_c compresses: one Gaussian a voxel, sorted by position, positions first."""
+        import torch
+
+        path = Path(str(arguments["file"]))
+        if path.name != COMPRESSED:
+            return None
+        positions = arguments["args"][0] if "args" in arguments else result["arr_0"]
+        return path, torch.from_numpy(positions)
 
 
 @hookimpl

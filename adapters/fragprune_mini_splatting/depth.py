@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from fragprune_plugins.errors import InputError
+from fragprune_plugins.types import Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,6 +48,7 @@ def render_depth(
         InputError: the host gave covariances in place of scales and rotations.
     """
     splats = inputs.splats
+    assert isinstance(splats, Splats)  # what unpack makes of the host's call
     if splats.scales is None or splats.rotations is None:
         raise InputError(
             "render_depth",
@@ -62,7 +64,8 @@ def render_depth(
     offset = inputs.view.campos.double() - splats.means.double()  # (N, 3) from the mean to the eye
     start = (whiten @ offset[:, :, None])[:, :, 0]
     normals = (whiten.transpose(1, 2) @ start[:, :, None])[:, :, 0]
-    for rows, where in _behind(inputs, drawn.radii, directions, normals):
+    behind = _behind(inputs.view, splats.means, drawn.radii, directions, normals)
+    for rows, where in behind:
         opacities = splats.opacities.clone()
         opacities[rows] = 0.0
         again = draw(replace(inputs, splats=replace(splats, opacities=opacities)))
@@ -91,12 +94,12 @@ def render_depth(
 
 def _directions(view: View) -> Tensor:
     """(H, W, 3) float64: from the eye to the pixels' centres at view depth 1, in the world."""
-    size = {"dtype": torch.float64, "device": view.viewmatrix.device}
-    x = ((2 * torch.arange(view.width, **size) + 1) / view.width - 1) * view.tan_fov_x
-    y = ((2 * torch.arange(view.height, **size) + 1) / view.height - 1) * view.tan_fov_y
-    rows, columns = torch.meshgrid(y, x, indexing="ij")
+    turn = view.viewmatrix[:3, :3].double().T
+    x = (2 * torch.arange(view.width, device=turn.device).double() + 1) / view.width - 1
+    y = (2 * torch.arange(view.height, device=turn.device).double() + 1) / view.height - 1
+    rows, columns = torch.meshgrid(y * view.tan_fov_y, x * view.tan_fov_x, indexing="ij")
     camera = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
-    return camera @ view.viewmatrix[:3, :3].double().T
+    return camera @ turn
 
 
 def _whiten(scales: Tensor, rotations: Tensor) -> Tensor:
@@ -111,7 +114,7 @@ def _whiten(scales: Tensor, rotations: Tensor) -> Tensor:
 
 
 def _behind(
-    inputs: RasterInputs, radii: Tensor, directions: Tensor, normals: Tensor
+    view: View, means: Tensor, radii: Tensor, directions: Tensor, normals: Tensor
 ) -> list[tuple[Tensor, Tensor]]:
     """Which Gaussians' middles lie behind the camera, and at which pixels.
 
@@ -127,8 +130,7 @@ def _behind(
     rows = ((corners @ normals.T > 0).any(dim=0) & (radii > 0)).nonzero()[:, 0]
     if not len(rows):
         return []
-    means = inputs.splats.means[rows]
-    clip = torch.cat([means, torch.ones_like(means[:, :1])], dim=1) @ inputs.view.projmatrix
+    clip = torch.nn.functional.pad(means[rows], (0, 1), value=1.0) @ view.projmatrix
     ndc = clip[:, :2] / (clip[:, 3:] + 1e-7)
     reach = radii[rows] + TILE
     x, y = ((ndc[:, 0] + 1) * width - 1) / 2, ((ndc[:, 1] + 1) * height - 1) / 2
@@ -136,6 +138,6 @@ def _behind(
     lines = torch.arange(height, device=x.device)[:, None]
     touched = ((lines - y).abs() <= reach)[:, None] & ((columns - x).abs() <= reach)[None]
     behind = touched & (directions @ normals[rows].T > 0)  # (H, W, M)
-    patterns, kind = behind.reshape(-1, len(rows)).unique(dim=0, return_inverse=True)
+    patterns, kind = torch.unique(behind.reshape(-1, len(rows)), dim=0, return_inverse=True)
     kind = kind.reshape(height, width)
     return [(rows[p], kind == i) for i, p in enumerate(patterns) if bool(p.any())]
