@@ -1,0 +1,136 @@
+"""autonomousvision/mip-splatting: 3DGS without aliasing, by a 3D filter and a 2D one.
+
+The 3D filter widens every Gaussian to what the closest training camera can resolve and dims it
+accordingly; it is recomputed from positions and cameras and lives in the PLY alone. The 2D filter
+is the rasterizer's: a dilation of ``kernel_size`` whose gain in area is taken back from the
+opacity. Densification also follows the absolute gradients on the screen.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.lineage.graphdeco import default, reaches
+from fragprune_plugins.seams import Role, Seam
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.ply import SplatFile
+    from fragprune_plugins.types import RasterInputs
+
+MODEL = "scene.gaussian_model"
+KERNEL_SIZE = 0.1
+OWN = (
+    *("kernel_size", "subpixel_offset", "grads_abs", "grad_abs_threshold"),
+    *("compute_3D_filter", "get_opacity_with_3D_filter", "filter_3D"),
+)
+"""Settings of the rasterizer, parameters of densification and members of the model."""
+
+DESCENDANTS = ("view2gaussian_precomp", "get_view2gaussian", "integrate")
+"""Names of Gaussian Opacity Fields and what descends from it: they keep all of the host's own."""
+
+
+@dataclass(frozen=True)
+class MipDialect(GraphdecoDialect):
+    """Vanilla's call of 2023 with the 2D filter's size and a sampling offset for each pixel."""
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """The third column of the means' gradient is the absolute one: densification reads it."""
+        return replace(
+            super().unpack(call),
+            dilation=float(call.settings.kernel_size),
+            compensation="mip",
+            sample_offsets=call.settings.subpixel_offset,
+            absolute_gradient=True,
+        )
+
+    def spares(self) -> dict[str, ModuleType]:
+        """``train.py`` imports open3d and does not use it."""
+        return {"open3d": ModuleType("open3d", "Stand-in of fragprune: empty.")}
+
+
+class MipSplatting(GraphdecoAdapter):
+    """Mip-Splatting."""
+
+    name = "mip-splatting"
+    info = HostInfo(
+        "Mip-Splatting",
+        repo="autonomousvision/mip-splatting",
+        states="2024, with absolute gradients in densification",
+    )
+    seams = (
+        *GraphdecoAdapter.seams,
+        Seam(Role.SAVE, MODEL, "GaussianModel.save_fused_ply", ("path",)),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Both filters and the absolute gradients, and nothing of what descends from it."""
+        findings = super().fingerprint(repo)
+        own = {
+            **dict.fromkeys(self.dialect(repo).settings),
+            **dict.fromkeys(repo.parameters(MODEL, "GaussianModel.densify_and_split") or ()),
+            **repo.mentions([MODEL], OWN),
+        }
+        cousins = repo.mentions(("gaussian_renderer", MODEL, "train"), DESCENDANTS)
+        found = [f"no {name}" for name in OWN if name not in own]
+        found += [f"{name} ({at}), which a descendant has" for name, at in cousins.items()]
+        if found:
+            findings.append(
+                Finding(
+                    "error",
+                    "other-host",
+                    str(repo.root),
+                    ", ".join(found),
+                    "a Mip-Splatting checkout",
+                    "Use the adapter of that host.",
+                )
+            )
+        return findings
+
+    def dialect(self, repo: HostRepo) -> MipDialect:
+        """As the lineage reads it from ``render``."""
+        return MipDialect(**vars(super().dialect(repo)))
+
+    def opacities(self, model: Any) -> Tensor:
+        """(N,) as they are drawn: dimmed by the 3D filter."""
+        opacities: Tensor = model.get_opacity_with_3D_filter
+        return opacities.detach().reshape(-1)
+
+    def needy(self, arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
+        """Either gradient will do, each with its own threshold."""
+        absolute = flat(arguments["grads_abs"], dim=-1)
+        return super().needy(arguments, rows, flat) | reaches(
+            absolute, arguments["grad_abs_threshold"], rows
+        )
+
+    def read_model(self, ply: Path) -> SplatFile:
+        """With the 3D filter, which only this host's own reader asks for."""
+        from fragprune_plugins.ply import read_ply
+
+        return read_ply(ply, filtered=True)
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+        """By the 2D filter of the command, or its default; ``--load_allres`` mixes resolutions."""
+        parser = ArgumentParser(add_help=False)
+        size = default(repo, "ModelParams", "_kernel_size", KERNEL_SIZE)
+        parser.add_argument("-k", "--kernel_size", type=float, default=size)
+        flags, rest = parser.parse_known_args(arguments)
+        if super().drawing(repo, rest) is None or "--load_allres" in rest:
+            return None
+        return {"dilation": flags.kernel_size, "compensation": "mip"}
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Offer Mip-Splatting."""
+    register(MipSplatting())

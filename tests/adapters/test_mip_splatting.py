@@ -1,0 +1,285 @@
+"""Mip-Splatting: two filters, absolute gradients, on a miniature of the host."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+
+import mip_splatting_host
+import numpy as np
+import pytest
+import torch
+from miniature import HOST, TINY, joint, label, running
+from mip_splatting_host import MipHost
+from PIL import Image
+
+from fragprune_mip_splatting import MipSplatting
+from fragprune_plugins import sidecar
+from fragprune_plugins.cli.run import _measure
+from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.engines import rasterize
+from fragprune_plugins.errors import ModelFileError, UnknownHostError
+from fragprune_plugins.finetuning import load_dataset
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.launch import RunOptions, run
+from fragprune_plugins.measure import Candidate
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.schedule import Settings
+
+COUNT = 16
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    return mip_splatting_host.make(tmp_path_factory.mktemp("mip"))
+
+
+def of(mini, **options):
+    return {"path": mini, "adapter": MipSplatting(), "driver": MipHost()} | options
+
+
+# -- which host ----------------------------------------------------------------------------------
+
+
+def test_each_host_has_its_adapter_and_no_other(mini):
+    adapters = load_plugins().adapters
+    assert choose(HostRepo(mini), adapters).name == "mip-splatting"
+    with pytest.raises(UnknownHostError, match="Mip-Splatting"):
+        choose(HostRepo(mini), adapters, "vanilla-3dgs")
+    with pytest.raises(UnknownHostError, match="no kernel_size"):
+        choose(HostRepo(HOST), adapters, "mip-splatting")
+
+
+RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "found"),
+    [
+        (RENDERER, "        kernel_size=kernel_size,\n", "", "no kernel_size"),
+        (RENDERER, "        subpixel_offset=", "        offset=", "no subpixel_offset"),
+        (MODEL, "compute_3D_filter", "compute_filter", "no compute_3D_filter"),
+        (MODEL, "grads_abs", "absolute", "no grads_abs"),
+        (MODEL, "def save_fused_ply", "def fuse", "no such function"),
+        (
+            MODEL,
+            "    def _both",
+            "    def get_view2gaussian(self): ...\n    def _both",
+            "descendant",
+        ),
+        (RENDERER, "def render(", "def integrate(): ...\ndef render(", "descendant"),
+    ],
+)
+def test_a_changed_host_and_a_descendant_are_refused_by_what_is_otherwise(
+    tmp_path, file, old, new, found
+):
+    path = mip_splatting_host.make(tmp_path) / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    errors = [f.found for f in MipSplatting().match(HostRepo(tmp_path)).findings]
+    assert any(found in error for error in errors)
+
+
+# -- the call ------------------------------------------------------------------------------------
+
+
+class Notes:
+    """Remembers what was rasterized."""
+
+    @hookimpl(tryfirst=True)
+    def fragprune_truncate(self, inputs, store):
+        self.inputs = inputs
+
+
+def test_filters_and_offsets_reach_the_engine(mini):
+    notes = Notes()
+    with joint(**of(mini, plugins=[notes])) as host:
+        model, camera = host.model(COUNT), host.camera(20, 14)
+        host.step(model, camera, 1)
+        jitter = torch.rand(14, 20, 2) - 0.5
+        drawn = host.driver.render(camera, model, torch.zeros(3), subpixel_offset=jitter)
+    assert notes.inputs.dilation == pytest.approx(0.1)
+    assert notes.inputs.compensation == "mip"
+    assert torch.equal(notes.inputs.sample_offsets, jitter)
+    splats = notes.inputs.splats
+    assert torch.equal(splats.opacities, model.get_opacity_with_3D_filter[:, 0])
+    assert torch.equal(splats.scales, model.get_scaling_with_3D_filter)
+    assert drawn["render"].requires_grad
+
+
+@pytest.mark.parametrize("opened", [False, True], ids=["host alone", "with thresholds"])
+def test_the_third_gradient_is_the_sum_over_pixels_of_both_others(mini, opened):
+    """Without it every Gaussian is densified: pixel by pixel, backward once for each."""
+    with joint(**of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera(9, 7)
+        if opened:
+            host.store(model).open(host.adapter.opacities(model))
+        weights = torch.rand(3, 7, 9, generator=torch.Generator().manual_seed(0)) - 0.5
+        package = host.render(camera, model)
+        (package["render"] * weights).sum().backward(retain_graph=True)
+        whole = package["viewspace_points"].grad.clone()
+        total = torch.zeros(COUNT)
+        for y in range(7):
+            for x in range(9):
+                package["viewspace_points"].grad = None
+                (package["render"] * weights)[:, y, x].sum().backward(retain_graph=True)
+                total += package["viewspace_points"].grad[:, :2].abs().sum(dim=1)
+    assert (total > 0).sum() > COUNT / 2
+    torch.testing.assert_close(whole[:, 2], total, rtol=1e-4, atol=1e-7)
+
+
+def test_densification_takes_the_share_the_host_means_to_take(mini):
+    with joint(**of(mini)) as host:
+        model = host.model(60)
+        for iteration in range(1, 6):
+            host.step(model, host.camera(side=iteration / 20), iteration)
+        moved = (model.xyz_gradient_accum / model.denom).nan_to_num()
+        threshold = float(moved.quantile(0.9))
+        label(host, model)
+        cloned, split, _ = model.densify_and_prune(threshold, 0.005, 3.0, None)
+        assert 6 <= cloned + split <= 12  # those above either threshold: a tenth by each
+
+
+# -- rows ----------------------------------------------------------------------------------------
+
+
+def test_a_gradient_that_equals_the_quantile_counts_as_the_host_counts_it(mini):
+    """The quantile often is one of the gradients; the norm of one number may be rounded."""
+    with joint(**of(mini)) as host:
+        for seed in range(20):
+            model = host.model(COUNT, seed=seed)
+            label(host, model)
+            absolute = torch.rand(COUNT, 1, generator=torch.Generator().manual_seed(seed)) * 1e-3
+            quantile = absolute.sort(dim=0).values[COUNT // 2]
+            none = torch.zeros(COUNT, 1)
+            model.densify_and_clone(none, 1.0, absolute, quantile, 1e9)
+            expected = int((torch.norm(absolute, dim=-1) >= quantile).sum())
+            assert len(host.store(model)) == COUNT + expected
+
+
+# -- files ---------------------------------------------------------------------------------------
+
+
+def test_a_fused_model_gets_its_thresholds_too(mini, tmp_path):
+    path = tmp_path / "fused.ply"
+    with joint(**of(mini)) as host:
+        model = host.model(COUNT)
+        host.step(model, host.camera(), 1)
+        model.save_fused_ply(str(path))
+        values = host.store(model).values.detach()
+    store, info = sidecar.load(path)
+    assert torch.equal(store.values.detach(), values)
+    assert info.rows == COUNT
+    fused = read_ply(path).splats()  # an ordinary splat
+    torch.testing.assert_close(fused.scales, model.get_scaling_with_3D_filter.detach())
+
+
+def test_a_hosts_model_says_who_may_read_it(mini, tmp_path):
+    with joint(**of(mini)) as host:
+        host.model(COUNT).save_ply(str(tmp_path / "m.ply"))
+    with pytest.raises(ModelFileError, match="Mip-Splatting"):
+        read_ply(tmp_path / "m.ply")
+    assert MipSplatting().read_model(tmp_path / "m.ply").filter_3d.shape == (COUNT, 1)
+
+
+# -- whole runs ----------------------------------------------------------------------------------
+
+OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
+FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
+
+
+def command(mini, scene, out, iterations, *more):
+    flags = ["-s", scene, "-m", out, "--iterations", iterations, *TINY]
+    return [str(mini / "train.py"), *map(str, flags), *map(str, more)]
+
+
+def models(summary):
+    paths = (summary.model_before, summary.model_after)
+    return [MipSplatting().read_model(path) for path in paths]
+
+
+def frozen_differences(summary):
+    before, after = models(summary)
+    return [name for name in FROZEN if not torch.equal(getattr(before, name), getattr(after, name))]
+
+
+@pytest.fixture(scope="module")
+def trained(mini, photographs, tmp_path_factory):
+    """Trained with jittered rays and another kernel, then fine-tuned."""
+    out = tmp_path_factory.mktemp("trained")
+    words = command(mini, photographs, out, 20, "-k", "0.2", "--ray_jitter")
+    return run(words, OPTIONS), words, out
+
+
+def test_stage_two_moves_opacities_and_thresholds_alone(trained):
+    summary, _, _ = trained
+    assert (summary.adapter, summary.iterations) == ("mip-splatting", 8)
+    assert summary.gaussians != 150  # it densified
+    assert frozen_differences(summary) == []
+    before, after = models(summary)
+    assert not torch.equal(before.opacity, after.opacity)
+    store, info = sidecar.load(summary.model_after)
+    assert len(store) == info.rows == summary.gaussians == len(after)
+    assert summary.fragments_after < summary.fragments_before
+    assert "open3d" not in sys.modules  # its stand-in left with the run
+
+
+def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained, photographs):
+    summary, words, out = trained
+    assert summary.drawing == {"dilation": 0.2, "compensation": "mip"}
+    run([str(mini / "render.py"), "-m", str(out), "--skip_train"], OPTIONS)
+    folder = out / "test" / "ours_28" / "test_preds_1"
+    values = sidecar.load(summary.model_after)[0].values.detach()
+    candidate = Candidate(models(summary)[1], values, summary.drawing)
+    (shot,) = load_dataset(photographs).test
+    with torch.no_grad():
+        image = rasterize(candidate.inputs(shot.view, candidate.model.splats()), values).image
+    pixels = (image.clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
+    theirs = np.asarray(Image.open(folder / "00000.png"))
+    assert np.abs(pixels.astype(int) - theirs).max() <= 1  # a camera's float32, rounded
+    assert (pixels != theirs).mean() < 0.05
+    before, after = _measure(words, summary)
+    assert after["fragments_per_pixel"] < before["fragments_per_pixel"]
+
+
+@pytest.mark.parametrize(("flag", "kernel"), [((), 0.1), (("--kernel_size=0.3",), 0.3)])
+def test_the_size_of_the_2d_filter_is_read_from_the_command_or_the_source(mini, flag, kernel):
+    drawing = MipSplatting().drawing(HostRepo(mini), ["--eval", *flag])
+    assert drawing == {"dilation": kernel, "compensation": "mip"}
+    assert MipSplatting().drawing(HostRepo(mini), ["--eval", "--load_allres"]) is None
+    assert MipSplatting().drawing(HostRepo(mini), []) is None
+
+
+def test_a_point_cloud_alone_is_resumed(mini, photographs, trained, tmp_path):
+    summary, _, _ = trained
+    shutil.copytree(summary.model_after.parent, tmp_path / "point_cloud" / "iteration_28")
+    words = command(mini, photographs, tmp_path, 20)
+    again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
+    assert frozen_differences(again) == []
+    first, second = (sidecar.load(s.model_after)[0] for s in (summary, again))
+    assert (first.steps, second.steps) == (7, 14)
+
+
+def test_thresholds_learn_beside_densification(mini, photographs, tmp_path):
+    options = RunOptions(device="cpu", stage="joint", from_iter=3, settings=OPTIONS.settings)
+    summary = run(command(mini, photographs, tmp_path, 20), options)
+    store, _ = sidecar.load(summary.model_after)
+    assert len(store) == len(MipSplatting().read_model(summary.model_after)) != 150
+    assert not store.neutral
+
+
+def test_the_hosts_fusing_script_carries_thresholds_along(mini, trained, tmp_path):
+    summary, _, out = trained
+    fused = tmp_path / "fused.ply"
+    run([str(mini / "create_fused_ply.py"), "-m", str(out), "--output_ply", str(fused)], OPTIONS)
+    ours, theirs = sidecar.load(fused)[0], sidecar.load(summary.model_after)[0]
+    assert torch.equal(ours.logits, theirs.logits)
+
+
+def test_an_installed_open3d_is_left_alone(mini, monkeypatch):
+    theirs = type(sys)("open3d")
+    monkeypatch.setitem(sys.modules, "open3d", theirs)
+    with running(**of(mini)):
+        assert sys.modules["open3d"] is theirs
+    assert sys.modules["open3d"] is theirs

@@ -1,0 +1,342 @@
+"""A miniature Mip-Splatting: the demo's host with what the method adds, from its interface."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+
+from fragprune_plugins.testing.host import Host
+
+
+class Added:
+    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
+
+    @property
+    def get_scaling_with_3D_filter(self):  # noqa: N802 - the name callers use
+        return torch.sqrt(self.get_scaling.square() + self.filter_3D.square())
+
+    @property
+    def get_opacity_with_3D_filter(self):  # noqa: N802 - the name callers use
+        return self.get_opacity * self._dimming()
+
+    def _dimming(self):
+        ratio = self.get_scaling / self.get_scaling_with_3D_filter
+        return ratio.prod(dim=1, keepdim=True)
+
+    @torch.no_grad()
+    def compute_3D_filter(self, cameras):  # noqa: N802 - the name callers use
+        nearest = torch.full((len(self._xyz),), math.inf, device="cuda")
+        for camera in cameras:
+            view = camera.world_view_transform
+            depth = (self._xyz @ view[:3, :3] + view[3, :3])[:, 2].clamp_min(0.2)
+            focal = camera.image_width / (2 * math.tan(camera.FoVx / 2))
+            nearest = torch.minimum(nearest, depth / focal)
+        self.filter_3D = (nearest * math.sqrt(0.2))[:, None]
+
+    def _reset_statistics(self):
+        shape = (self.get_xyz.shape[0], 1)
+        self.xyz_gradient_accum = torch.zeros(shape, device="cuda")
+        self.xyz_gradient_accum_abs = torch.zeros(shape, device="cuda")
+        self.xyz_gradient_accum_abs_max = torch.zeros(shape, device="cuda")
+        self.denom = torch.zeros(shape, device="cuda")
+
+    def prune_points(self, mask):
+        keep = ~mask
+        self._adopt(self._prune_optimizer(keep))
+        for name in ("", "_abs", "_abs_max"):
+            name = f"xyz_gradient_accum{name}"
+            setattr(self, name, getattr(self, name)[keep])
+        self.denom, self.max_radii2D = self.denom[keep], self.max_radii2D[keep]
+
+    def add_densification_stats(self, viewspace_point_tensor, update_filter):
+        grad = viewspace_point_tensor.grad[update_filter]
+        self.xyz_gradient_accum[update_filter] += grad[:, :2].norm(dim=1, keepdim=True)
+        self.xyz_gradient_accum_abs[update_filter] += grad[:, 2:].norm(dim=1, keepdim=True)
+        self.denom[update_filter] += 1
+
+    def _both(self, grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent, large):
+        moved = self._needy(grads, grad_threshold, scene_extent, large)
+        return moved | self._needy(grads_abs, grad_abs_threshold, scene_extent, large)
+
+    def densify_and_clone(self, grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent):
+        given = (grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent)
+        chosen = self._both(*given, large=False)
+        own = (self._xyz, self._features_dc, self._features_rest)
+        own = (*own, self._opacity, self._scaling, self._rotation)
+        self.densification_postfix(*(tensor[chosen] for tensor in own))
+
+    def densify_and_split(
+        self, grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent, N=2
+    ):
+        given = (grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent)
+        chosen = self._both(*given, large=True)
+        spread = self.get_scaling[chosen].repeat(N, 1)
+        turn = build_rotation(self._rotation[chosen]).repeat(N, 1, 1)  # noqa: F821
+        offset = (turn @ torch.normal(torch.zeros_like(spread), spread)[..., None])[..., 0]
+        self.densification_postfix(
+            self.get_xyz[chosen].repeat(N, 1) + offset,
+            self._features_dc[chosen].repeat(N, 1, 1),
+            self._features_rest[chosen].repeat(N, 1, 1),
+            self._opacity[chosen].repeat(N, 1),
+            self.scaling_inverse_activation(spread / (0.8 * N)),
+            self._rotation[chosen].repeat(N, 1),
+        )
+        children = torch.zeros(len(spread), dtype=torch.bool, device="cuda")
+        self.prune_points(torch.cat((chosen, children)))
+
+    def densify_and_prune(self, max_grad, min_opacity, extent, max_screen_size):
+        grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
+        grads_abs = (self.xyz_gradient_accum_abs / self.denom).nan_to_num(0.0)
+        share = (grads >= max_grad).float().mean()
+        quantile = torch.quantile(grads_abs.reshape(-1), 1 - share)
+        counts = [len(self._xyz)]
+        self.densify_and_clone(grads, max_grad, grads_abs, quantile, extent)
+        counts.append(len(self._xyz))
+        self.densify_and_split(grads, max_grad, grads_abs, quantile, extent)
+        counts.append(len(self._xyz))
+        unwanted = (self.get_opacity < min_opacity).squeeze(-1)
+        if max_screen_size:
+            unwanted |= self.max_radii2D > max_screen_size
+            unwanted |= self.get_scaling.max(dim=1).values > 0.1 * extent
+        self.prune_points(unwanted)
+        return counts[1] - counts[0], counts[2] - counts[1], counts[2] - len(self._xyz)
+
+    def reset_opacity(self):
+        low = self.get_opacity_with_3D_filter.clamp_max(0.01) / self._dimming()
+        new = inverse_sigmoid(low.detach())  # noqa: F821
+        self._opacity = self.replace_tensor_to_optimizer(new, "opacity")["opacity"]
+
+    def _table(self, opacity, scaling, more=()):
+        columns = [
+            self._xyz,
+            torch.zeros_like(self._xyz),
+            self._features_dc.transpose(1, 2).flatten(1),
+            self._features_rest.transpose(1, 2).flatten(1),
+            *(opacity, scaling, self._rotation, *more),
+        ]
+        return torch.cat(columns, dim=1).detach().cpu().numpy()
+
+    def _write(self, path, table, names):
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        rows = np.ascontiguousarray(table).view([(name, "f4") for name in names])[:, 0]
+        PlyData([PlyElement.describe(rows, "vertex")]).write(path)
+
+    def save_ply(self, path):
+        table = self._table(self._opacity, self._scaling, [self.filter_3D])
+        self._write(path, table, [*self.construct_list_of_attributes(), "filter_3D"])
+
+    def save_fused_ply(self, path):
+        opacity = inverse_sigmoid(self.get_opacity_with_3D_filter)  # noqa: F821
+        table = self._table(opacity, self.get_scaling_with_3D_filter.log())
+        self._write(path, table, self.construct_list_of_attributes())
+
+    def load_ply(self, path):
+        self._load_vanilla(path)
+        column = np.asarray(PlyData.read(path)["vertex"]["filter_3D"])[:, None]
+        self.filter_3D = torch.tensor(column, dtype=torch.float, device="cuda")
+
+
+CHANGES = {
+    "arguments/__init__.py": [
+        (
+            "        self.eval = False\n",
+            "        self.eval = False\n"
+            "        self._kernel_size = 0.1\n"
+            "        self.ray_jitter = False\n",
+        ),
+    ],
+    "gaussian_renderer/__init__.py": [
+        ("    bg_color: torch.Tensor,\n", "    bg_color: torch.Tensor,\n    kernel_size: float,\n"),
+        ("    override_color=None,\n", "    override_color=None,\n    subpixel_offset=None,\n"),
+        (
+            "        bg=bg_color,\n",
+            "        kernel_size=kernel_size,\n"
+            "        subpixel_offset=subpixel_offset,\n"
+            "        bg=bg_color,\n",
+        ),
+        (
+            "    settings = Gauss",
+            "    size = int(viewpoint_camera.image_height), int(viewpoint_camera.image_width), 2\n"
+            "    if subpixel_offset is None:\n"
+            '        subpixel_offset = torch.zeros(size, device="cuda")\n'
+            "    settings = Gauss",
+        ),
+        ("scales=pc.get_scaling,", "scales=pc.get_scaling_with_3D_filter,"),
+        ("opacities=pc.get_opacity,", "opacities=pc.get_opacity_with_3D_filter,"),
+    ],
+    "scene/gaussian_model.py": [
+        ("import numpy as np\n", "import math\n\nimport numpy as np\n"),
+        ("    def load_ply(", "    def _load_vanilla("),
+        *(
+            (f"    def {name}(", f"    def _vanilla{index}(")
+            for index, name in enumerate(
+                (
+                    *("_reset_statistics", "prune_points", "add_densification_stats"),
+                    *("densify_and_clone", "densify_and_split", "densify_and_prune"),
+                    *("reset_opacity", "save_ply"),
+                )
+            )
+        ),
+    ],
+    "train.py": [
+        ("import torch\n", "import open3d as o3d  # noqa: F401\nimport torch\n"),
+        (
+            "    background = torch.tensor(",
+            "    gaussians.compute_3D_filter(cameras=scene.getTrainCameras())\n"
+            "    background = torch.tensor(",
+        ),
+        (
+            "        package = render(camera, gaussians, pipe, bg)\n",
+            "        size = camera.image_height, camera.image_width, 2\n"
+            '        jitter = torch.rand(size, device="cuda") - 0.5\n'
+            "        jitter = jitter if dataset.ray_jitter else None\n"
+            "        package = render(\n"
+            "            camera,\n"
+            "            gaussians,\n"
+            "            pipe,\n"
+            "            bg,\n"
+            "            kernel_size=dataset.kernel_size,\n"
+            "            subpixel_offset=jitter,\n"
+            "        )\n",
+        ),
+        ("render, (pipe, background))", "render, (pipe, background, dataset.kernel_size))"),
+        (
+            "scene.cameras_extent, largest)\n",
+            "scene.cameras_extent, largest)\n"
+            "        gaussians.compute_3D_filter(cameras=scene.getTrainCameras())\n",
+        ),
+        (
+            "            if iteration < opt.iterations:\n",
+            "            elif iteration % 5 == 0 and iteration < opt.iterations - 5:\n"
+            "                gaussians.compute_3D_filter(cameras=scene.getTrainCameras())\n"
+            "            if iteration < opt.iterations:\n",
+        ),
+    ],
+    "render.py": [
+        (
+            "pipeline, background)[",
+            "pipeline, background, kernel_size)[",
+        ),
+        ("gaussians, pipeline, background):", "gaussians, pipeline, background, kernel_size):"),
+        (
+            "gaussians, pipeline, background)\n",
+            "gaussians, pipeline, background, dataset.kernel_size)\n",
+        ),
+        ('folder / "renders"', 'folder / "test_preds_1"'),
+        ('folder / "gt"', 'folder / "gt_1"'),
+    ],
+}
+
+FUSE = """import sys
+from pathlib import Path
+
+from arguments import ModelParams, get_combined_args
+from argparse import ArgumentParser
+from gaussian_renderer import GaussianModel
+
+parser = ArgumentParser()
+model = ModelParams(parser, sentinel=True)
+parser.add_argument("--output_ply", default="./output.ply")
+args = get_combined_args(parser)
+gaussians = GaussianModel(model.extract(args).sh_degree)
+newest = max(Path(args.model_path).glob("point_cloud/*/*.ply"), key=lambda p: p.stat().st_mtime)
+gaussians.load_ply(str(newest))
+gaussians.save_fused_ply(args.output_ply)
+"""
+
+
+class MipHost(Host):
+    """How to drive it: filters are as old as the last rows they were computed for."""
+
+    def write(self, root: Path) -> None:
+        """The demo's host, changed where Mip-Splatting is otherwise."""
+        super().write(root)
+        for name, changes in CHANGES.items():
+            text = (root / name).read_text()
+            for old, new in changes:
+                assert text.count(old) == 1, (name, old)
+                text = text.replace(old, new)
+            (root / name).write_text(text)
+        model = root / "scene" / "gaussian_model.py"
+        model.write_text(model.read_text() + "\n" + "".join(inspect.getsourcelines(Added)[0][2:]))
+        (root / "create_fused_ply.py").write_text(FUSE)
+
+    def refresh(self, model: Any) -> None:
+        """As the training loop does after every change of rows."""
+        if len(getattr(model, "filter_3D", ())) != len(model.get_xyz):
+            model.compute_3D_filter([self.camera(24, 18)])
+
+    def model(self, *args: Any, **options: Any) -> Any:
+        """With a filter, as before the training loop."""
+        model = super().model(*args, **options)
+        self.refresh(model)
+        return model
+
+    def camera(self, width: int, height: int, *, side: float = 0.0) -> Any:
+        """With what the real host's filter reads."""
+        camera = super().camera(width, height, side=side)
+        camera.R, camera.T = np.eye(3), np.array([side, 0.0, 3.0])
+        camera.focal_x = width / (2 * math.tan(camera.FoVx / 2))
+        camera.focal_y = height / (2 * math.tan(camera.FoVy / 2))
+        return camera
+
+    def render(self, camera: Any, model: Any, background: Any, **more: Any) -> dict[str, Any]:
+        """With the filter's size."""
+        self.refresh(model)
+        render = import_module("gaussian_renderer").render
+        return render(camera, model, self.pipe(), background, 0.1, **more)
+
+    def step(self, model: Any, camera: Any, iteration: int, background: Any) -> float:
+        """Rows first have a filter."""
+        self.refresh(model)
+        return super().step(model, camera, iteration, background)
+
+    def save(self, model: Any, path: Path) -> None:
+        """The filter is saved with the model."""
+        self.refresh(model)
+        super().save(model, path)
+
+    def actions(self) -> Any:
+        """Resetting opacities reads the filter; densification takes absolute gradients too."""
+        shared = dict(super().actions())
+        reset = shared["reset opacity"]
+
+        def refreshed(model: Any, arguments: Any, chance: Any) -> None:
+            self.refresh(model)
+            reset(model, arguments, chance)
+
+        def densifying(name: str, all_rows: float) -> Any:
+            def act(model: Any, arguments: Any, chance: Any) -> None:
+                n = len(model.get_xyz)
+                grads, grads_abs = chance.uniform(n, 1), chance.uniform(n, 1)
+                extent = all_rows if chance.seed % 3 else 3.0
+                quantile = torch.quantile(grads_abs, 1 - chance.share / 2)
+                getattr(model, name)(grads, 1 - chance.share / 2, grads_abs, quantile, extent)
+
+            return act
+
+        def both(model: Any, arguments: Any, chance: Any) -> None:
+            model.xyz_gradient_accum_abs = chance.uniform(len(model.get_xyz), 1)
+            model.xyz_gradient_accum_abs_max = model.xyz_gradient_accum_abs
+            shared["densify and prune"](model, arguments, chance)
+
+        return {
+            **shared,
+            "reset opacity": refreshed,
+            "clone": densifying("densify_and_clone", 1e6),
+            "split": densifying("densify_and_split", 1e-6),
+            "densify and prune": both,
+        }
+
+
+def make(root: Path) -> Path:
+    """Write the host into a folder; returns it."""
+    MipHost().write(root)
+    return root
