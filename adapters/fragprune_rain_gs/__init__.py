@@ -1,0 +1,136 @@
+"""KU-CVLAB/RAIN-GS: 3DGS from random or sparse points, coarse to fine.
+
+While Gaussians are few its rasterizer dilates them widely (``low_pass``), and while it warms up
+every split also throws a copy far out, so one split appends twice. In its newer mode the host sets
+no learning rate before iteration 10,000 and an offset one from there.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.seams import Role
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+MODEL = "scene.gaussian_model"
+PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
+"""Inside the checkout, and compiled when it is imported."""
+
+OWN = ("low_pass", "divide_ratio", "abe_split", "args_dict")
+"""A setting of the rasterizer and parameters of the model, of its split and of the scene."""
+
+
+@dataclass(frozen=True)
+class RainDialect(GraphdecoDialect):
+    """Vanilla's call of 2023 with a dilation of its own, and depth as third output."""
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Depth is blended as one more channel; it has no gradient."""
+        inputs = super().unpack(call)
+        view = inputs.view.viewmatrix
+        depth = call["means3D"].detach() @ view[:3, 2:3] + view[3, 2]
+        splats = replace(inputs.splats, features=depth)
+        return replace(inputs, splats=splats, dilation=float(call.settings.low_pass))
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
+        """(colour (3, H, W), radii (P,) int32, depth (1, H, W): the sum of z alpha T)."""
+        assert outputs.features is not None  # unpack asked for it
+        return outputs.image, outputs.radii, outputs.features.detach()
+
+    def present(self, package: str) -> bool:
+        """The rasterizer is where its compiler is."""
+        if not PACKAGE.startswith(package):
+            return super().present(package)
+        from torch.cuda import is_available
+        from torch.utils.cpp_extension import CUDA_HOME
+
+        return CUDA_HOME is not None and is_available()
+
+    def spares(self) -> dict[str, ModuleType]:
+        """``train.py`` imports wandb and does not use it."""
+        return {"wandb": ModuleType("wandb", "Stand-in of fragprune: empty.")}
+
+
+class RainGS(GraphdecoAdapter):
+    """RAIN-GS."""
+
+    name = "rain-gs"
+    info = HostInfo("RAIN-GS", repo="KU-CVLAB/RAIN-GS", states="2024, both of its modes")
+    package = PACKAGE
+    steps_by_rendering = True
+    seams = (
+        *(seam for seam in GraphdecoAdapter.seams if seam.role is not Role.RASTERIZE),
+        *(
+            replace(seam, module=PACKAGE)
+            for seam in GraphdecoAdapter.seams
+            if seam.role is Role.RASTERIZE
+        ),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """The dilation, the far split, and the rasterizer inside the checkout."""
+        findings = super().fingerprint(repo)
+        own = {
+            *self.dialect(repo).settings,
+            *(repo.parameters(MODEL, "GaussianModel.__init__") or ()),
+            *(repo.parameters(MODEL, "GaussianModel.densify_and_split") or ()),
+            *(repo.parameters("scene", "Scene.__init__") or ()),
+        }
+        missing = [name for name in OWN if name not in own]
+        if repo.path(PACKAGE) is None:
+            missing.append(PACKAGE)
+        if missing:
+            findings.append(
+                Finding(
+                    "error",
+                    "other-host",
+                    str(repo.root),
+                    f"no {', no '.join(missing)}",
+                    "a RAIN-GS checkout",
+                    "Use the adapter of that host.",
+                )
+            )
+        return findings
+
+    def dialect(self, repo: HostRepo) -> RainDialect:
+        """As the lineage reads it from ``render``."""
+        return RainDialect(**vars(super().dialect(repo)))
+
+    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
+        """A far split appends N - 1 copies of each row before it appends N children."""
+        copies = 2 * arguments["N"] - 1 if arguments.get("abe_split") else arguments.get("N", 1)
+        return super().parents(model, method, {**arguments, "N": copies})
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """Without the modes: they make new points, and cannot go on (no dilation is set then)."""
+        parser = ArgumentParser(add_help=False, allow_abbrev=False)
+        for flag in ("--ours", "--ours_new", "--paper_random", "--c2f"):
+            parser.add_argument(flag, action="store_true")
+        for flag in ("--train_from", "--warmup_iter", "--num_gaussians"):
+            parser.add_argument(flag)
+        for flag in ("--c2f_every_step", "--c2f_max_lowpass"):
+            parser.add_argument(flag)
+        return script, parser.parse_known_args(arguments)[1]
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+        """As vanilla's, with its dilation; views are always held out."""
+        return super().drawing(repo, [*arguments, "--eval"])
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Offer RAIN-GS."""
+    register(RainGS())
