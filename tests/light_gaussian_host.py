@@ -13,6 +13,7 @@ import torch
 from torch.optim.lr_scheduler import ExponentialLR
 
 from fragprune_plugins import demo
+from fragprune_plugins.testing import Chance, Host
 
 args = SimpleNamespace()  # the host's scripts hold their options under this name
 
@@ -235,3 +236,38 @@ def make(root: Path) -> Path:
     (root / "distill_train.py").write_text(distilling)
     (root / "train.py").unlink()
     return root
+
+
+class LightGaussianHost(Host):
+    """Pruning by a score, and densification without it."""
+
+    routine = (
+        "prune by score",
+        "prune by opacity",
+        "densify",
+        "densify and prune",
+        "reset opacity",
+        "another band",
+    )
+
+    def write(self, root):
+        make(root)
+
+    def actions(self):
+        return {
+            **super().actions(),
+            "prune by score": prune_by_score,
+            "prune by opacity": lambda m, arguments, chance: m.prune_opacity(chance.share),
+            "densify": densify_alone,
+        }
+
+
+def prune_by_score(model, arguments, chance: Chance):
+    model.prune_gaussians(chance.share, chance.uniform(len(model.get_xyz)))
+
+
+def densify_alone(model, arguments, chance: Chance):
+    n = len(model.get_xyz)
+    model.xyz_gradient_accum = chance.uniform(n, 1)
+    model.denom = chance.rows(n, 0.8)[:, None].float()
+    model.densify(1 - chance.share, 3.0 if chance.heads else 100.0)

@@ -10,6 +10,8 @@ from types import SimpleNamespace
 import torch
 
 from fragprune_plugins import demo
+from fragprune_plugins.testing import Chance, Host
+from fragprune_plugins.testing.host import prune
 
 args = SimpleNamespace()  # the host's training loop reads its own script's global of this name
 
@@ -212,3 +214,43 @@ def make(root: Path) -> Path:
     text = (root / "train.py").read_text()
     (root / "train.py").write_text(text.replace("if __name__", added + "\n\nif __name__"))
     return root
+
+
+class MCMCHost(Host):
+    """Relocation, addition and noise in place of densification."""
+
+    routine = ("relocate", "add", "another band")
+
+    def write(self, root):
+        make(root)
+
+    def step(self, model, camera, iteration, background):
+        rate = model.update_learning_rate(iteration)
+        package = self.render(camera, model, background)
+        loss = (package["render"] - camera.original_image).abs().mean()
+        loss = loss + 0.01 * (model.get_opacity.abs().mean() + model.get_scaling.abs().mean())
+        loss.backward()
+        with torch.no_grad():
+            self.descend(model)
+            model._xyz.add_(1e3 * rate * torch.randn_like(model._xyz))
+        return float(loss.detach())
+
+    def actions(self):
+        shared = super().actions()
+        return {
+            "relocate": relocate,
+            "add": add,
+            "prune": prune,
+            **{name: shared[name] for name in ("restore", "another band", "training setup")},
+        }
+
+
+@torch.no_grad()
+def relocate(model, arguments, chance: Chance):
+    share = (0.0, 1.0, chance.share, chance.share)[chance.seed % 4]
+    model.relocate_gs(dead_mask=chance.rows(len(model.get_xyz), share))
+
+
+@torch.no_grad()
+def add(model, arguments, chance: Chance):
+    model.add_new_gs(cap_max=len(model.get_xyz) + int(10 * chance.share))
