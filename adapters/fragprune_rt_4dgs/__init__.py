@@ -1,0 +1,203 @@
+"""fudan-zvg/4d-gaussian-splatting (RT-4DGS): Gaussians in space and time.
+
+A view is drawn at a moment: the Gaussians are cut there, and the 3D Gaussians that come out are
+splatted as ever. A threshold acts on the falloff of that 3D Gaussian; how likely the moment is only
+scales its opacity. The host has no PLY: its checkpoints are its models, and carry the thresholds.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from fragprune_plugins.adapter import CommandLine, HostAdapter, HostCall, HostInfo
+from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.lineage import GraphdecoAdapter
+from fragprune_plugins.seams import Role, Seam
+from fragprune_rt_4dgs.config import YAMLFile
+from fragprune_rt_4dgs.dialect import OUTPUTS, RASTERIZER, SETTINGS, RT4DGSDialect
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+MODEL = "scene.gaussian_model"
+
+LACKING = (Role.SAVE, Role.LOAD, Role.RASTERIZE)
+"""Roles whose seams of the lineage are missing here, or are elsewhere."""
+
+
+class RT4DGS(GraphdecoAdapter):
+    """RT-4DGS, with and without 4D rotation."""
+
+    name = "rt-4dgs"
+    info = HostInfo(
+        "Real-time Photorealistic Dynamic Scene Representation with 4D Gaussian Splatting",
+        repo="fudan-zvg/4d-gaussian-splatting",
+        states="January 2026",
+    )
+    package = RASTERIZER
+    gradients_read = frozenset({"t"})
+    seams = (
+        *(seam for seam in GraphdecoAdapter.seams if seam.role not in LACKING),
+        Seam(
+            Role.RASTERIZE,
+            RASTERIZER,
+            "GaussianRasterizer.forward",
+            ("means3D", "means2D", "opacities"),
+            external=True,
+        ),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Gaussians with a marginal in time, and a rasterizer of their own inside the host."""
+        findings = super().fingerprint(repo)
+        dialect = self.dialect(repo)
+        checks = {
+            "no-marginal": (
+                f"{MODEL}:GaussianModel.get_marginal_t",
+                bool(repo.function(MODEL, "GaussianModel.get_marginal_t")),
+                "no such function",
+                "one, as RT-4DGS has it",
+            ),
+            "rasterizer-settings": (
+                "gaussian_renderer:render",
+                dialect.settings == SETTINGS,
+                f"settings ({', '.join(dialect.settings)})",
+                f"({', '.join(SETTINGS)})",
+            ),
+            "rasterizer-outputs": (
+                "gaussian_renderer:render",
+                dialect.outputs == OUTPUTS,
+                f"{dialect.outputs} values unpacked from the rasterizer",
+                f"{OUTPUTS}: colour, radii, depth, alpha, flow, covariances",
+            ),
+            "rasterizer-call": (
+                RASTERIZER,
+                {"ts", "scales_t", "rotations_r", "prefilter_var"}
+                <= set(repo.parameters(RASTERIZER, "GaussianRasterizer.forward") or ()),
+                "no forward() that takes ts, scales_t, rotations_r and prefilter_var",
+                "the host's own rasterizer",
+            ),
+        }
+        return findings + [
+            Finding("error", code, where, found, expected, "Use the adapter of that host.")
+            for code, (where, holds, found, expected) in checks.items()
+            if not holds
+        ]
+
+    def dialect(self, repo: HostRepo) -> RT4DGSDialect:
+        """As the lineage reads it from ``render``."""
+        return RT4DGSDialect(**vars(super().dialect(repo)))
+
+    # -- its command line ------------------------------------------------------------------------
+
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """A YAML file wins over flags; models are checkpoints; the first iteration is 2."""
+        return replace(
+            super().command_line(repo),
+            save_checkpoints="--save_iterations",
+            config=YAMLFile("--config"),
+            checkpoints_only=True,
+            skipped=1,
+        )
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """The same command, if the host can resume at all what it trains."""
+        parser = ArgumentParser(add_help=False)
+        parser.add_argument("--config", type=Path)
+        parser.add_argument("--gaussian_dim", type=int, default=3)
+        flags, _ = parser.parse_known_args(arguments)
+        values = vars(flags) | (YAMLFile("").read(flags.config) if flags.config else {})
+        if values["gaussian_dim"] != 4:
+            raise UsageError(
+                "gaussian_dim",
+                f"{values['gaussian_dim']}: the host fails to resume its own checkpoints of these",
+                "4",
+                "Learn inside one run, with fragprune run --stage finetune --from-iter N.",
+            )
+        return script, arguments
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> None:
+        """Our readers know no time."""
+
+    def view(self, camera: Any) -> int:
+        """Every render gets a copy of its camera; copies keep the number."""
+        return int(camera.uid)
+
+    # -- its models ------------------------------------------------------------------------------
+
+    def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
+        """With ``compute_cov3D_python`` the host leaves out who is not there at the moment.
+
+        The same mask, worked out by the host's own function; the opacities of the call, which have
+        the marginal in them, must be those of the rows it keeps.
+        """
+        import torch
+
+        if call.get("cov3D_precomp") is None or model.gaussian_dim != 4:
+            return None
+        with torch.no_grad():
+            marginal = model.get_marginal_t(call.settings.timestamp)
+            rows: Tensor = (marginal[:, 0] > 0.05).nonzero()[:, 0]
+            expected = (model.get_opacity * marginal)[rows]
+        if not torch.equal(expected, call["opacities"]):
+            raise AlignmentError(
+                f"{self.name}: compute_cov3D_python",
+                f"{len(call['opacities'])} Gaussians",
+                f"the {len(rows)} of {self.rows(model)} that are there at "
+                f"{float(call.settings.timestamp):g}, with their opacities",
+                "Report this with the host's commit, or leave compute_cov3D_python off.",
+            )
+        return rows
+
+    def elsewhere(self, model: Any) -> list[Tensor]:
+        """The environment map, whose optimizer is a local of the training loop."""
+        return [model.env_map] if getattr(model.env_map, "requires_grad", False) else []
+
+    def before_restore(self, model: Any, capture: Any) -> Any:
+        """Keep the environment map: the training loop replaces it by a new one."""
+        model.restored_env_map = capture[17] if model.gaussian_dim == 4 else None
+        return capture
+
+    def prepare_stage2(self, model: Any, output: Path | None) -> None:
+        """Bring the environment map back."""
+        import torch
+
+        saved = getattr(model, "restored_env_map", None)
+        if saved is not None and model.env_map is not None:
+            with torch.no_grad():
+                model.env_map.copy_(saved)
+
+    # -- its files -------------------------------------------------------------------------------
+
+    def model_file(self, output: Path, iteration: int) -> Path:
+        """What ``scene.save`` writes."""
+        return output / f"chkpnt{iteration}.pth"
+
+    def save_model(self, model: Any, output: Path, iteration: int) -> Path:
+        """As ``scene.save`` does."""
+        import torch
+
+        path = self.model_file(output, iteration)
+        torch.save((model.capture(), iteration), path)
+        return path
+
+    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> NoReturn:
+        """A PLY holds no time."""
+        raise ModelFileError(
+            str(ply),
+            "a PLY, which has no place for Gaussians in time",
+            "chkpnt*.pth, as RT-4DGS saves",
+            "Name one with --start_checkpoint.",
+        )
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Offer RT-4DGS."""
+    register(RT4DGS())

@@ -1,0 +1,133 @@
+"""Colour by direction and time: spherical harmonics times cosines, as RT-4DGS evaluates them.
+
+The picture is drawn with directions to the means as they are stored. The host's backward pass looks
+elsewhere: from the means where the moment has moved them. It also has slips in what it writes by
+hand for colours in time, named at ``_slope``. Training follows those gradients, so they are ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+import torch
+from torch import Tensor
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154)
+C3_2 = 1.445305721320277
+BANDS = 16
+"""Coefficients of degree 3; time modulates them only when all are in use."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What colours in time depend on.
+
+    Attributes:
+        times: (N,) means in time.
+        timestamp: the moment.
+        duration: of the whole recording, the cosines' longest period.
+        degree: how many cosines are in use, 0 to 2.
+    """
+
+    times: Tensor
+    timestamp: float
+    duration: float
+    degree: int
+
+    def wave(self, order: int, times: Tensor | None = None) -> Tensor:
+        """(N,) cosine of an order, 1 and up."""
+        since = (self.times if times is None else times) - self.timestamp
+        return torch.cos(2 * pi * order * since / self.duration)
+
+
+def colors(
+    sh: Tensor,
+    means: Tensor,
+    moved: Tensor,
+    campos: Tensor,
+    degree: int,
+    clock: Clock | None,
+) -> Tensor:
+    """(N, 3) RGB, not below 0.
+
+    Args:
+        sh: (N, K, 3), K at least (degree + 1)^2, and 16 more for each cosine.
+        means: (N, 3) as stored.
+        moved: (N, 3) where they are at the moment.
+        campos: (3,).
+        degree: of the harmonics in use, 0 to 3.
+        clock: None for colours that time leaves alone.
+    """
+    with torch.no_grad():
+        harmonics = basis(_towards(means, campos), degree)
+        value = _blend(sh, harmonics, clock) + 0.5
+    asked = (sh, moved) if clock is None else (sh, moved, clock.times)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in asked):
+        slope = _slope(sh, basis(_towards(moved, campos), degree), clock)
+        value = value + (slope - slope.detach())
+    return value.clamp_min(0)
+
+
+def basis(directions: Tensor, degree: int) -> Tensor:
+    """(N, (degree + 1)^2) real spherical harmonics of unit directions (N, 3), signs as in 3DGS."""
+    x, y, z = directions.unbind(-1)
+    values = [torch.full_like(x, C0)]
+    if degree > 0:
+        values += [-C1 * y, C1 * z, -C1 * x]
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        values += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy)]
+        values += [C2[1] * x * z, C2[3] * (xx - yy)]
+    if degree > 2:
+        values += [C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, C3[2] * y * (4 * zz - xx - yy)]
+        values += [C3[3] * z * (2 * zz - 3 * xx - 3 * yy), C3[2] * x * (4 * zz - xx - yy)]
+        values += [C3_2 * z * (xx - yy), C3[0] * x * (xx - 3 * yy)]
+    return torch.stack(values, dim=-1)
+
+
+def _towards(means: Tensor, campos: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(means - campos, dim=-1)
+
+
+def _orders(harmonics: Tensor, clock: Clock | None) -> range:
+    """Orders of the cosines in use: none below degree 3."""
+    used = clock.degree if clock is not None and harmonics.shape[1] == BANDS else 0
+    return range(1, used + 1)
+
+
+def _sum(harmonics: Tensor, sh: Tensor, order: int = 0) -> Tensor:
+    """(N, 3) harmonics (N, K) weighed by the coefficients of one cosine."""
+    count = harmonics.shape[1]
+    return torch.einsum("nk,nkc->nc", harmonics, sh[:, BANDS * order : BANDS * order + count])
+
+
+def _blend(sh: Tensor, harmonics: Tensor, clock: Clock | None) -> Tensor:
+    """(N, 3) the sum over harmonics and cosines."""
+    total = _sum(harmonics, sh)
+    for order in _orders(harmonics, clock):
+        assert clock is not None
+        total = total + clock.wave(order)[:, None] * _sum(harmonics, sh, order)
+    return total
+
+
+def _slope(sh: Tensor, harmonics: Tensor, clock: Clock | None) -> Tensor:
+    """(N, 3) has the host's gradient; its value is of no use.
+
+    Where time modulates colours, the host gives the second coefficient the first one's gradient,
+    and to the means in time only that of the highest cosine, with the opposite sign.
+    """
+    if clock is None:
+        return _blend(sh, harmonics, None)
+    given = harmonics.detach().clone()
+    given[:, 1:2] = C0
+    total = _sum(harmonics, sh.detach()) + _sum(given, sh)
+    orders = _orders(harmonics, clock)
+    for order in orders:
+        still = clock.times.detach()
+        times = 2 * still - clock.times if order == orders[-1] else still
+        total = total + clock.wave(order, times)[:, None] * _sum(harmonics, sh, order)
+    return total

@@ -1,0 +1,44 @@
+"""The host's configuration: a YAML file whose values win over the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.adapter import ConfigFile
+
+
+class YAMLFile(ConfigFile):
+    """The host walks the file's sections in order and takes every value, whatever section it is in.
+
+    The last one wins, so a section at the end overrules the file. It is read with the host's own
+    reader, which knows more numbers than YAML does.
+    """
+
+    def read(self, path: Path) -> dict[str, Any]:
+        """Values by argument name, sections flattened."""
+        try:
+            from omegaconf import OmegaConf
+            from omegaconf.errors import OmegaConfBaseException
+            from yaml import YAMLError
+        except ImportError as error:
+            raise ValueError(f"{error}; the host reads the file with omegaconf") from error
+        try:
+            return _flat(OmegaConf.to_container(OmegaConf.load(path), resolve=True))
+        except (OmegaConfBaseException, YAMLError) as error:
+            raise ValueError(str(error)) from error
+
+    def overrule(self, text: str, values: dict[str, Any]) -> str:
+        """The file and one more section."""
+        lines = [f"  {name}: {json.dumps(value)}" for name, value in values.items()]
+        return "\n".join([text.rstrip(), "fragprune:", *lines, ""])
+
+
+def _flat(section: Any) -> dict[str, Any]:
+    if not isinstance(section, dict):
+        raise ValueError("not sections of names and values")
+    values: dict[str, Any] = {}
+    for key, value in section.items():
+        values.update(_flat(value) if isinstance(value, dict) else {key: value})
+    return values

@@ -1,0 +1,150 @@
+"""A 4D Gaussian at one moment: the 3D Gaussian that RT-4DGS draws there.
+
+Space and time have one covariance. At a moment, time is known: the 3D Gaussian is the conditional
+one, its mean moves linearly, and it is as strong as the moment is likely (the marginal). Plain
+torch, in the dtype of its arguments; gradients are the host's, which its kernels write by hand:
+where they differ from the derivative, so do ours, and it says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+MARGINAL_MIN = 0.05
+"""At or below it a Gaussian is not there."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """N Gaussians at one moment.
+
+    Attributes:
+        means: (N, 3) world.
+        cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
+        opacities: (N,) marginal included.
+        present: (N,) bool, those that the host does not cull for their time.
+    """
+
+    means: Tensor
+    cov3d: Tensor
+    opacities: Tensor
+    present: Tensor
+
+
+def _rows(*entries: Tensor) -> Tensor:
+    """(N, n, n) of n * n columns (N,), row by row."""
+    size = round(len(entries) ** 0.5)
+    return torch.stack(entries, dim=-1).reshape(-1, size, size)
+
+
+def rotation(quaternions: Tensor) -> Tensor:
+    """(N, 3, 3) of quaternions (N, 4) w, x, y, z, used as given."""
+    w, x, y, z = quaternions.unbind(-1)
+    return _rows(
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def rotation_4d(left: Tensor, right: Tensor) -> Tensor:
+    """(N, 4, 4) rotation of x, y, z, t by two quaternions (N, 4) each, used as given.
+
+    With (t, z, y, x) read as a quaternion v, it is v -> left v right.
+    """
+    a, b, c, d = left.unbind(-1)
+    p, q, r, s = right.unbind(-1)
+    by_left = _rows(*(a, b, -c, d), *(-b, a, d, c), *(c, -d, a, b), *(-d, -c, -b, a))
+    by_right = _rows(*(p, q, -r, -s), *(-q, p, s, -r), *(r, -s, p, -q), *(s, r, q, p))
+    return by_left @ by_right
+
+
+def covariance(rotations: Tensor, scales: Tensor) -> Tensor:
+    """(N, n, n) of rotation matrices (N, n, n) and standard deviations (N, n) along their axes."""
+    axes = rotations * scales[:, None, :]
+    return axes @ axes.transpose(1, 2)
+
+
+def upper(matrices: Tensor) -> Tensor:
+    """(N, 6) upper triangle of symmetric matrices, the first three of their rows and columns."""
+    rows, columns = torch.triu_indices(3, 3, device=matrices.device)
+    return matrices[:, rows, columns]
+
+
+def joint(
+    means: Tensor,
+    opacities: Tensor,
+    times: Tensor,
+    scales: Tensor,
+    rotations: tuple[Tensor, Tensor],
+    *,
+    timestamp: float,
+    prefilter_var: float = -1.0,
+) -> Moment:
+    """Gaussians whose axes lie anywhere in space and time (``rot_4d``).
+
+    Args:
+        means: (N, 3).
+        opacities: (N,).
+        times: (N,) means in time.
+        scales: (N, 4) standard deviations, x, y, z, t.
+        rotations: left and right quaternions (N, 4).
+        timestamp: the moment.
+        prefilter_var: when positive, added to the variance in time that the marginal sees.
+    """
+    cov4d = covariance(rotation_4d(*rotations), scales)
+    in_time, across = cov4d[:, 3, 3], cov4d[:, :3, 3]
+    since = timestamp - times
+    marginal = _marginal(since, in_time, prefilter_var)
+    velocity = across / in_time[:, None]
+    cov3d = upper(cov4d) - upper(across[:, :, None] * velocity[:, None, :])
+    return Moment(
+        means=means + velocity * since[:, None],
+        cov3d=cov3d,
+        opacities=opacities * marginal,
+        present=marginal > MARGINAL_MIN,
+    )
+
+
+def separate(
+    means: Tensor,
+    opacities: Tensor,
+    times: Tensor,
+    scales: Tensor,
+    rotations: Tensor,
+    *,
+    timestamp: float,
+    prefilter_var: float = -1.0,
+) -> Moment:
+    """Gaussians that come and go where they are (4D without ``rot_4d``).
+
+    The host takes the scale in time for a variance, unsquared. Its backward pass leaves the
+    marginal out altogether: opacity gets the gradient of what is drawn, time and its scale get
+    zeros.
+
+    Args:
+        means: (N, 3).
+        opacities: (N,).
+        times: (N,) means in time.
+        scales: (N, 4): standard deviations x, y, z, and the variance in time.
+        rotations: (N, 4) quaternions.
+        timestamp: the moment.
+        prefilter_var: when positive, added to the variance in time.
+    """
+    since = (timestamp - times).detach()
+    marginal = _marginal(since, scales[:, 3].detach(), prefilter_var)
+    strength = (opacities * marginal).detach() + (opacities - opacities.detach())
+    return Moment(
+        means=means,
+        cov3d=upper(covariance(rotation(rotations), scales[:, :3])),
+        opacities=strength + 0.0 * (times + scales[:, 3]),
+        present=marginal > MARGINAL_MIN,
+    )
+
+
+def _marginal(since: Tensor, variance: Tensor, prefilter_var: float) -> Tensor:
+    """(N,) how likely the moment is, 1 at the mean in time."""
+    return torch.exp(-0.5 * since * since / (variance + max(prefilter_var, 0.0)))
