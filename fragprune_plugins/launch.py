@@ -11,7 +11,6 @@ import argparse
 import contextlib
 import gc
 import logging
-import os
 import runpy
 import sys
 import tempfile
@@ -255,6 +254,8 @@ class _Runner:
             return
         resumed = self.adapter.resumed_by(self.host.script, self.host.arguments)
         self.host = _parse(*resumed, self.host.line, self.host.module)
+        if self.output is None and self.host.flags.output:
+            self.output = Path(self.host.flags.output)
         with self._checkpoint() as (iteration, checkpoint):
             self._note_before(iteration)
             start = 0 if self.host.line.restarts else iteration
@@ -326,7 +327,8 @@ class _Runner:
         )
         known = set(sys.modules)
         try:
-            with session, _host_process(self.host, arguments, self.device):
+            folder = Path.cwd() if self.host.module else self.host.script.parent
+            with session, _host_process(self.host.script, arguments, self.device, folder):
                 try:
                     if self.host.module:
                         runpy.run_module(self.host.module, run_name="__main__", alter_sys=True)
@@ -342,6 +344,7 @@ class _Runner:
                         if saved
                         else "Start it again.",
                     ) from error
+            session.expect_drawn()
         except SystemExit as error:
             if error.code not in (None, 0):
                 raise HostFailed(
@@ -352,7 +355,7 @@ class _Runner:
                 ) from error
         finally:
             self.output = session.output or self.output
-            _forget_modules(self.repo.root, self.adapter.installed, known)
+            _forget_modules(self.repo.root, known, self.adapter.installed)
             if learn:
                 self.learned = session.finish()
                 self.curves = session.curves
@@ -548,13 +551,15 @@ def _host_pictures() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _host_process(host: _Invocation, arguments: list[str], device: str) -> Iterator[None]:
+def _host_process(
+    script: Path, arguments: list[str], device: str, folder: Path | None = None
+) -> Iterator[None]:
     """What a fresh interpreter would give the script, put back afterwards."""
     from fragprune_plugins.device import cpu_only
 
     saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
-    sys.argv = [str(host.script), *arguments]
-    sys.path.insert(0, os.getcwd() if host.module else str(host.script.parent))
+    sys.argv = [str(script), *arguments]
+    sys.path.insert(0, str(folder or script.parent))
     try:
         with contextlib.ExitStack() as stack:
             stack.enter_context(_host_checkpoints())
@@ -566,13 +571,13 @@ def _host_process(host: _Invocation, arguments: list[str], device: str) -> Itera
         sys.argv, sys.path[:], sys.stdout, sys.stderr = saved
 
 
-def _forget_modules(root: Path, packages: tuple[str, ...], known: set[str]) -> None:
+def _forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) -> None:
     """Drop the host's own modules, so that its script runs again as if for the first time.
 
     Args:
         root: of a checkout, which may hold an environment with packages that are not its own.
-        packages: that are the host, where it is installed; their compiled modules stay.
         known: names of modules that were there before the host ran.
+        packages: that are the host, where it is installed; their compiled modules stay.
     """
     for name in sys.modules.keys() - known:
         file = getattr(sys.modules[name], "__file__", None) or ""

@@ -320,6 +320,18 @@ class Session:
         self.hook.fragprune_finished(summary=summary)
         return summary
 
+    def expect_drawn(self) -> None:
+        """Raise where steps were counted as learned and no view was drawn with thresholds."""
+        state = self._last_state
+        steps = self._learned(state) if state else 0
+        if steps and self.settings.truncate and not (state and state.drawn):
+            raise SessionError(
+                self.adapter.name,
+                f"{steps} steps, and no view of the trained model drawn with its thresholds",
+                "one or more in every step",
+                "Report this with the host's commit: it draws in a way that the adapter misses.",
+            )
+
     def save_interrupted(self) -> Path | None:
         """After Ctrl-C: have the host save its model, with what was learned beside it."""
         model = self._last() if self._last else None

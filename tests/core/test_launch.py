@@ -70,7 +70,7 @@ def test_modules_of_an_installed_host_are_forgotten_and_its_compiled_ones_kept(
         module = ModuleType(name)
         module.__file__ = str(root / file)
         monkeypatch.setitem(sys.modules, name, module)
-    _forget_modules(root, ("toy",), sys.modules.keys() - {*files, "other"})
+    _forget_modules(root, sys.modules.keys() - {*files, "other"}, ("toy",))
     assert {"toy", "toy.train"} & sys.modules.keys() == set()
     assert {"toy._C", "other"} <= sys.modules.keys()
 
