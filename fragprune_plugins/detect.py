@@ -59,6 +59,13 @@ class Match:
         return self.confidence != "none"
 
 
+def _definition(scope: ast.AST | None, name: str) -> ast.AST | None:
+    """The class or function of a name right inside a module or class."""
+    body: Sequence[ast.stmt] = getattr(scope, "body", ())
+    kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    return next((child for child in body if isinstance(child, kinds) and child.name == name), None)
+
+
 class HostRepo:
     """A host's checkout, or installed package, read as text.
 
@@ -106,17 +113,19 @@ class HostRepo:
         """The definition at a dotted path inside a module, or None."""
         node: ast.AST | None = self.tree(module)
         for name in attribute.split("."):
-            body: Sequence[ast.stmt] = getattr(node, "body", ())
-            node = next(
-                (
-                    child
-                    for child in body
-                    if isinstance(child, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-                    and child.name == name
-                ),
-                None,
-            )
+            node = _definition(node, name)
         return node if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else None
+
+    def place(self, module: str, attribute: str) -> str:
+        """The file:line of a definition; where it is absent, of as much of its path as exists."""
+        path, line = self.path(module), 1
+        if path is None:
+            return f"no file {module.replace('.', '/')}.py"
+        scope: ast.AST | None = self.tree(module)
+        for name in attribute.split("."):
+            scope = _definition(scope, name)
+            line = getattr(scope, "lineno", line)
+        return f"{path.relative_to(self.root)}:{line}"
 
     def parameters(self, module: str, attribute: str) -> tuple[str, ...] | None:
         """Parameter names of a function, ``self`` left out; None when it is not there."""
@@ -194,26 +203,48 @@ class HostRepo:
         return ""
 
 
+@dataclass(frozen=True)
+class SeamState:
+    """A seam as the source has it.
+
+    Attributes:
+        seam: looked up.
+        status: "at import" where the source cannot tell, because the module is compiled.
+        at: "file:line" of the function, or of what it was expected in; "" at import.
+        finding: the error, where there is one.
+    """
+
+    seam: Seam
+    status: Literal["found", "changed", "missing", "at import"]
+    at: str = ""
+    finding: Finding | None = None
+
+
+def look_up(repo: HostRepo, seams: Iterable[Seam]) -> list[SeamState]:
+    """Each seam in the source, in order; nothing is imported."""
+    return [_look_up(repo, seam) for seam in seams]
+
+
+def _look_up(repo: HostRepo, seam: Seam) -> SeamState:
+    if seam.external:
+        return SeamState(seam, "at import")
+    at = repo.place(seam.module, seam.attribute)
+    have = repo.parameters(seam.module, seam.attribute)
+    where = f"{seam} ({at})"
+    if have is None:
+        gone = Finding("error", "seam-missing", where, "no such function", "one")
+        return SeamState(seam, "missing", at, gone)
+    missing = [name for name in seam.needs if name not in have]
+    if not missing:
+        return SeamState(seam, "found", at)
+    found, expected = f"parameters ({', '.join(have)})", f"also {', '.join(missing)}"
+    changed = Finding("error", "seam-signature", where, found, expected)
+    return SeamState(seam, "changed", at, changed)
+
+
 def check_seams(repo: HostRepo, seams: Iterable[Seam]) -> list[Finding]:
-    """Look each seam up in the source: an error per one that is missing or was changed."""
-    findings = []
-    for seam in seams:
-        if seam.external:
-            continue
-        have = repo.parameters(seam.module, seam.attribute)
-        if have is None:
-            findings.append(Finding("error", "seam-missing", str(seam), "no such function", "one"))
-        elif missing := [name for name in seam.needs if name not in have]:
-            findings.append(
-                Finding(
-                    "error",
-                    "seam-signature",
-                    str(seam),
-                    f"parameters ({', '.join(have)})",
-                    f"also {', '.join(missing)}",
-                )
-            )
-    return findings
+    """An error for each seam that is missing or was changed."""
+    return [state.finding for state in look_up(repo, seams) if state.finding]
 
 
 def locate(

@@ -47,14 +47,18 @@ def test_every_seam_that_is_gone_or_changed_is_named(tmp_path, seam):
     head = f"def {seam.attribute.split('.')[-1]}("
     whole = path.read_text()
     path.write_text(whole.replace(head, "def renamed("))
-    assert [(f.code, f.where) for f in errors(HostRepo(tmp_path))] == [("seam-missing", str(seam))]
+    (gone,) = errors(HostRepo(tmp_path))
+    assert gone.code == "seam-missing"
+    assert gone.where.startswith(f"{seam} ({path.relative_to(tmp_path)}:")
     for name in seam.needs:
         changed = [
             line.replace(name, "other", 1) if head in line else line for line in whole.splitlines()
         ]
         path.write_text("\n".join(changed))
         found = errors(HostRepo(tmp_path))
-        assert [(f.code, f.where) for f in found] == [("seam-signature", str(seam))]
+        line = next(n for n, text in enumerate(changed, 1) if head in text)
+        where = f"{seam} ({path.relative_to(tmp_path)}:{line})"
+        assert [(f.code, f.where) for f in found] == [("seam-signature", where)]
         assert name in found[0].expected
 
 
