@@ -92,13 +92,16 @@ class PatchLedger:
                 )
         return findings
 
+    def _is_hosts(self, module: ModuleType) -> bool:
+        file = getattr(module, "__file__", None)
+        return not file or Path(file).resolve().is_relative_to(self._root or "/")
+
     def _check(self, module: ModuleType, seam: Seam) -> None:
-        file = Path(getattr(module, "__file__", None) or "")
-        shadowed = not seam.external and not file.resolve().is_relative_to(self._root or "/")
-        if shadowed:  # hosts have plain names, and some append themselves to the path
+        if not seam.external and not self._is_hosts(module):
+            # Hosts have plain names, and some append themselves to the path.
             raise SeamError(
                 str(seam),
-                f"a module of the same name from {file}",
+                f"a module of the same name from {module.__file__}",
                 f"the host's, in {self._root}",
                 "Uninstall the other, or take it from PYTHONPATH.",
             )
@@ -120,9 +123,11 @@ class PatchLedger:
                 "Run fragprune check on the host to see which adapter fits.",
             )
 
-    @staticmethod
-    def _refuse_late(module: ModuleType, seam: Seam) -> None:
-        """A copy bound by ``from module import name`` would stay unpatched: refuse, name it."""
+    def _refuse_late(self, module: ModuleType, seam: Seam) -> None:
+        """A copy bound by ``from module import name`` would stay unpatched: refuse, name it.
+
+        Of a function that is not the host's, only the host's copies matter.
+        """
         head = seam.attribute.split(".")[0]
         if head != seam.attribute:
             return  # a method is patched on its class, which every holder shares
@@ -131,7 +136,7 @@ class PatchLedger:
             name
             for name, other in list(sys.modules.items())
             if other is not module
-            and not (seam.external and name.startswith(f"{seam.module}."))  # its own affair
+            and (not seam.external or self._is_hosts(other))
             and original is not None
             and getattr(other, "__dict__", {}).get(head) is original
         ]

@@ -1,0 +1,314 @@
+"""A miniature Mini-Splatting: the demo's host with what the method adds, from its interface."""
+
+from __future__ import annotations
+
+import inspect
+import random
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from light_gaussian_host import changed
+
+from fragprune_plugins.testing.host import Chance, Host
+
+args = SimpleNamespace()  # the host's scripts hold their options under this name
+
+
+class Added:
+    """Methods of GaussianModel that vanilla does not have."""
+
+    def densify_and_prune_split(self, max_grad, min_opacity, extent, max_screen_size, mask):
+        grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
+        self.densify_and_clone(grads, max_grad, extent)
+        self.densify_and_split_mask(grads, max_grad, extent, mask)
+        unwanted = (self.get_opacity < min_opacity).squeeze(-1)
+        if max_screen_size:
+            unwanted |= self.max_radii2D > max_screen_size
+        self.prune_points(unwanted)
+
+    def reinitial_pts(self, pts, rgb):
+        cloud = type("Cloud", (), {"points": pts.detach().cpu(), "colors": rgb.detach().cpu()})
+        self.create_from_pcd(cloud, self.spatial_lr_scale)
+
+
+def clock(iteration):
+    """The learning rate's: it goes back once the model is made anew."""
+    restart = args.simp_iteration1
+    return iteration if iteration < restart else iteration - restart + 5000
+
+
+def grow(iteration, opt, gaussians, scene, package, pipe, background, blur):
+    """Statistics; clone and split, blurred ones too; now and then all points anew from depth."""
+    seen, radii = package["visibility_filter"], package["radii"]
+    gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
+    gaussians.add_densification_stats(package["viewspace_points"], seen)
+    pixels = package["render"][0].numel()
+    blur = torch.logical_or(blur, package["area_max"] > pixels / 200)
+    fresh = torch.zeros(0)
+    if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+        gaussians.densify_and_prune_split(
+            opt.densify_grad_threshold, 0.005, scene.cameras_extent, None, blur
+        )
+        return fresh.new_zeros(gaussians.get_xyz.shape[0])
+    if iteration % args.depth_interval == 0:
+        points, colours = [], []
+        for view in scene.getTrainCameras():
+            package = render_depth(view, gaussians, pipe, background)  # noqa: F821
+            chances = (1 - package["accum_alpha"]).reshape(-1).cpu().numpy().astype(float)
+            number = args.num_depth // len(scene.getTrainCameras())
+            rows = np.random.choice(
+                len(chances), size=number, p=chances / chances.sum(), replace=False
+            )
+            points.append(package["out_pts"].permute(1, 2, 0).reshape(-1, 3)[rows])
+            colours.append(view.original_image.permute(1, 2, 0).reshape(-1, 3)[rows])
+        gaussians.reinitial_pts(torch.cat(points), torch.cat(colours))
+        gaussians.training_setup(opt)
+        return fresh.new_zeros(gaussians.get_xyz.shape[0])
+    return blur
+
+
+def importance(gaussians, scene, pipe, background):
+    """What each Gaussian adds to all training views; nothing where it nowhere adds most."""
+    total = torch.zeros(gaussians.get_xyz.shape[0])
+    most = torch.zeros_like(total)
+    for view in scene.getTrainCameras():
+        package = render_imp(view, gaussians, pipe, background)  # noqa: F821
+        total += package["accum_weights"]
+        most += package["area_max"]
+    total[most == 0] = 0
+    return total
+
+
+def simplify(iteration, dataset, opt, gaussians, scene, pipe, background):
+    """Once sample by importance and begin again from the sample, once cut what adds least."""
+    if iteration == args.simp_iteration1:
+        score = importance(gaussians, scene, pipe, background).numpy().astype(float)
+        number = int(np.count_nonzero(score) * args.sampling_factor)
+        kept = np.zeros(len(score), dtype=bool)
+        kept[np.random.choice(len(score), size=number, p=score / score.sum(), replace=False)] = True
+        gaussians.prune_points(~kept)
+        gaussians.max_sh_degree = dataset.sh_degree
+        gaussians.reinitial_pts(gaussians._xyz, gaussians._features_dc[:, 0] * 0.28 + 0.5)
+        gaussians.training_setup(opt)
+    if iteration == args.simp_iteration2:
+        score = importance(gaussians, scene, pipe, background)
+        gaussians.prune_points(score <= score.sort().values[len(score) // 10])
+        gaussians.training_setup(opt)
+
+
+def evaluate(image, truth):
+    """Perceptual, with the weights this wants."""
+    return float(lpips(image, truth, net_type="vgg"))  # noqa: F821
+
+
+MASKED = [
+    (
+        "densify_and_split(self, grads, grad_threshold, scene_extent,",
+        "densify_and_split_mask(self, grads, grad_threshold, scene_extent, mask,",
+    ),
+    ("large=True)\n", "large=True)\n        chosen[: grads.shape[0]] |= mask.bool()\n"),
+]
+PATH = (
+    "import torch\nfrom arguments",
+    "import numpy as np\nimport torch\nsys.path.append(str(Path(__file__).resolve().parents[1]))\n"
+    "from arguments",
+)
+OWN = [
+    PATH,
+    (
+        "from gaussian_renderer import render\n",
+        "from gaussian_renderer import render_depth, render_imp\nfrom lpipsPyTorch import lpips\n",
+    ),
+    ("GaussianModel(dataset.sh_degree)", "GaussianModel(0)"),
+    ("learning_rate(iteration)", "learning_rate(clock(iteration))"),
+    ("package = render(camera", "package = render_imp(camera"),
+    ("scene, render, (pipe", "scene, render_imp, (pipe"),
+    (
+        "densify(iteration, opt, dataset, gaussians, scene, package)\n",
+        "blur = grow(iteration, opt, gaussians, scene, package, pipe, background, blur)\n"
+        "            simplify(iteration, dataset, opt, gaussians, scene, pipe, background)\n",
+    ),
+    (
+        "    waiting, smooth",
+        "    blur = torch.zeros(gaussians.get_xyz.shape[0])\n    waiting, smooth",
+    ),
+    (
+        "        total += psnr(image, camera.original_image.cuda()).item()\n",
+        "        total += psnr(image, camera.original_image.cuda()).item()\n"
+        "        evaluate(image, camera.original_image)\n",
+    ),
+    (
+        "    args = parser.parse_args()\n",
+        '    parser.add_argument("--simp_iteration1", type=int, default=15_000)\n'
+        '    parser.add_argument("--simp_iteration2", type=int, default=20_000)\n'
+        '    parser.add_argument("--num_depth", type=int, default=3_500_000)\n'
+        '    parser.add_argument("--depth_interval", type=int, default=5_000)\n'
+        '    parser.add_argument("--sampling_factor", type=float, default=0.5)\n'
+        '    parser.add_argument("--imp_metric", required=True)\n'
+        "    args = parser.parse_args()\n    args.test_iterations.append(args.iterations)\n",
+    ),
+]
+DENSE = [
+    ('    parser.add_argument("--imp_metric", required=True)\n', ""),
+    (
+        "    args.test_iterations.append",
+        "    args.simp_iteration1 = args.densify_until_iter\n    args.test_iterations.append",
+    ),
+]
+LPIPS = '''"""A metric whose weights are elsewhere."""
+from urllib.error import URLError
+
+
+def lpips(x, y, net_type="alex", version="0.1"):
+    raise URLError("no way there")
+'''
+COMPRESSION = '''"""Sort and thin a finished model, store it, read it again and draw it."""
+import os
+import sys
+from argparse import ArgumentParser
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from arguments import ModelParams, PipelineParams, get_combined_args
+from gaussian_renderer import render
+from scene import GaussianModel, Scene
+
+NAMES = ("_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity")
+
+
+def compress(dataset, iteration):
+    model = GaussianModel(dataset.sh_degree)
+    scene = Scene(dataset, model, load_iteration=iteration, shuffle=False)
+    folder = os.path.join(scene.model_path, "point_cloud", f"iteration_{iteration}", "compressed")
+    os.makedirs(folder, exist_ok=True)
+    place = model._xyz.detach()
+    voxels = torch.round((place - place.min()) / (place.max() - place.min()) * 255)
+    _, rows = np.unique(voxels.numpy(), axis=0, return_index=True)
+    rest = [getattr(model, name).detach()[rows].numpy() for name in NAMES]
+    np.savez_compressed(folder + "/compressed_gs.npz", place[rows].numpy(), *rest)
+
+
+def decompress(dataset, iteration, pipe):
+    model = GaussianModel(dataset.sh_degree)
+    scene = Scene(dataset, model, shuffle=False)
+    folder = os.path.join(scene.model_path, "point_cloud", f"iteration_{iteration}", "compressed")
+    data = np.load(folder + "/compressed_gs.npz")
+    model._xyz = torch.tensor(data["arr_0"])
+    for index, name in enumerate(NAMES, 1):
+        setattr(model, name, torch.tensor(data[f"arr_{index}"]))
+    model.active_sh_degree = dataset.sh_degree
+    pictures = [
+        render(camera, model, pipe, torch.zeros(3))["render"] for camera in scene.getTestCameras()
+    ]
+    torch.save(torch.stack(pictures), os.path.join(scene.model_path, "decompressed.pt"))
+
+
+if __name__ == "__main__":
+    parser = ArgumentParser()
+    model, pipeline = ModelParams(parser, sentinel=True), PipelineParams(parser)
+    parser.add_argument("--iteration", default=30_000, type=int)
+    args = get_combined_args(parser)
+    with torch.no_grad():
+        compress(model.extract(args), args.iteration)
+        decompress(model.extract(args), args.iteration, pipeline.extract(args))
+'''
+
+
+class MiniSplattingHost(Host):
+    """Splits by mask, new points, and simplification."""
+
+    routine = ("densify by mask", "new points", "simplify", "reset opacity", "another band")
+
+    def write(self, root: Path) -> None:
+        super().write(root)
+        renderer = root / "gaussian_renderer" / "__init__.py"
+        names = "import GaussianRasterizationSettings, GaussianRasterizer\n"
+        text = changed(renderer.read_text(), [(f"from diff_gaussian_rasterization {names}", "")])
+        head, body = text.split("def render(")
+        begin = "    screenspace = torch.zeros_like("
+
+        def function(name, package, changes=()):
+            lazy = (begin, f"    from {package} {names}\n{begin}")
+            return "\n\ndef " + changed(f"{name}({body}", [lazy, *changes])
+
+        call = "    image, radii = GaussianRasterizer(raster_settings=settings)(\n"
+        tail = body[body.index("    return {\n") :]
+        scores = ("accum_weights", "area_proj", "area_max")
+        five = [
+            (call, f"    image, radii, {', '.join(scores)} = GaussianRasterizer(settings)(\n"),
+            ('"radii": radii,\n', "".join(f'"{n}": {n},\n        ' for n in ("radii", *scores))),
+        ]
+        depth = [(call, "    return GaussianRasterizer(settings).render_depth(\n"), (tail, "")]
+        scoring = "diff_gaussian_rasterization_ms"
+        renderer.write_text(
+            head.rstrip()
+            + function("render", "diff_gaussian_rasterization")
+            + function("render_imp", scoring, five)
+            + function("render_depth", scoring, depth)
+        )
+        model = root / "scene" / "gaussian_model.py"
+        text = model.read_text()
+        split = text[
+            text.index("    def densify_and_split(") : text.index("    def densify_and_prune(")
+        ]
+        added = "".join(inspect.getsourcelines(Added)[0][2:])
+        model.write_text(f"{text}\n{added}\n{changed(split, MASKED)}")
+        train = (root / "train.py").read_text()
+        functions = (clock, grow, importance, simplify, evaluate)
+        own = "\n\n".join(inspect.getsource(f) for f in functions)
+        ms = changed(train, OWN).replace("if __name__", own + "\n\nif __name__")
+        scripts = {
+            "gs/train.py": changed(train, [PATH]),
+            "ms/train.py": ms,
+            "ms_d/train.py": changed(ms, DENSE),
+            "ms_c/run.py": COMPRESSION,
+            "lpipsPyTorch/__init__.py": LPIPS,
+        }
+        for name, text in scripts.items():
+            (root / name).parent.mkdir(exist_ok=True)
+            (root / name).write_text(text)
+        (root / "train.py").unlink()
+
+    def actions(self):
+        return {
+            **super().actions(),
+            "split by mask": split_by_mask,
+            "densify by mask": densify_by_mask,
+            "new points": new_points,
+            "simplify": simplified,
+        }
+
+
+def split_by_mask(model, arguments, chance: Chance):
+    n = len(model.get_xyz)
+    extent = 3.0 if chance.heads else 1e6
+    model.densify_and_split_mask(
+        chance.uniform(n, 1), 1 - chance.share, extent, chance.rows(n, 0.1)
+    )
+
+
+def densify_by_mask(model, arguments, chance: Chance):
+    n = len(model.get_xyz)
+    model.xyz_gradient_accum = chance.uniform(n, 1)
+    model.denom = chance.rows(n, 0.8)[:, None].float()
+    model.max_radii2D = 40 * chance.uniform(n)
+    blur = chance.rows(n, 0.1).float()  # the host begins with zeros, not with booleans
+    model.densify_and_prune_split(1 - chance.share, 0.005, 3.0, None, blur)
+
+
+def new_points(model, arguments, chance: Chance):
+    """Other points, or the same once more: nobody's descendants, which their mark says."""
+    n = len(model.get_xyz) if chance.heads else random.Random(chance.seed).randrange(5, 30)
+    points = model.get_xyz if chance.heads else chance.uniform(n, 3)
+    model.reinitial_pts(points, torch.full((n, 3), 0.5 - 0.28209479))
+    model.training_setup(arguments)
+
+
+def simplified(model, arguments, chance: Chance):
+    model.prune_points(chance.rows(len(model.get_xyz)).numpy())
+    model.training_setup(arguments)
