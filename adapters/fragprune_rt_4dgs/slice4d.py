@@ -53,7 +53,7 @@ def rotation(quaternions: Tensor) -> Tensor:
 def rotation_4d(left: Tensor, right: Tensor) -> Tensor:
     """(N, 4, 4) rotation of x, y, z, t by two quaternions (N, 4) each, used as given.
 
-    With (t, z, y, x) read as a quaternion v, it is v -> left v right.
+    With (t, z, y, x) read as a quaternion v, it is v -> left v right*.
     """
     a, b, c, d = left.unbind(-1)
     p, q, r, s = right.unbind(-1)
