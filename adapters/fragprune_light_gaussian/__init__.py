@@ -74,23 +74,12 @@ class LightGaussian(GraphdecoAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """A rasterizer that counts, and the three training scripts."""
-        findings = super().fingerprint(repo)
-        missing = [name for name in self.scripts if not (repo.root / name).is_file()]
+        found = [f"no {name}" for name in self.scripts if not (repo.root / name).is_file()]
         if "f_count" not in self.dialect(repo).settings:
-            missing = ["f_count among the rasterizer's settings", *missing]
-        if missing:
-            vanilla = ", but train.py, as vanilla 3DGS has it" if repo.path("train") else ""
-            findings.append(
-                Finding(
-                    "error",
-                    "other-host",
-                    str(repo.root),
-                    f"no {', no '.join(missing)}{vanilla}",
-                    "a LightGaussian checkout",
-                    "Use the adapter of that host.",
-                )
-            )
-        return findings
+            found.insert(0, "no f_count among the rasterizer's settings")
+        if found and repo.path("train"):
+            found.append("but train.py, as vanilla 3DGS has it")
+        return [*super().fingerprint(repo), *self.other_host(repo, found)]
 
     def dialect(self, repo: HostRepo) -> LightGaussianDialect:
         """As the lineage reads it from ``render``."""

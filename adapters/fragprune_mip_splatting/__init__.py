@@ -75,7 +75,6 @@ class MipSplatting(GraphdecoAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Both filters and the absolute gradients, and nothing of what descends from it."""
-        findings = super().fingerprint(repo)
         own = {
             **dict.fromkeys(self.dialect(repo).settings),
             **dict.fromkeys(repo.parameters(MODEL, "GaussianModel.densify_and_split") or ()),
@@ -84,18 +83,7 @@ class MipSplatting(GraphdecoAdapter):
         cousins = repo.mentions(("gaussian_renderer", MODEL, "train"), DESCENDANTS)
         found = [f"no {name}" for name in OWN if name not in own]
         found += [f"{name} ({at}), which a descendant has" for name, at in cousins.items()]
-        if found:
-            findings.append(
-                Finding(
-                    "error",
-                    "other-host",
-                    str(repo.root),
-                    ", ".join(found),
-                    "a Mip-Splatting checkout",
-                    "Use the adapter of that host.",
-                )
-            )
-        return findings
+        return [*super().fingerprint(repo), *self.other_host(repo, found)]
 
     def dialect(self, repo: HostRepo) -> MipDialect:
         """As the lineage reads it from ``render``."""

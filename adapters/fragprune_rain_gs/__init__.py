@@ -33,6 +33,12 @@ OWN = ("low_pass", "divide_ratio", "abe_split", "args_dict")
 """A setting of the rasterizer and parameters of the model, of its split and of the scene."""
 
 
+SCENES = (
+    *("bicycle", "flowers", "garden", "stump", "treehill"),
+    *("room", "counter", "kitchen", "bonsai"),
+)
+
+
 @dataclass(frozen=True)
 class RainDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with a dilation of its own, and depth as third output."""
@@ -71,39 +77,23 @@ class RainGS(GraphdecoAdapter):
     info = HostInfo("RAIN-GS", repo="KU-CVLAB/RAIN-GS", states="2024, both of its modes")
     package = PACKAGE
     steps_by_rendering = True
-    seams = (
-        *(seam for seam in GraphdecoAdapter.seams if seam.role is not Role.RASTERIZE),
-        *(
-            replace(seam, module=PACKAGE)
-            for seam in GraphdecoAdapter.seams
-            if seam.role is Role.RASTERIZE
-        ),
+    seams = tuple(
+        replace(seam, module=PACKAGE) if seam.role is Role.RASTERIZE else seam
+        for seam in GraphdecoAdapter.seams
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """The dilation, the far split, and the rasterizer inside the checkout."""
-        findings = super().fingerprint(repo)
         own = {
             *self.dialect(repo).settings,
             *(repo.parameters(MODEL, "GaussianModel.__init__") or ()),
             *(repo.parameters(MODEL, "GaussianModel.densify_and_split") or ()),
             *(repo.parameters("scene", "Scene.__init__") or ()),
         }
-        missing = [name for name in OWN if name not in own]
+        missing = [f"no {name}" for name in OWN if name not in own]
         if repo.path(PACKAGE) is None:
-            missing.append(PACKAGE)
-        if missing:
-            findings.append(
-                Finding(
-                    "error",
-                    "other-host",
-                    str(repo.root),
-                    f"no {', no '.join(missing)}",
-                    "a RAIN-GS checkout",
-                    "Use the adapter of that host.",
-                )
-            )
-        return findings
+            missing.append(f"no {PACKAGE}")
+        return [*super().fingerprint(repo), *self.other_host(repo, missing)]
 
     def dialect(self, repo: HostRepo) -> RainDialect:
         """As the lineage reads it from ``render``."""
@@ -115,18 +105,33 @@ class RainGS(GraphdecoAdapter):
         return super().parents(model, method, {**arguments, "N": copies})
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """Without the modes: they make new points, and cannot go on (no dilation is set then)."""
+        """Without its modes, which cannot resume: they replace the points and set no dilation.
+
+        Where only ``--exp_name`` says where the output is, the folder is named.
+        """
         parser = ArgumentParser(add_help=False, allow_abbrev=False)
         for flag in ("--ours", "--ours_new", "--paper_random", "--c2f"):
             parser.add_argument(flag, action="store_true")
         for flag in ("--train_from", "--warmup_iter", "--num_gaussians"):
             parser.add_argument(flag)
-        for flag in ("--c2f_every_step", "--c2f_max_lowpass"):
-            parser.add_argument(flag)
-        return script, parser.parse_known_args(arguments)[1]
+        rest = parser.parse_known_args(arguments)[1]
+        parser.add_argument("-m", "--model_path")
+        parser.add_argument("--exp_name")
+        flags, _ = parser.parse_known_args(arguments)
+        if flags.exp_name and not flags.model_path:
+            rest += ["-m", str(Path("output") / flags.exp_name)]
+        return script, rest
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
-        """As vanilla's, with its dilation; views are always held out."""
+        """As vanilla's; views are always held out.
+
+        The host takes smaller pictures where the path holds the name of a scene of Mip-NeRF 360.
+        """
+        parser = ArgumentParser(add_help=False)
+        parser.add_argument("-s", "--source_path", default="")
+        flags, _ = parser.parse_known_args(arguments)
+        if any(scene in flags.source_path for scene in SCENES) or "--white_bg" in arguments:
+            return None
         return super().drawing(repo, [*arguments, "--eval"])
 
 

@@ -145,6 +145,21 @@ class GraphdecoAdapter(HostAdapter):
             )
         ]
 
+    def other_host(self, repo: HostRepo, found: list[str]) -> list[Finding]:
+        """An error that says all of what speaks against this host, if anything does."""
+        if not found:
+            return []
+        return [
+            Finding(
+                "error",
+                "other-host",
+                str(repo.root),
+                ", ".join(found),
+                f"a {self.info.title} checkout",
+                "Use the adapter of that host.",
+            )
+        ]
+
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
         """Read from the source of ``render``: what it passes and how many values it unpacks."""
         calls = repo.calls("gaussian_renderer", "GaussianRasterizationSettings")

@@ -77,13 +77,13 @@ def _opened_changes_nothing(case: Case) -> tuple[int, int]:
             model, camera = host.model(40), host.camera()
             if opened:
                 host.store(model).open(host.adapter.opacities(model))
+            require(host.store(model).neutral != opened, "thresholds did not open")
             package = host.render(camera, model)
             (package["render"] - camera.original_image).square().sum().backward()
             pictures.append(package["render"].detach())
             gradients.append(
                 {n: p.grad for n, p in host.driver.parameters(model).items() if p.grad is not None}
             )
-            require(host.store(model).neutral != opened, "thresholds did not open")
     require(torch.equal(*pictures), "freshly opened thresholds change the picture")
     require(gradients[0].keys() == gradients[1].keys(), "gradients reach other parameters")
     for name, gradient in gradients[0].items():

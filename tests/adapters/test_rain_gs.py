@@ -1,0 +1,258 @@
+"""RAIN-GS: far splits, wide dilation, an own clock, on a miniature of the host."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import rain_gs_host
+import torch
+from miniature import HOST, TINY, expect_ancestors, identity, joint, label, running
+from rain_gs_host import RainHost
+
+from fragprune_plugins import sidecar
+from fragprune_plugins.cli.run import _measure
+from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.engines import rasterize
+from fragprune_plugins.errors import AlignmentError, UnknownHostError
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.launch import RunOptions, run
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.schedule import Settings
+from fragprune_rain_gs import PACKAGE, RainGS
+
+COUNT = 16
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    return rain_gs_host.make(tmp_path_factory.mktemp("rain"))
+
+
+def of(mini, **options):
+    return {"path": mini, "adapter": RainGS(), "driver": RainHost()} | options
+
+
+# -- which host, and its rasterizer ----------------------------------------------------------------
+
+
+def test_each_host_has_its_adapter_and_no_other(mini):
+    adapters = load_plugins().adapters
+    assert choose(HostRepo(mini), adapters).name == "rain-gs"
+    with pytest.raises(UnknownHostError, match="RAIN-GS"):
+        choose(HostRepo(mini), adapters, "vanilla-3dgs")
+    with pytest.raises(UnknownHostError, match="no low_pass"):
+        choose(HostRepo(HOST), adapters, "rain-gs")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "found"),
+    [
+        ("gaussian_renderer/__init__.py", "low_pass=low_pass,\n", "", "no low_pass"),
+        ("scene/gaussian_model.py", "abe_split", "far", "no abe_split"),
+        ("scene/gaussian_model.py", "int, divide_ratio)", "int, ratio)", "no divide_ratio"),
+        ("scene/__init__.py", "args_dict", "options", "no args_dict"),
+    ],
+)
+def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, found):
+    path = rain_gs_host.make(tmp_path) / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    errors = [f.found for f in RainGS().match(HostRepo(tmp_path)).findings]
+    assert any(found in error for error in errors)
+
+
+def test_our_rasterizer_answers_before_anything_is_compiled_and_leaves_again(mini):
+    with running(**of(mini)):
+        ours = import_module(PACKAGE)
+        renderer = import_module("gaussian_renderer")
+        assert renderer.GaussianRasterizer is ours.GaussianRasterizer
+    assert PACKAGE not in sys.modules
+    done = subprocess.run(
+        [sys.executable, "-c", "import gaussian_renderer"], cwd=mini, capture_output=True, text=True
+    )
+    assert "no compiler here" in done.stderr or "simple_knn" in done.stderr
+
+
+def test_the_hosts_own_rasterizer_is_used_where_it_can_be_compiled(mini, monkeypatch):
+    import torch.utils.cpp_extension as extension
+
+    dialect = RainGS().dialect(HostRepo(mini))
+    for compiler, gpu in ((None, True), ("/usr/local/cuda", False), ("/usr/local/cuda", True)):
+        monkeypatch.setattr(extension, "CUDA_HOME", compiler)
+        monkeypatch.setattr(torch.cuda, "is_available", lambda gpu=gpu: gpu)
+        assert dialect.present("submodules") == bool(compiler and gpu)
+        assert dialect.present("torch")
+        assert not dialect.present("simple_knn")
+
+
+class Notes:
+    """Remembers what was rasterized."""
+
+    @hookimpl(tryfirst=True)
+    def fragprune_truncate(self, inputs, store):
+        self.inputs = inputs
+
+
+def test_dilation_reaches_the_engine_and_depth_comes_back_without_a_gradient(mini):
+    notes = Notes()
+    with joint(**of(mini, plugins=[notes])) as host:
+        model, camera = host.model(COUNT), host.camera(20, 14)
+        host.step(model, camera, 1)
+        render, pipe = import_module("gaussian_renderer").render, host.driver.pipe()
+        wide = render(camera, model, pipe, torch.zeros(3), low_pass=40.0)
+        assert notes.inputs.dilation == 40.0
+        usual = render(camera, model, pipe, torch.zeros(3))
+        assert notes.inputs.dilation == pytest.approx(0.3)
+    assert (wide["radii"] > usual["radii"]).any()
+    depth = usual["depth"]
+    assert depth.shape == (1, 14, 20)
+    assert not depth.requires_grad
+    assert usual["render"].requires_grad
+
+
+def test_depth_is_the_blended_distance_of_what_is_drawn(mini):
+    """One Gaussian: depth over alpha is its own z wherever it is drawn."""
+    notes = Notes()
+    with joint(**of(mini, plugins=[notes])) as host:
+        model, camera = host.model(1), host.camera(20, 14)
+        host.step(model, camera, 1)
+        package = host.render(camera, model, torch.ones(3))
+        alpha = rasterize(notes.inputs, host.store(model).values).alpha.detach()
+        point = torch.cat([model.get_xyz.detach()[0], torch.ones(1)])
+        z = float((point @ camera.world_view_transform)[2])
+    drawn = alpha > 0.01
+    assert drawn.any()
+    torch.testing.assert_close(
+        package["depth"][drawn] / alpha[drawn], torch.full_like(alpha, z)[drawn]
+    )
+
+
+# -- rows ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_a_far_split_appends_twice_and_every_child_has_its_parents_threshold(mini, number):
+    with joint(**of(mini)) as host:
+        model = host.model(COUNT)
+        label(host, model)
+        grads = (torch.arange(COUNT) % 3 == 0).float()[:, None]
+        model.densify_and_split(grads, 0.5, 1e-6, N=number, abe_split=True)
+        expect_ancestors(host, model)
+        split = COUNT // 3 + 1
+        # Those that were not split, then far copies, then children; the split ones are gone.
+        assert len(identity(model)) == COUNT - split + (2 * number - 1) * split
+        assert not torch.isin(identity(model)[: COUNT - split], torch.arange(0, COUNT, 3)).any()
+
+
+def test_a_split_that_forgets_one_of_its_appends_is_refused(mini, monkeypatch):
+    with joint(**of(mini)) as host:
+        model = host.model(COUNT)
+        label(host, model)
+        monkeypatch.setattr(type(model), "_split_near", lambda *_: None)
+        with pytest.raises(AlignmentError, match=f"{2 * COUNT} selected parents without a child"):
+            model.densify_and_split(torch.ones(COUNT, 1), 0.5, 1e-6, abe_split=True)
+
+
+# -- whole runs ----------------------------------------------------------------------------------
+
+OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
+FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
+
+
+def command(mini, scene, out, iterations, *more):
+    flags = [f for f in TINY if f != "--eval"]
+    flags = ["-s", scene, "-m", out, "--iterations", iterations, *flags]
+    return [str(mini / "train.py"), *map(str, flags), *map(str, more)]
+
+
+@pytest.fixture
+def scene(photographs, tmp_path):
+    """Not under the name of one of the host's scenes: it would take other pictures."""
+    (tmp_path / "fox").symlink_to(photographs)
+    return tmp_path / "fox"
+
+
+@pytest.mark.parametrize("mode", ["ours", "ours_new", "paper_random"])
+def test_every_mode_is_fine_tuned_and_moves_opacities_and_thresholds_alone(
+    mini, scene, tmp_path, mode
+):
+    words = command(mini, scene, tmp_path / "out", 22, f"--{mode}", "--num_gaussians", 60)
+    summary = run([*words, "--c2f"], OPTIONS)
+    assert (summary.adapter, summary.iterations) == ("rain-gs", 8)
+    before, after = (read_ply(p) for p in (summary.model_before, summary.model_after))
+    assert [n for n in FROZEN if not torch.equal(getattr(before, n), getattr(after, n))] == []
+    store, info = sidecar.load(summary.model_after)
+    assert len(store) == info.rows == summary.gaussians == len(after)
+    assert summary.fragments_after < summary.fragments_before
+    assert summary.drawing == {}
+    assert _measure(words, summary) is not None  # though no --eval is in the command
+    assert {PACKAGE, "wandb"} & set(sys.modules) == set()
+
+
+class Steps:
+    """Keeps what every learned step reports."""
+
+    def __init__(self):
+        self.steps = []
+
+    @hookimpl
+    def fragprune_step(self, stats):
+        self.steps.append(stats.step)
+
+
+@pytest.mark.parametrize("mode", ["--ours", "--ours_new"])
+def test_iterations_are_counted_where_the_host_sets_no_rate(mini, scene, tmp_path, mode):
+    """In its newer mode the host announces iterations 12 to 24 as 0 to 12."""
+    options = RunOptions(device="cpu", stage="joint", from_iter=15, settings=OPTIONS.settings)
+    summary = run(command(mini, scene, tmp_path / "out", 24, mode), options)
+    assert summary.model_after.parent.name == "iteration_24"
+    assert summary.curves[0]["step"] == 15
+    assert [c["step"] for c in summary.curves] == list(range(15, 25))
+    store, _ = sidecar.load(summary.model_after)
+    assert len(store) == len(read_ply(summary.model_after).xyz)
+
+
+def test_frozen_from_an_iteration_on_in_the_newer_mode(mini, scene, tmp_path):
+    options = replace(OPTIONS, stage="finetune", from_iter=18)
+    words = command(mini, scene, tmp_path / "out", 24, "--ours_new", "--checkpoint_iterations", 18)
+    summary = run(words, options)
+    capture, _ = torch.load(tmp_path / "out" / "chkpnt18.pth", weights_only=False)
+    assert torch.equal(capture[1].detach(), read_ply(summary.model_after).xyz)
+    assert summary.iterations == 6
+
+
+def test_an_experiments_name_is_enough_to_find_its_folder(mini, scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [w for w in command(mini, scene, "OUT", 12) if w not in ("-m", "OUT")]
+    words += ["--exp_name", "fox"]
+    run(words, replace(OPTIONS, stage="off"))
+    assert Path("output/fox/point_cloud/iteration_12").is_dir()
+    summary = run(words, replace(OPTIONS, stage="finetune"))
+    assert summary.model_after.resolve().is_relative_to(tmp_path / "output" / "fox")
+
+
+def test_what_resumes_is_left_without_the_modes():
+    shared = ["-s", "a", "-m", "b", "--iterations", "9"]
+    own = ["--ours_new", "--num_gaussians", "10", "--c2f", "--train_from=cluster"]
+    assert RainGS().resumed_by(Path("train.py"), [*shared, *own]) == (Path("train.py"), shared)
+    named = RainGS().resumed_by(Path("train.py"), ["-s", "a", "--exp_name", "e", "--ours"])[1]
+    assert named == ["-s", "a", "--exp_name", "e", "-m", "output/e"]
+
+
+@pytest.mark.parametrize(
+    ("words", "known"),
+    [
+        (["-s", "fox"], True),
+        (["-s", "data/room"], False),  # it reads images_2 there
+        (["--source_path=garden"], False),
+        (["-s", "fox", "--white_bg"], False),
+    ],
+)
+def test_what_our_readers_would_read_otherwise_is_not_measured(mini, words, known):
+    assert (RainGS().drawing(HostRepo(mini), words) is not None) == known

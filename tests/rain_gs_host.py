@@ -1,0 +1,242 @@
+"""A miniature RAIN-GS: the demo's host with what the method adds, from its interface."""
+
+from __future__ import annotations
+
+import inspect
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fragprune_plugins.testing.host import Host, densify_and_prune
+
+PACKAGE = "submodules/diff_gaussian_rasterization"
+
+
+class Added:
+    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
+
+    def densify_and_split(self, grads, grad_threshold, scene_extent, N=2, abe_split=False):
+        if abe_split:
+            chosen = self._needy(grads, grad_threshold, scene_extent, large=True)
+            self.densification_postfix(
+                self._xyz[chosen].repeat(N - 1, 1) * 0.3 * scene_extent,
+                self._features_dc[chosen].repeat(N - 1, 1, 1),
+                self._features_rest[chosen].repeat(N - 1, 1, 1),
+                self._opacity[chosen].repeat(N - 1, 1),
+                self._scaling[chosen].repeat(N - 1, 1),
+                self._rotation[chosen].repeat(N - 1, 1),
+            )
+        self._split_near(grads, grad_threshold, scene_extent, N)
+
+    def densify_and_prune(
+        self, max_grad, min_opacity, extent, max_screen_size, N=2, abe_split=False
+    ):
+        grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
+        self.densify_and_clone(grads, max_grad, extent)
+        self.densify_and_split(grads, max_grad, extent, N=N, abe_split=abe_split)
+        unwanted = (self.get_opacity < min_opacity).squeeze(-1)
+        if max_screen_size:
+            unwanted |= self.max_radii2D > max_screen_size
+            unwanted |= self.get_scaling.max(dim=1).values > 0.1 * extent
+        self.prune_points(unwanted)
+
+
+def dilation(iteration, opt, camera, gaussians, args_dict, before):
+    """What the rasterizer adds to footprints; not set where a run begins in the middle."""
+    if not args_dict["c2f"]:
+        return 0.3
+    due = iteration % args_dict["c2f_every_step"] == 0 and iteration < opt.densify_until_iter
+    if iteration == 1 or due:
+        share = camera.image_height * camera.image_width / len(gaussians.get_xyz)
+        return min(max(share / (9 * np.pi), 0.3), args_dict["c2f_max_lowpass"])
+    if before is None:
+        raise UnboundLocalError("low_pass")
+    return before
+
+
+def rate(iteration, gaussians, args_dict):
+    """None before the warm-up is over; offset from there."""
+    if not args_dict["ours_new"]:
+        gaussians.update_learning_rate(iteration)
+    elif iteration >= args_dict["warmup_iter"]:
+        gaussians.update_learning_rate(iteration - args_dict["warmup_iter"])
+
+
+def replaced_points(args, args_dict):
+    """Random points, written over those of the data; either are removed once they are read."""
+    file = Path(args.source_path) / "sparse" / "0" / "points3D.ply"
+    if args_dict and (args_dict["ours"] or args_dict["ours_new"] or args_dict["paper_random"]):
+        points = np.random.uniform(-1.5, 1.5, (args_dict["num_gaussians"], 3))
+        file.write_text("random")
+        cloud = BasicPointCloud(points, np.random.random(points.shape), 0 * points)  # noqa: F821
+    else:
+        cloud = read_points(args)  # noqa: F821 - imported where this is put
+    file.unlink(missing_ok=True)
+    return cloud
+
+
+CHANGES = {
+    "gaussian_renderer/__init__.py": [
+        (
+            "from diff_gaussian_rasterization import GaussianRasterizationSettings, "
+            "GaussianRasterizer\n",
+            "from submodules.diff_gaussian_rasterization.diff_gaussian_rasterization import (\n"
+            "    GaussianRasterizationSettings,\n    GaussianRasterizer,\n)\n",
+        ),
+        ("    override_color=None,\n", "    override_color=None,\n    low_pass=0.3,\n"),
+        ("debug=pipe.debug,\n", "debug=pipe.debug,\n        low_pass=low_pass,\n"),
+        (
+            "    image, radii = GaussianRasterizer(raster_settings=settings)(\n",
+            "    rasterizer = GaussianRasterizer(raster_settings=settings)\n"
+            "    image, radii, depth = rasterizer(\n",
+        ),
+        ('        "radii": radii,\n', '        "radii": radii,\n        "depth": depth,\n'),
+    ],
+    "scene/gaussian_model.py": [
+        (
+            "    def __init__(self, sh_degree: int):\n",
+            "    def __init__(self, sh_degree: int, divide_ratio):\n"
+            "        self.divide_ratio = divide_ratio\n",
+        ),
+        ("    def densify_and_split(", "    def _split_near("),
+        ("    def densify_and_prune(", "    def _vanilla_densify_and_prune("),
+        ("spread / (0.8 * N)", "spread / (self.divide_ratio * N)"),
+    ],
+    "scene/__init__.py": [
+        ("(1.0,)\n    ):", "(1.0,), args_dict=None\n    ):"),
+        (
+            "create_from_pcd(read_points(args), self",
+            "create_from_pcd(replaced_points(args, args_dict), self",
+        ),
+        (
+            "\n\nclass Scene:",
+            "\nfrom utils.graphics_utils import BasicPointCloud\n\n\n"
+            + inspect.getsource(replaced_points)
+            + "\n\nclass Scene:",
+        ),
+    ],
+    "train.py": [
+        ("import torch\n", "import numpy as np\nimport torch\nimport wandb  # noqa: F401\n"),
+        ("    debug_from,\n):", "    debug_from,\n    args_dict,\n):"),
+        (
+            "    prepare_output_and_logger(dataset)\n",
+            "    dataset.model_path = dataset.model_path or f\"./output/{args_dict['exp_name']}\"\n"
+            "    prepare_output_and_logger(dataset)\n"
+            '    ratio = 0.7 if args_dict["ours"] or args_dict["ours_new"] else 0.8\n'
+            '    opt.densify_until_iter += args_dict["warmup_iter"]\n'
+            "    low_pass = None\n",
+        ),
+        ("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset.sh_degree, ratio)"),
+        ("Scene(dataset, gaussians)", "Scene(dataset, gaussians, args_dict=args_dict)"),
+        (
+            "        gaussians.update_learning_rate(iteration)\n",
+            "        rate(iteration, gaussians, args_dict)\n",
+        ),
+        (
+            "        package = render(camera, gaussians, pipe, bg)\n",
+            "        low_pass = dilation(iteration, opt, camera, gaussians, args_dict, low_pass)\n"
+            "        package = render(camera, gaussians, pipe, bg, low_pass=low_pass)\n",
+        ),
+        (
+            "dataset, gaussians, scene, package)\n            if",
+            "dataset, gaussians, scene, package, args_dict)\n            if",
+        ),
+        ("gaussians, scene, package):", "gaussians, scene, package, args_dict):"),
+        (
+            "(threshold, 0.005, scene.cameras_extent, largest)\n",
+            "(\n            threshold,\n            0.005,\n            scene.cameras_extent,\n"
+            "            largest,\n            N=2,\n"
+            '            abe_split=iteration <= args_dict["warmup_iter"],\n        )\n',
+        ),
+        (
+            "    args = parser.parse_args()\n",
+            "    for flag in ('ours', 'ours_new', 'paper_random', 'c2f', 'white_bg'):\n"
+            '        parser.add_argument(f"--{flag}", action="store_true")\n'
+            '    parser.add_argument("--exp_name")\n'
+            '    parser.add_argument("--num_gaussians", type=int, default=1_000_000)\n'
+            '    parser.add_argument("--warmup_iter", type=int, default=0)\n'
+            '    parser.add_argument("--train_from", default="random")\n'
+            '    parser.add_argument("--c2f_every_step", type=float, default=1000)\n'
+            '    parser.add_argument("--c2f_max_lowpass", type=float, default=300)\n'
+            "    args = parser.parse_args()\n"
+            "    args.eval, args.white_background = True, args.white_bg\n"
+            "    if args.ours or args.ours_new:\n"
+            "        args.c2f, args.c2f_every_step, args.num_gaussians = True, 10, 40\n"
+            "    if args.ours_new:\n"
+            "        args.warmup_iter = 12\n",
+        ),
+        ("        args.debug_from,\n    )", "        args.debug_from,\n        vars(args),\n    )"),
+        (
+            "\n\nif __name__",
+            "\n\n"
+            + inspect.getsource(dilation)
+            + "\n\n"
+            + inspect.getsource(rate)
+            + "\n\nif __name__",
+        ),
+    ],
+    "render.py": [("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset.sh_degree, 0.8)")],
+}
+
+BINDING = '''"""Binds what its neighbour compiles."""
+
+from ..setup import _C
+
+
+class GaussianRasterizer:
+    """Would draw."""
+'''
+
+
+class RainHost(Host):
+    """How to drive it; splits throw a copy far out, as they do while it warms up."""
+
+    def write(self, root: Path) -> None:
+        """The demo's host, changed where RAIN-GS is otherwise; nothing compiles here."""
+        super().write(root)
+        for name, changes in CHANGES.items():
+            text = (root / name).read_text()
+            for old, new in changes:
+                assert text.count(old) == 1, (name, old)
+                text = text.replace(old, new)
+            (root / name).write_text(text)
+        model = root / "scene" / "gaussian_model.py"
+        model.write_text(model.read_text() + "\n" + "".join(inspect.getsourcelines(Added)[0][2:]))
+        package = root / PACKAGE / "diff_gaussian_rasterization"
+        package.mkdir(parents=True)
+        (package / "__init__.py").write_text(BINDING)
+        (root / PACKAGE / "setup.py").write_text('raise ImportError("no compiler here")\n')
+
+    def new_model(self, degree: int) -> Any:
+        """With the divisor of a split's scales."""
+        return import_module("scene.gaussian_model").GaussianModel(degree, 0.7)
+
+    def actions(self) -> Any:
+        """Splits near and far, in two or three, and the loop's own call."""
+
+        def far(model: Any, arguments: Any, chance: Any) -> None:
+            grads = chance.uniform(len(model.get_xyz), 1)
+            number = 3 if chance.heads else 2
+            model.densify_and_split(grads, 1 - chance.share / 2, 1e-6, N=number, abe_split=True)
+
+        def both(model: Any, arguments: Any, chance: Any) -> None:
+            prune = type(model).densify_and_prune
+
+            def once(*args: Any, **options: Any) -> None:
+                prune(model, *args, **options, abe_split=chance.seed % 3 == 0)
+
+            model.densify_and_prune = once
+            try:
+                densify_and_prune(model, arguments, chance)
+            finally:
+                del model.densify_and_prune
+
+        return {**super().actions(), "far split": far, "densify and prune": both}
+
+
+def make(root: Path) -> Path:
+    """Write the host into a folder; returns it."""
+    RainHost().write(root)
+    return root
