@@ -31,11 +31,13 @@ class HostInfo:
         title: the method's name.
         repo: owner/name of its public repository.
         states: the revisions this adapter was written for.
+        limits: what will not work with this host, or is refused; a sentence each.
     """
 
     title: str
     repo: str
     states: str = ""
+    limits: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -232,7 +232,9 @@ def _look_up(repo: HostRepo, seam: Seam) -> SeamState:
     have = repo.parameters(seam.module, seam.attribute)
     where = f"{seam} ({at})"
     if have is None:
-        gone = Finding("error", "seam-missing", where, "no such function", "one")
+        broken = repo.path(seam.module) is not None and repo.tree(seam.module) is None
+        found = "source that is no Python" if broken else "no such function"
+        gone = Finding("error", "seam-missing", where, found, "one")
         return SeamState(seam, "missing", at, gone)
     missing = [name for name in seam.needs if name not in have]
     if not missing:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fragprune_plugins.cli.common import FILE, Command, Report
+
+if TYPE_CHECKING:
+    from fragprune_plugins.adapter import HostAdapter
+    from fragprune_plugins.detect import Finding, HostRepo, Match, SeamState
 
 
 @click.command("check", cls=Command)
@@ -15,13 +21,15 @@ from fragprune_plugins.cli.common import FILE, Command, Report
 def command(host: Path, adapter: str | None) -> Report:
     """Read HOST, a training repository, and say which adapter fits and what speaks against it.
 
-    Nothing is imported or run; no GPU is needed. Exit code 0 when exactly one adapter fits.
+    Nothing is imported or run; no GPU is needed. Of every seam it says in which file and line it
+    was found, changed, or expected, and for the adapter that fits also what will not work. Exit
+    code 0 when exactly one adapter fits.
 
     \b
-    Example:
+    Examples:
       fragprune check ~/code/gaussian-splatting
+      fragprune check ~/code/my-fork --adapter vanilla-3dgs     (why does it not fit?)
     """
-    from fragprune_plugins.detect import HostRepo
     from fragprune_plugins.errors import UnknownHostError
     from fragprune_plugins.plugins import load_plugins
 
@@ -29,7 +37,6 @@ def command(host: Path, adapter: str | None) -> Report:
         raise UnknownHostError(
             str(host), "no such folder", "a host's checkout", "Name the folder of train.py."
         )
-    repo = HostRepo(host)
     adapters = load_plugins().adapters
     if adapter is not None:
         adapters = [a for a in adapters if a.name == adapter.replace("_", "-")]
@@ -37,32 +44,128 @@ def command(host: Path, adapter: str | None) -> Report:
             raise UnknownHostError(
                 "--adapter", repr(adapter), "an installed adapter", "Run fragprune adapters."
             )
-    lines, data, fitting = [], [], []
-    for candidate in adapters:
-        match = candidate.match(repo)
-        fitting += [candidate] if match.fits else []
-        lines.append(f"{candidate.name}: {'fits' if match.fits else 'does not fit'}")
-        lines += [f"  {finding}" for finding in match.findings]
-        places = []
-        for seam in candidate.seams_for(repo):
-            function = None if seam.external else repo.function(seam.module, seam.attribute)
-            path = repo.path(seam.module)
-            place = (
-                f"{path.relative_to(repo.root)}:{function.lineno}" if function and path else None
-            )
-            status = "at import" if seam.external else (place or "missing")
-            places.append({"role": seam.role.name, "seam": str(seam), "at": status})
-            lines.append(f"  {seam.role.name.lower():<10} {seam!s:<62} {status}")
-        data.append(
-            {
-                "adapter": candidate.name,
-                "confidence": match.confidence,
-                "findings": [finding.as_dict() for finding in match.findings],
-                "seams": places,
-            }
+    repo = _repository(host, adapters, adapter)
+    checked = sorted((_check(each, repo) for each in adapters), key=lambda each: each.order)
+    fitting = [each for each in checked if each.match.fits]
+    verdict = fitting[0] if len(fitting) == 1 else None
+    lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
+    known = fitting or [each for each in checked if each.held or adapter]
+    shown = fitting or known[:1]
+    for each in shown:
+        lines += ["", *each.lines()]
+    if len(checked) > len(shown):
+        lines += ["", "Others:" if shown else "None of these adapters finds anything of its host:"]
+    lines += [f"  {each.headline()}" for each in checked if each not in shown]
+    lines += ["", _conclusion(repo, fitting)]
+    data = {
+        "host": str(host),
+        "commit": repo.commit,
+        "fits": verdict.adapter.name if verdict else None,
+        "adapters": [each.as_dict() for each in checked],
+    }
+    return Report(data, "\n".join(lines), exit_code=0 if verdict else 1)
+
+
+_SIGNS = {"missing": "MISSING in", "changed": "CHANGED at", "at import": "(checked at import)"}
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """One adapter tried on one codebase."""
+
+    adapter: HostAdapter
+    match: Match
+    seams: list[SeamState]
+
+    @property
+    def held(self) -> int:
+        """Seams that are as the adapter needs them."""
+        return sum(state.status == "found" for state in self.seams)
+
+    @property
+    def looked_up(self) -> int:
+        """Seams that source can tell about."""
+        return sum(state.status != "at import" for state in self.seams)
+
+    @property
+    def order(self) -> tuple[int, float, str]:
+        """By what speaks against them, then by the share of seams that hold."""
+        return len(self.errors), -self.held / max(1, self.looked_up), self.adapter.name
+
+    @property
+    def errors(self) -> list[Finding]:
+        """What speaks against the adapter."""
+        return [finding for finding in self.match.findings if finding.level == "error"]
+
+    def verdict(self) -> str:
+        """Whether it fits, and how much of it."""
+        return (
+            f"{self.adapter.name} {'fits' if self.match.fits else 'does not fit'}: "
+            f"{self.held} of {self.looked_up} seams hold"
         )
-    verdict = fitting[0].name if len(fitting) == 1 else None
-    scripts = [host / fit.command_line(repo).scripts[0] for fit in fitting]
-    lines.append(f"Use: fragprune run -- python {scripts[0]} ..." if verdict else "No fit.")
-    report = {"host": str(host), "commit": repo.commit, "fits": verdict, "adapters": data}
-    return Report(report, "\n".join(lines), exit_code=0 if verdict else 1)
+
+    def headline(self) -> str:
+        """The verdict, and where it is no, the first reason."""
+        return self.verdict() + (f"; {self.errors[0]}" if self.errors else "")
+
+    def lines(self) -> list[str]:
+        """Everything, for a person."""
+        info, of_seams = self.adapter.info, [state.finding for state in self.seams]
+        lines = [f"{self.verdict()} ({info.title}, {info.repo})"]
+        lines += [f"  {each}" for each in self.match.findings if each not in of_seams]
+        for state in self.seams:
+            at = state.at if state.status == "found" else f"{_SIGNS[state.status]} {state.at}"
+            if state.finding and state.status == "changed":
+                at += f": {state.finding.found}; expected {state.finding.expected}"
+            lines.append(f"  {state.seam.role.name.lower():<10} {state.seam!s:<62} {at.strip()}")
+        if self.match.fits and self.adapter.info.limits:
+            lines += ["  What will not work:"]
+            lines += [f"  - {limit}" for limit in self.adapter.info.limits]
+        return lines
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, for --json."""
+        return {
+            "adapter": self.adapter.name,
+            "confidence": self.match.confidence,
+            "seams_held": self.held,
+            "seams_looked_up": self.looked_up,
+            "findings": [finding.as_dict() for finding in self.match.findings],
+            "limits": list(self.adapter.info.limits),
+            "seams": [
+                {
+                    "role": state.seam.role.name,
+                    "seam": str(state.seam),
+                    "status": state.status,
+                    "at": state.at,
+                }
+                for state in self.seams
+            ],
+        }
+
+
+def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:
+    """The checkout that the folder is or lies in; the folder itself where none is."""
+    from fragprune_plugins.detect import HostRepo, locate
+    from fragprune_plugins.errors import UnknownHostError
+
+    try:
+        return locate(host, adapters, name)[0]
+    except UnknownHostError:
+        return HostRepo(host)
+
+
+def _check(adapter: HostAdapter, repo: HostRepo) -> _Checked:
+    from fragprune_plugins.detect import look_up
+
+    return _Checked(adapter, adapter.match(repo), look_up(repo, adapter.seams_for(repo)))
+
+
+def _conclusion(repo: HostRepo, fitting: list[_Checked]) -> str:
+    if len(fitting) == 1:
+        script = Path(fitting[0].adapter.command_line(repo).scripts[0])
+        return f"Use: fragprune run -- python {script if repo.package else repo.root / script} ..."
+    if fitting:
+        names = ", ".join(each.adapter.name for each in fitting)
+        return f"Several adapters fit: {names}. Name one with fragprune run --adapter."
+    return "No adapter fits. docs/how-to/write-an-adapter.md says how to write one."
