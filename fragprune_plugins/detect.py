@@ -118,13 +118,18 @@ class HostRepo:
 
     def place(self, module: str, attribute: str) -> str:
         """The file:line of a definition; where it is absent, of as much of its path as exists."""
-        path, line = self.path(module), 1
-        if path is None:
-            return f"no file {module.replace('.', '/')}.py"
         scope: ast.AST | None = self.tree(module)
+        line = 1
         for name in attribute.split("."):
             scope = _definition(scope, name)
             line = getattr(scope, "lineno", line)
+        return self.at(module, line)
+
+    def at(self, module: str, line: int) -> str:
+        """A line of a module as file:line, the file relative to the checkout."""
+        path = self.path(module)
+        if path is None:
+            return f"no file {module.replace('.', '/')}.py"
         return f"{path.relative_to(self.root)}:{line}"
 
     def parameters(self, module: str, attribute: str) -> tuple[str, ...] | None:

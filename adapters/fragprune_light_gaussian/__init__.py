@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.adapter import CommandLine, HostAdapter, HostCall, HostInfo
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.seams import Role, Seam
 
 if TYPE_CHECKING:
@@ -61,6 +61,10 @@ class LightGaussian(GraphdecoAdapter):
         repo="VITA-Group/LightGaussian",
         states="2024, rasterizer of 240618b (score: opacity per fragment)",
     )
+    contracts = (
+        Contract(frozenset({"f_count"})),
+        Contract(frozenset({"f_count"}), 4, "count_render"),
+    )
     scripts = (TRAIN, PRUNE, DISTIL)
     optimizer = "AdamW"
     seams = (
@@ -79,7 +83,7 @@ class LightGaussian(GraphdecoAdapter):
             found.insert(0, "no f_count among the rasterizer's settings")
         if found and repo.path("train"):
             found.append("but train.py, as vanilla 3DGS has it")
-        return [*super().fingerprint(repo), *self.other_host(repo, found)]
+        return [*self.other_host(repo, found), *super().fingerprint(repo)]
 
     def dialect(self, repo: HostRepo) -> LightGaussianDialect:
         """As the lineage reads it from ``render``."""

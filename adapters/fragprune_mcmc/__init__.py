@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.adapter import CommandLine, ConfigFile, HostAdapter, HostCall, HostInfo
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.seams import Role, Seam
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 MODEL = "scene.gaussian_model"
 RELOCATION = "utils.reloc_utils"
-OUTPUTS = 3
-"""Colour, radii and which Gaussians were used."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +57,7 @@ class MCMC(GraphdecoAdapter):
         repo="ubc-vision/3dgs-mcmc",
         states="January 2025",
     )
+    contracts = (Contract(outputs=3),)
     seams = (
         *GraphdecoAdapter.seams,
         Seam(Role.CHOICE, MODEL, "GaussianModel._update_params", ("idxs", "ratio")),
@@ -68,32 +67,18 @@ class MCMC(GraphdecoAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Relocation by the rasterizer package's formula, and three outputs."""
-        findings = super().fingerprint(repo)
-        if not repo.mentions([RELOCATION], ["compute_relocation"]):
-            findings.append(
-                Finding(
-                    "error",
-                    "no-relocation",
-                    RELOCATION,
-                    "no use of the rasterizer package's compute_relocation",
-                    "one, as 3DGS-MCMC has it",
-                    "Use the adapter of that host.",
-                )
-            )
-        outputs = self.dialect(repo).outputs
-        if outputs != OUTPUTS:
-            findings.append(
-                Finding(
-                    "error",
-                    "rasterizer-outputs",
-                    "gaussian_renderer:render",
-                    f"{outputs} values unpacked from the rasterizer",
-                    f"{OUTPUTS}: colour, radii, is_used",
-                    "Use the adapter of that host.",
-                )
-            )
-        return findings
+        """Relocation by the rasterizer package's formula."""
+        if repo.mentions([RELOCATION], ["compute_relocation"]):
+            return super().fingerprint(repo)
+        missing = Finding(
+            "error",
+            "no-relocation",
+            RELOCATION,
+            "no use of the rasterizer package's compute_relocation",
+            "one, as 3DGS-MCMC has it",
+            "Use the adapter of that host.",
+        )
+        return [missing, *super().fingerprint(repo)]
 
     def dialect(self, repo: HostRepo) -> MCMCDialect:
         """As the lineage reads it."""

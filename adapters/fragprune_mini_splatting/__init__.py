@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.seams import Role, Seam
 
 if TYPE_CHECKING:
@@ -80,6 +80,11 @@ class MiniSplatting(GraphdecoAdapter):
     name = "mini-splatting"
     info = HostInfo(
         "Mini-Splatting", repo="fatPeter/mini-splatting", states="gs, ms, ms_d and ms_c"
+    )
+    contracts = (
+        Contract(),
+        Contract(outputs=5, function="render_imp"),
+        Contract(outputs=None, function="render_depth"),
     )
     scripts = SCRIPTS
     seams = (

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.lineage.graphdeco import default, reaches
 from fragprune_plugins.seams import Role, Seam
 
@@ -68,6 +68,7 @@ class MipSplatting(GraphdecoAdapter):
         repo="autonomousvision/mip-splatting",
         states="2024, with absolute gradients in densification",
     )
+    contracts = (Contract(frozenset({"kernel_size", "subpixel_offset"})),)
     seams = (
         *GraphdecoAdapter.seams,
         Seam(Role.SAVE, MODEL, "GaussianModel.save_fused_ply", ("path",)),

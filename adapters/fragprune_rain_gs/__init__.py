@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.seams import Role
 
 if TYPE_CHECKING:
@@ -76,6 +76,7 @@ class RainGS(GraphdecoAdapter):
     name = "rain-gs"
     info = HostInfo("RAIN-GS", repo="KU-CVLAB/RAIN-GS", states="2024, both of its modes")
     package = PACKAGE
+    contracts = (Contract(frozenset({"low_pass"}), 3),)
     steps_by_rendering = True
     seams = tuple(
         replace(seam, module=PACKAGE) if seam.role is Role.RASTERIZE else seam

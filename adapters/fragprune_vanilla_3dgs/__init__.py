@@ -15,7 +15,7 @@ from typing import Any
 from fragprune_plugins.adapter import HostAdapter, HostInfo
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter
 
 OUTPUTS = 3
 """Colour, radii and, since August 2024, inverse depth."""
@@ -27,9 +27,13 @@ OTHER_HOSTS = {
     "count_render": "LightGaussian",
     "render_imp": "Mini-Splatting",
     "get_marginal_t": "RT-4DGS",
-    "score_func": "LP-3DGS",
+    "bw_score": "LP-3DGS",
     "kernel_times": "Speedy-Splat",
     "vq_scale": "Compact-3DGS",
+    "clamp_color": "c3dgs",
+    "get_view2gaussian": "Gaussian Opacity Fields",
+    "depth_ratio": "2D Gaussian Splatting",
+    "_deformation": "4DGaussians",
 }
 """Names that vanilla does not have and a descendant does."""
 
@@ -43,6 +47,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         repo="graphdeco-inria/gaussian-splatting",
         states="2023 (2-tuple), August 2024 (3-tuple), October 2024 (separate_sh, sparse Adam)",
     )
+    contracts = (Contract(), Contract(frozenset({"antialiasing"}), OUTPUTS))
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """The revision found, or the descendant whose names occur."""

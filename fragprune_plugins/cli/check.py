@@ -88,9 +88,11 @@ class _Checked:
         return sum(state.status != "at import" for state in self.seams)
 
     @property
-    def order(self) -> tuple[int, float, str]:
-        """By what speaks against them, then by the share of seams that hold."""
-        return len(self.errors), -self.held / max(1, self.looked_up), self.adapter.name
+    def order(self) -> tuple[int, float, int]:
+        """By kinds of errors, then by the share of seams that hold, then by how much is wrong."""
+        kinds = {finding.code for finding in self.errors}
+        complaint = sum(len(finding.found) for finding in self.errors)
+        return len(kinds), -self.held / max(1, self.looked_up), complaint
 
     @property
     def errors(self) -> list[Finding]:

@@ -23,10 +23,12 @@ class Contract:
     Attributes:
         besides: settings passed besides the shared ones.
         outputs: how many values come back; None where the host keeps the tuple whole.
+        function: of ``gaussian_renderer`` that makes it.
     """
 
     besides: frozenset[str] = frozenset()
     outputs: int | None = 2
+    function: str = "render"
 
     def __str__(self) -> str:
         passed = f"{', '.join(sorted(self.besides))} besides the shared settings"
@@ -39,19 +41,14 @@ class Call:
     """One as the source has it.
 
     Attributes:
+        contract: what it amounts to.
         settings: names passed by keyword, in order.
-        outputs: how many names its result is unpacked to; None where it is kept whole.
-        line: of the assignment.
+        line: where its result is assigned.
     """
 
+    contract: Contract
     settings: tuple[str, ...]
-    outputs: int | None
     line: int
-
-    @property
-    def contract(self) -> Contract:
-        """What it amounts to."""
-        return Contract(frozenset(self.settings) - set(SHARED), self.outputs)
 
 
 def read_calls(repo: HostRepo, module: str, function: str) -> list[Call]:
@@ -65,10 +62,15 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[Call]:
     names = tuple(k.arg for k in settings[0] if k.arg) if settings else ()
     if body is None or not names:
         return []
-    return [
-        Call(names, len(target.elts) if isinstance(target, ast.Tuple) else None, target.lineno)
+    besides = frozenset(names) - set(SHARED)
+    counts = [
+        (len(target.elts) if isinstance(target, ast.Tuple) else None, target.lineno)
         for target in _results(body)
-    ] or [Call(names, None, body.lineno)]
+    ]
+    return [
+        Call(Contract(besides, outputs, function), names, line)
+        for outputs, line in counts or [(None, body.lineno)]
+    ]
 
 
 def _results(body: Function) -> list[ast.expr]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapter import CommandLine, Dialect, HostAdapter, HostCall
 from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.lineage.contract import Contract, read_calls
 from fragprune_plugins.seams import Role, Seam
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
-MODEL = "scene.gaussian_model"
+MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 
 GROUPS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 """Names and order of the host optimizer's param groups; load_state_dict matches by position."""
@@ -102,6 +103,15 @@ class GraphdecoDialect(Dialect):
         """(colour (3, H, W), radii (P,) int32) or, with it, inverse depth (1, H, W)."""
         return (outputs.image, outputs.radii, outputs.invdepth)[: self.outputs]
 
+    def present(self, package: str) -> bool:
+        """A rasterizer that is a module of the host is compiled when it is imported, if it can."""
+        if not self.package.startswith(f"{package}."):
+            return super().present(package)
+        from torch.cuda import is_available
+        from torch.utils.cpp_extension import CUDA_HOME
+
+        return CUDA_HOME is not None and is_available()
+
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizer and simple_knn."""
         from fragprune_plugins.lineage import stand_ins
@@ -114,13 +124,15 @@ class GraphdecoAdapter(HostAdapter):
     """Base of every adapter of this lineage; a subclass adds name, fingerprint and what differs."""
 
     package = "diff_gaussian_rasterization"
+    contracts: tuple[Contract, ...] = (Contract(),)
+    """Calls of the rasterizer that the dialect answers; a function may make any one of its own."""
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
     """The host's, by its name in ``torch.optim``."""
     seams = (
         *MODEL_SEAMS,
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
-        Seam(Role.VIEW, "gaussian_renderer", "render", ("viewpoint_camera", "pc")),
+        Seam(Role.VIEW, RENDERER, "render", ("viewpoint_camera", "pc")),
         Seam(
             Role.RASTERIZE,
             package,
@@ -131,18 +143,34 @@ class GraphdecoAdapter(HostAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """What every descendant has: a rasterizer called with named settings."""
-        if self.dialect(repo).settings:
-            return []
+        """What every descendant has: a rasterizer called as the dialect knows it."""
+        functions = dict.fromkeys(contract.function for contract in self.contracts)
+        there = [name for name in functions if repo.function(RENDERER, name)]  # else a missing seam
+        return [finding for name in there for finding in self._differences(repo, name)]
+
+    def _differences(self, repo: HostRepo, function: str) -> list[Finding]:
+        """What one drawing function does otherwise than any contract of it says."""
+        known = [contract for contract in self.contracts if contract.function == function]
+        calls = read_calls(repo, RENDERER, function)
+        found = [
+            (repo.at(RENDERER, call.line), str(call.contract), "Use the adapter of that host.")
+            for call in calls
+            if call.contract not in known
+        ]
+        if not calls:
+            nothing = "no call of GaussianRasterizationSettings with keywords"
+            remedy = "Check that this is the folder of the training script."
+            found.append((repo.place(RENDERER, function), nothing, remedy))
         return [
             Finding(
                 "error",
-                "no-rasterizer-call",
-                "gaussian_renderer",
-                "no call of GaussianRasterizationSettings with keywords",
-                "one inside render()",
-                "Check that this is the folder train.py lies in.",
+                "rasterizer-call",
+                f"{RENDERER}:{function} ({at})",
+                what,
+                " or ".join(map(str, known)),
+                remedy,
             )
+            for at, what, remedy in found
         ]
 
     def other_host(self, repo: HostRepo, found: list[str]) -> list[Finding]:
@@ -162,30 +190,14 @@ class GraphdecoAdapter(HostAdapter):
 
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
         """Read from the source of ``render``: what it passes and how many values it unpacks."""
-        calls = repo.calls("gaussian_renderer", "GaussianRasterizationSettings")
-        settings = tuple(k.arg for k in calls[0].keywords if k.arg) if calls else ()
+        call = next(iter(read_calls(repo, RENDERER, "render")), None)
         return GraphdecoDialect(
             package=self.package,
-            settings=settings,
-            outputs=self._arity(repo),
+            settings=call.settings if call else (),
+            outputs=(call.contract.outputs if call else None) or 2,
             sparse_adam=bool(repo.mentions(["train"], ["SparseGaussianAdam"]))
             or bool(repo.mentions([MODEL], ["SparseGaussianAdam"])),
         )
-
-    @staticmethod
-    def _arity(repo: HostRepo) -> int:
-        """How many names the host's ``render`` assigns the rasterizer's result to."""
-        function = repo.function("gaussian_renderer", "render")
-        for node in ast.walk(function) if function else ():
-            if (
-                isinstance(node, ast.Assign)
-                and isinstance(node.value, ast.Call)
-                and isinstance(node.value.func, ast.Name)
-                and node.value.func.id == "rasterizer"
-                and isinstance(node.targets[0], ast.Tuple)
-            ):
-                return len(node.targets[0].elts)
-        return 2
 
     def command_line(self, repo: HostRepo) -> CommandLine:
         """The flags of ``train.py``; the iteration count's default is read from the source."""

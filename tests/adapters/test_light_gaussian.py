@@ -62,7 +62,7 @@ RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
     [
         (RENDERER, "def count_render", "def counting", "seam-missing"),
         (RENDERER, "f_count", "f_counts", "other-host"),
-        (RENDERER, "GaussianRasterizationSettings(", "S(", "no-rasterizer-call"),
+        (RENDERER, "GaussianRasterizationSettings(", "S(", "rasterizer-call"),
         (MODEL, "def prune_gaussians", "def prune", "seam-missing"),
         (MODEL, "def load_ply_sh(self, path", "def load_ply_sh(self, file", "seam-signature"),
     ],

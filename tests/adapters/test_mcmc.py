@@ -70,12 +70,12 @@ MODEL = "scene/gaussian_model.py"
         (MODEL, "_to_optimizer(self, inds", "_to_optimizer(self, rows", "seam-signature"),
         (MODEL, "def relocate_gs", "def relocate", "seam-missing"),
         ("utils/reloc_utils.py", "compute_relocation", "another", "no-relocation"),
-        ("gaussian_renderer/__init__.py", "radii, is_used =", "radii =", "rasterizer-outputs"),
+        ("gaussian_renderer/__init__.py", "radii, is_used =", "radii =", "rasterizer-call"),
         (
             "gaussian_renderer/__init__.py",
             "GaussianRasterizationSettings(",
             "S(",
-            "no-rasterizer-call",
+            "rasterizer-call",
         ),
     ],
 )

@@ -67,7 +67,7 @@ def test_a_folder_that_is_no_host_is_refused_with_a_reason_and_a_remedy(tmp_path
     with pytest.raises(UnknownHostError) as caught:
         choose(HostRepo(tmp_path), [Vanilla3DGS()])
     assert "no adapter fits" in caught.value.found
-    assert "GaussianRasterizationSettings" in caught.value.found
+    assert "no file scene.py" in caught.value.found
     assert "fragprune check" in caught.value.remedy
 
 
