@@ -84,7 +84,7 @@ class MipSplatting(GraphdecoAdapter):
         cousins = repo.mentions(("gaussian_renderer", MODEL, "train"), DESCENDANTS)
         found = [f"no {name}" for name in OWN if name not in own]
         found += [f"{name} ({at}), which a descendant has" for name, at in cousins.items()]
-        return [*super().fingerprint(repo), *self.other_host(repo, found)]
+        return [*self.other_host(repo, found), *super().fingerprint(repo)]
 
     def dialect(self, repo: HostRepo) -> MipDialect:
         """As the lineage reads it from ``render``."""

@@ -94,7 +94,7 @@ class RainGS(GraphdecoAdapter):
         missing = [f"no {name}" for name in OWN if name not in own]
         if repo.path(PACKAGE) is None:
             missing.append(f"no {PACKAGE}")
-        return [*super().fingerprint(repo), *self.other_host(repo, missing)]
+        return [*self.other_host(repo, missing), *super().fingerprint(repo)]
 
     def dialect(self, repo: HostRepo) -> RainDialect:
         """As the lineage reads it from ``render``."""
