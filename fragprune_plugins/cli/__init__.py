@@ -16,6 +16,7 @@ _COMMANDS = {
     "profile": "profile",
     "compare": "compare",
     "export": "export",
+    "report": "report",
     "adapters": "adapters",
     "check": "check",
     "bench": "bench",
@@ -33,6 +34,17 @@ class _LazyGroup(click.Group):
             return None
         command: click.Command = import_module(f"{__name__}.{_COMMANDS[cmd_name]}").command
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        words = list(args)
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            from fragprune_plugins.cli.common import usage_error
+
+            raise usage_error(error, words) from error
 
 
 def _present(name: str) -> bool:

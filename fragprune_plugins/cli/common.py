@@ -58,6 +58,20 @@ class Command(click.Command):
             )
         )
 
+    def make_context(
+        self,
+        info_name: str | None,
+        args: list[str],
+        parent: click.Context | None = None,
+        **extra: Any,
+    ) -> click.Context:
+        """Read the words; what is wrong with them is said as JSON where that was asked for."""
+        words = list(args)
+        try:
+            return super().make_context(info_name, args, parent, **extra)
+        except click.UsageError as error:
+            raise usage_error(error, words) from error
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run, print, and leave with the right exit code."""
         as_json = ctx.meta[JSON] = bool(ctx.params.pop("as_json"))
@@ -75,6 +89,24 @@ class Command(click.Command):
             ctx.exit(130)
         click.echo(json.dumps(_strict(report.data)) if as_json else report.text)
         ctx.exit(report.exit_code)
+
+
+def usage_error(error: click.UsageError, words: list[str]) -> Exception:
+    """What to raise for a usage error: itself, or an exit once it was printed as JSON.
+
+    Args:
+        error: click's.
+        words: as typed; those after ``--`` are the host's, ``--json`` among them.
+    """
+    ours = words[: words.index("--")] if "--" in words else words
+    if "--json" not in ours:
+        return error
+    where = error.ctx.command_path if error.ctx else "fragprune"
+    stated = UsageError(
+        where, error.format_message(), "options it understands", f"Run {where} --help."
+    )
+    click.echo(json.dumps({"error": stated.as_dict()}))
+    return click.exceptions.Exit(2)
 
 
 def _together(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:

@@ -119,10 +119,32 @@ def test_a_failed_write_touches_nothing(scene, monkeypatch):
     assert untouched(out)
 
 
-def test_missing_arguments_are_usage():
-    result = run("finetune")
+@pytest.mark.parametrize(
+    ("words", "where", "found"),
+    [
+        (("finetune",), "cli finetune", "Missing argument 'MODEL'"),
+        (("check", ".", "--fast"), "cli check", "No such option"),
+        (("profile", "a.ply", "--data", "b", "--views", "some"), "cli profile", "'some' is not"),
+        (("prune",), "cli", "No such command 'prune'"),
+        (("run", "--iters", "many"), "cli run", "'many' is not"),
+    ],
+)
+def test_usage_errors_are_said_as_text_and_as_json(words, where, found):
+    result = run(*words)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert found in result.stderr
+    command, *rest = words
+    result = run(command, "--json", *rest)
     assert result.exit_code == 2
-    assert result.stdout == ""
+    error = json.loads(result.stdout)["error"]
+    assert (error["code"], error["where"]) == ("usage", where)
+    assert found in error["found"]
+    assert result.stderr == ""
+
+
+def test_the_hosts_own_json_flag_is_not_ours():
+    result = run("run", "--iters", "many", "--", "train.py", "--json")
+    assert (result.exit_code, result.stdout) == (2, "")
 
 
 def test_bugs_keep_their_traceback(scene, monkeypatch):
