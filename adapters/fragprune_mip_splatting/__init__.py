@@ -55,8 +55,10 @@ class MipDialect(GraphdecoDialect):
         )
 
     def spares(self) -> dict[str, ModuleType]:
-        """``train.py`` imports open3d and does not use it."""
-        return {"open3d": ModuleType("open3d", "Stand-in of fragprune: empty.")}
+        """``train.py`` imports these two and uses neither."""
+        return {
+            name: ModuleType(name, "Stand-in of fragprune: empty.") for name in ("open3d", "cv2")
+        }
 
 
 class MipSplatting(GraphdecoAdapter):

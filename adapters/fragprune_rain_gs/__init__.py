@@ -56,15 +56,6 @@ class RainDialect(GraphdecoDialect):
         assert outputs.features is not None  # unpack asked for it
         return outputs.image, outputs.radii, outputs.features.detach()
 
-    def present(self, package: str) -> bool:
-        """The rasterizer is where its compiler is."""
-        if not PACKAGE.startswith(package):
-            return super().present(package)
-        from torch.cuda import is_available
-        from torch.utils.cpp_extension import CUDA_HOME
-
-        return CUDA_HOME is not None and is_available()
-
     def spares(self) -> dict[str, ModuleType]:
         """``train.py`` imports wandb and does not use it."""
         return {"wandb": ModuleType("wandb", "Stand-in of fragprune: empty.")}

@@ -15,7 +15,9 @@ import pytest
 from skeleton import STATES
 
 from fragprune_mcmc import MCMC
+from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins.detect import HostRepo
+from fragprune_rain_gs import RainGS
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -41,13 +43,18 @@ def each_of(*adapters):
 
 every_vanilla = each_of(Vanilla3DGS())
 every_mcmc = each_of(MCMC())
-every_host = each_of(Vanilla3DGS(), MCMC())
+every_mip = each_of(MipSplatting())
+every_rain = each_of(RainGS())
+every_host = each_of(Vanilla3DGS(), MCMC(), MipSplatting(), RainGS())
+every_renderer = each_of(Vanilla3DGS(), MCMC(), MipSplatting())  # RAIN-GS's fails by itself
 
 
 def flags(host: Path) -> list[str]:
     """What a host needs, or refuses, beyond the flags that all have."""
-    mcmc = MCMC().match(HostRepo(host)).fits
-    return ["--cap_max", "3100", "--init_type", "sfm"] if mcmc else ["--port", "0"]
+    repo = HostRepo(host)
+    if MCMC().match(repo).fits:
+        return ["--cap_max", "3100", "--init_type", "sfm"]
+    return ["--port", "0", *(["--exp_name", "a"] if RainGS().match(repo).fits else [])]
 
 
 @every_vanilla
@@ -73,8 +80,44 @@ def test_mcmcs_dialect_is_read_and_vanillas_adapter_keeps_out(host):
     assert not Vanilla3DGS().match(repo).fits
 
 
-RUN = """
-import contextlib, json, sys
+@every_mip
+def test_mip_splattings_dialect_is_read_and_vanillas_adapter_keeps_out(host):
+    adapter, repo = MipSplatting(), HostRepo(host)
+    dialect = adapter.dialect(repo)
+    assert (len(dialect.settings), dialect.outputs, dialect.sparse_adam) == (14, 2, False)
+    assert adapter.drawing(repo, ["--eval"]) == {"dilation": 0.1, "compensation": "mip"}
+    assert not Vanilla3DGS().match(repo).fits
+
+
+@every_rain
+def test_rain_gss_dialect_is_read_and_vanillas_adapter_keeps_out(host):
+    adapter, repo = RainGS(), HostRepo(host)
+    dialect = adapter.dialect(repo)
+    assert (len(dialect.settings), dialect.outputs, dialect.sparse_adam) == (13, 3, False)
+    assert dialect.settings[-1] == "low_pass"
+    assert not Vanilla3DGS().match(repo).fits
+
+
+TORCHVISION = """
+import sys
+from types import ModuleType
+try:
+    import torchvision
+except Exception:  # it is not made for every torch; only pictures and LPIPS need it
+    from PIL import Image
+    package, tools = ModuleType("torchvision"), ModuleType("torchvision.utils")
+    package.__path__, package.models = [], None
+    def save_image(tensor, path):
+        pixels = (tensor.detach().clamp(0, 1) * 255).byte().permute(1, 2, 0)
+        Image.fromarray(pixels.cpu().numpy()).save(path)
+    tools.save_image, package.utils = save_image, tools
+    sys.modules.update({"torchvision": package, "torchvision.utils": tools})
+"""
+
+RUN = (
+    TORCHVISION
+    + """
+import contextlib, json
 from dataclasses import replace
 from pathlib import Path
 import torch
@@ -95,7 +138,8 @@ options = RunOptions(
 )
 with contextlib.redirect_stdout(sys.stderr):
     summary = run(words, replace(options))
-    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
+    paths = (summary.model_before, summary.model_after)
+    before, after = (read_ply(path, filtered=True) for path in paths)
     store, info = sidecar.load(summary.model_after)
     moved = [
         name
@@ -111,6 +155,7 @@ with contextlib.redirect_stdout(sys.stderr):
     }
 print(json.dumps(report))
 """
+)
 
 MOVES = {  # f_rest is not drawn yet: hosts use a second band from iteration 1000 on
     "opacity": ["opacity"],
@@ -139,6 +184,7 @@ from importlib import import_module
 import numpy as np, torch
 torch.set_num_threads(1)
 from fragprune_plugins.detect import HostRepo
+from fragprune_rain_gs import RainGS
 from fragprune_plugins.device import cpu_only
 from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.schedule import JointSchedule, Settings
@@ -203,11 +249,13 @@ from importlib import import_module
 import numpy as np, torch
 torch.set_num_threads(1)
 from fragprune_plugins.detect import HostRepo
+from fragprune_rain_gs import RainGS
 from fragprune_plugins.device import cpu_only
 from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.schedule import JointSchedule, Settings
 from fragprune_plugins.session import Session
 from fragprune_mcmc import MCMC
+from fragprune_mip_splatting import MipSplatting
 
 root, settings = Path(sys.argv[1]), Settings(iterations=9)
 sys.path.insert(0, str(root))
@@ -254,30 +302,19 @@ def test_rows_follow_the_hosts_own_relocation_and_addition(host, python):
     assert python(RELOCATION, host) > 30
 
 
-RENDER = """
-import contextlib, hashlib, json, sys
+RENDER = (
+    TORCHVISION
+    + """
+import contextlib, hashlib, json
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from types import ModuleType
 from fragprune_plugins.launch import RunOptions, run
 from fragprune_plugins import sidecar
-if "torchvision" not in sys.modules:
-    try:
-        import torchvision
-    except Exception:
-        from PIL import Image
-        package, tools = ModuleType("torchvision"), ModuleType("torchvision.utils")
-        package.__path__ = []
-        def save_image(tensor, path):
-            pixels = (tensor.detach().clamp(0, 1) * 255).byte().permute(1, 2, 0)
-            Image.fromarray(pixels.cpu().numpy()).save(path)
-        tools.save_image, package.utils = save_image, tools
-        sys.modules.update({"torchvision": package, "torchvision.utils": tools})
 host, out = Path(sys.argv[1]), Path(sys.argv[2])
 def pictures():
     run([str(host / "render.py"), "-m", str(out), "--skip_train"], RunOptions(device="cpu"))
-    found = sorted(out.glob("test/ours_*/renders/*.png"))
+    found = sorted(out.glob("test/ours_*/*/*.png"))
     return [hashlib.sha256(path.read_bytes()).hexdigest() for path in found]
 with contextlib.redirect_stdout(sys.stderr):
     with_thresholds = pictures()
@@ -286,9 +323,10 @@ with contextlib.redirect_stdout(sys.stderr):
     without = pictures()
 print(json.dumps([len(with_thresholds), with_thresholds != without]))
 """
+)
 
 
-@every_host
+@every_renderer
 def test_the_hosts_own_render_script_applies_thresholds(host, dataset, tmp_path, python):
     python(RUN, host, dataset, tmp_path / "out", "opacity", *flags(host))
     count, differ = python(RENDER, host, tmp_path / "out")
