@@ -187,7 +187,7 @@ def compress(dataset, iteration):
     folder = os.path.join(scene.model_path, "point_cloud", f"iteration_{iteration}", "compressed")
     os.makedirs(folder, exist_ok=True)
     place = model._xyz.detach()
-    voxels = torch.round((place - place.min()) / (place.max() - place.min()) * 255)
+    voxels = torch.round((place - place.min()) / (place.max() - place.min()) * 12)
     _, rows = np.unique(voxels.numpy(), axis=0, return_index=True)
     rest = [getattr(model, name).detach()[rows].numpy() for name in NAMES]
     np.savez_compressed(folder + "/compressed_gs.npz", place[rows].numpy(), *rest)

@@ -1,0 +1,331 @@
+"""Mini-Splatting: scores, new points, simplification, compression, on a miniature of the host."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from dataclasses import replace
+from importlib import import_module
+
+import pytest
+import torch
+from mini_splatting_host import MiniSplattingHost
+from miniature import HOST, joint, label
+
+from fragprune_mini_splatting import MiniSplatting
+from fragprune_plugins import launch, sidecar
+from fragprune_plugins.detect import HostRepo, choose, locate
+from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.launch import RunOptions, run
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.schedule import Settings
+
+NAMES = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    root = tmp_path_factory.mktemp("mini")
+    MiniSplattingHost().write(root)
+    return root
+
+
+def of(mini, **options):
+    return {"path": mini, "adapter": MiniSplatting()} | options
+
+
+# -- which host ----------------------------------------------------------------------------------
+
+
+def test_a_scripts_folder_lies_in_its_host(mini):
+    adapters = load_plugins().adapters
+    repo, adapter = locate(mini / "ms", adapters)
+    assert (repo.root, adapter.name) == (mini.resolve(), "mini-splatting")
+    assert choose(HostRepo(HOST), adapters).name == "vanilla-3dgs"
+    with pytest.raises(UnknownHostError, match="no adapter fits"):
+        locate(mini / "nowhere" / "deep", adapters)
+
+
+RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "code"),
+    [
+        (RENDERER, "def render_imp", "def render_more", "seam-missing"),
+        (RENDERER, "def render_depth", "def depth_of", "seam-missing"),
+        (MODEL, "reinitial_pts(self, pts", "reinitial_pts(self, points", "seam-signature"),
+        (MODEL, "scene_extent, mask", "scene_extent, blur", "seam-signature"),
+        (MODEL, "def prune_points", "def prune_rows", "seam-missing"),
+        ("lpipsPyTorch/__init__.py", "def lpips", "def measure", "seam-missing"),
+    ],
+)
+def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, code):
+    MiniSplattingHost().write(tmp_path)
+    path = tmp_path / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    match = MiniSplatting().match(HostRepo(tmp_path))
+    assert code in [f.code for f in match.findings if f.level == "error"]
+
+
+def test_a_missing_script_is_named(tmp_path):
+    MiniSplattingHost().write(tmp_path)
+    (tmp_path / "ms_d/train.py").unlink()
+    match = MiniSplatting().match(HostRepo(tmp_path))
+    assert "no ms_d/train.py" in str(match.findings[0])
+
+
+# -- scores --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ["reference"])
+def test_scores_are_those_of_the_truncated_picture(mini, engine):
+    """Weights add up to the picture of white Gaussians; each drawn pixel is won once."""
+    scores = {}
+    with joint(**of(mini, engine=engine)) as host:
+        model, camera = host.model(30), host.camera()
+        render = import_module("gaussian_renderer")
+        pipe, black = host.driver.pipe(), torch.zeros(3)
+        white = torch.ones(30, 3)
+        for threshold in (None, -2.0):
+            if threshold is not None:
+                label(host, model)
+                with torch.no_grad():
+                    host.store(model).logits.fill_(threshold)
+            with torch.no_grad():
+                package = render.render_imp(camera, model, pipe, black, override_color=white)
+                plain = render.render(camera, model, pipe, black, override_color=white)
+            image, wins = package["render"], package["area_max"]
+            assert torch.equal(image, plain["render"])
+            torch.testing.assert_close(package["accum_weights"].sum(), image[0].sum())
+            assert wins.sum() == (image[0] > 0).sum()
+            assert (package["area_proj"].dtype, wins.dtype) == (torch.int32, torch.float32)
+            assert ((wins > 0) <= (package["area_proj"] > 0)).all()
+            scores[threshold] = package
+    whole, truncated = scores[None], scores[-2.0]
+    assert (truncated["area_proj"] <= whole["area_proj"]).all()
+    assert truncated["area_proj"].sum() < 0.8 * whole["area_proj"].sum()
+    assert torch.equal(truncated["radii"], whole["radii"])  # the host's rule, whatever is drawn
+
+
+# -- runs ----------------------------------------------------------------------------------------
+
+TINY = [
+    *("-r", "1", "--sh_degree", "1", "--eval", "--test_iterations", "-1"),
+    *("--densify_from_iter", "2", "--densification_interval", "4"),
+    *("--densify_grad_threshold", "0.0008"),
+]
+OWN = ["--depth_interval", 6, "--num_depth", 90, "--simp_iteration2", 13]
+FLAGS = {
+    "gs": ["--densify_until_iter", 10],
+    "ms": ["--densify_until_iter", 10, "--simp_iteration1", 10, *OWN, "--imp_metric", "indoor"],
+    "ms_d": ["--densify_until_iter", 10, *OWN],
+}
+OPTIONS = RunOptions(
+    device="cpu", engine="reference", settings=Settings(iterations=6, threshold_lr=0.3)
+)
+
+
+def command(mini, variant, scene, out, iterations, *more):
+    words = [mini / variant / "train.py", "-s", scene, "-m", out, "--iterations", iterations]
+    return [str(word) for word in (*words, *TINY, *FLAGS[variant], *more)]
+
+
+@pytest.fixture(scope="module", params=FLAGS)
+def trained(request, mini, photographs, tmp_path_factory):
+    """16 iterations: split by mask, all points from depth at 6, simplified at 10 and at 13."""
+    out = tmp_path_factory.mktemp(request.param)
+    return request.param, out, run(command(mini, request.param, photographs, out, 16), OPTIONS)
+
+
+def test_every_script_is_fine_tuned_and_only_opacities_move(trained):
+    variant, _, summary = trained
+    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
+    for name in NAMES:
+        assert torch.equal(getattr(before, name), getattr(after, name))
+    assert not torch.equal(before.opacity, after.opacity)
+    store, info = sidecar.load(summary.model_after)
+    assert len(store) == info.rows == len(after.xyz) == summary.gaussians
+    assert summary.iterations == 6
+    assert not store.neutral
+    assert before.sh_degree == 1  # though ms and ms_d begin without a second band
+    assert summary.fragments_after < summary.fragments_before
+    assert (len(before.xyz) != 150) or variant == "gs"
+
+
+@pytest.mark.parametrize("variant", ["ms", "ms_d"])
+def test_stage_two_stands_still_where_points_would_be_made_anew(
+    mini, photographs, tmp_path, variant
+):
+    """It passes depth's iteration and the simplifications; the host goes through the motions."""
+    later = ["--densify_until_iter", 10, "--depth_interval", 9, "--simp_iteration2", 12]
+    more = [*later, *(["--simp_iteration1", 10] if variant == "ms" else [])]
+    options = replace(OPTIONS, settings=Settings(iterations=8, threshold_lr=0.3))
+    summary = run(command(mini, variant, photographs, tmp_path, 7, *more), options)
+    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
+    for name in NAMES:
+        assert torch.equal(getattr(before, name), getattr(after, name))
+    store, _ = sidecar.load(summary.model_after)
+    assert len(store) == len(before.xyz)
+    assert store.steps == 7  # hosts take no step in their last iteration
+    assert before.f_rest.shape[1] == 0  # a model saved before simplification has no f_rest
+
+
+@pytest.mark.parametrize("variant", ["ms", "ms_d"])
+def test_thresholds_learn_through_new_points_and_simplification(
+    mini, photographs, tmp_path, variant
+):
+    class Rows:
+        def __init__(self):
+            self.changes = []
+
+        @hookimpl
+        def fragprune_population_changed(self, store, change):
+            neutral = bool((store.logits <= -13).all())
+            self.changes.append((change.operation, change.before, change.after, neutral))
+
+    rows = Rows()
+
+    def load():
+        plugins = load_plugins()
+        plugins.manager.register(rows, "test")
+        return plugins
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(launch, "load_plugins", load)
+        options = replace(OPTIONS, stage="joint", from_iter=2)
+        summary = run(command(mini, variant, photographs, tmp_path, 16), options)
+    store, _ = sidecar.load(summary.model_after)
+    assert len(store) == len(read_ply(summary.model_after).xyz)
+    anew = [change for change in rows.changes if change[0] == "training_setup"]
+    assert len(anew) == 2  # from depth at 6, from its own points at 10
+    assert all(neutral for *_, neutral in anew)
+    if variant == "ms":  # at 13 rows go, and those that stay keep what they have
+        operation, before, after, neutral = rows.changes[-1]
+        assert (operation, neutral) == ("keep", False)
+        assert after < before
+
+
+def test_a_run_without_learning_keeps_the_thresholds_of_its_checkpoint(mini, photographs, tmp_path):
+    """Simplified on, from a checkpoint of stage 2: survivors keep theirs."""
+    out, later = tmp_path / "out", ["--simp_iteration2", 40, "--checkpoint_iterations", 22]
+    summary = run(command(mini, "ms", photographs, out, 16, *later), OPTIONS)
+    before, whole = read_ply(summary.model_after), sidecar.load(summary.model_after)[0]
+    more = ["--start_checkpoint", out / "chkpnt22.pth", "--simp_iteration2", 23]
+    run(
+        command(mini, "ms", photographs, tmp_path / "b", 24, *more),
+        replace(OPTIONS, stage="off"),
+    )
+    model = tmp_path / "b/point_cloud/iteration_24/point_cloud.ply"
+    after, store = read_ply(model), sidecar.load(model)[0]
+    assert len(store) == len(after.xyz) < len(before.xyz)
+    where = {row.numpy().tobytes(): index for index, row in enumerate(before.f_dc)}
+    moved = {index for index, row in enumerate(after.f_dc) if row.numpy().tobytes() not in where}
+    assert len(moved) == len(after.xyz) or torch.equal(  # colours train on in this run
+        store.logits, whole.logits[[where[row.numpy().tobytes()] for row in after.f_dc]]
+    )
+    assert set(store.logits.tolist()) <= set(whole.logits.tolist())
+
+
+def test_the_metric_without_its_weights_is_said_once(mini, photographs, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING, logger="fragprune"):
+        more = ["--test_iterations", 2, 3]
+        run(command(mini, "ms", photographs, tmp_path, 4, *more), replace(OPTIONS, stage="off"))
+    said = [record for record in caplog.records if "lpipsPyTorch:lpips" in record.getMessage()]
+    assert len(said) == 1
+    assert "no way there" in said[0].getMessage()
+
+
+class InterruptAt:
+    """Ctrl-C at the end of a learned step."""
+
+    @hookimpl
+    def fragprune_step(self, stats):
+        if stats.step == 3:
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupted_run_saves_at_its_iteration_whatever_the_hosts_clock_says(
+    mini, photographs, tmp_path, monkeypatch
+):
+    def load():
+        plugins = load_plugins()
+        plugins.manager.register(InterruptAt(), "test")
+        return plugins
+
+    monkeypatch.setattr(launch, "load_plugins", load)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(Interrupted):
+            run(command(mini, "ms", photographs, tmp_path, 16), OPTIONS)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    (saved,) = tmp_path.glob("point_cloud/*/*.safetensors")
+    assert saved.parent.name == "iteration_19"  # 16 and 3 steps; the host's own clock is at 5009
+
+
+def test_another_package_of_the_hosts_name_is_refused(mini, photographs, tmp_path, monkeypatch):
+    """The host appends itself to the path: whatever lies before it would be imported instead."""
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/__init__.py").write_text("class Scene:\n    def __init__(self): ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SeamError, match="a module of the same name"):
+        run(command(mini, "ms", photographs, tmp_path / "out", 16), OPTIONS)
+    sys.modules.pop("scene", None)
+
+
+# -- compression ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compressed(mini, photographs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("compressed")
+    summary = run(command(mini, "ms", photographs, out, 16), OPTIONS)
+    run([str(mini / "ms_c/run.py"), "-m", str(out), "--iteration", "22"], OPTIONS)
+    return out, summary, out / "point_cloud/iteration_22/compressed/compressed_gs.npz"
+
+
+def test_compression_takes_each_gaussians_threshold_along(compressed):
+    import numpy as np
+
+    _, summary, file = compressed
+    positions = np.load(file)["arr_0"]
+    model, store = read_ply(summary.model_after), sidecar.load(summary.model_after)[0]
+    packed, info = sidecar.load(file)
+    assert len(packed) == info.rows == len(positions) < len(model.xyz)
+    rows = [
+        int((model.xyz == place).all(dim=1).nonzero()[0, 0]) for place in torch.tensor(positions)
+    ]
+    assert rows != sorted(rows)
+    assert torch.equal(packed.logits, store.logits[rows])
+
+
+def test_what_is_decompressed_is_drawn_with_its_thresholds(mini, compressed):
+    out, _, file = compressed
+    pictures = torch.load(out / "decompressed.pt")
+    sidecar.path_beside(file).rename(file.with_suffix(".aside"))
+    try:
+        alone = [str(mini / "ms_c/run.py"), "-m", str(out), "--iteration", "22"]
+        ply = out / "point_cloud/iteration_22/point_cloud.ply"
+        sidecar.path_beside(ply).rename(ply.with_suffix(".aside"))
+        run(alone, OPTIONS)
+        assert not sidecar.path_beside(file).exists()
+        assert not torch.equal(torch.load(out / "decompressed.pt"), pictures)
+    finally:
+        ply.with_suffix(".aside").rename(sidecar.path_beside(ply))
+    run(alone, OPTIONS)
+    assert torch.equal(torch.load(out / "decompressed.pt"), pictures)
+
+
+def test_an_unpacked_file_and_another_model_are_not_paired(mini, compressed):
+    import numpy as np
+
+    _, _, file = compressed
+    with joint(**of(mini)) as host:
+        np.load(file)["arr_0"]
+        with pytest.raises(AlignmentError, match="not the unpacked file's"):
+            host.render(host.camera(), host.model(9, setup=False))
