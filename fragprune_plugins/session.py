@@ -215,6 +215,7 @@ class Session:
         self._optimizers: weakref.WeakKeyDictionary[Any, list[weakref.ReferenceType[Any]]] = (
             weakref.WeakKeyDictionary()
         )
+        self._warned = False
         self._last: weakref.ReferenceType[Any] | None = None
         self._last_state: _ModelState | None = None  # outlives the host's model
         self._rendering: ContextVar[tuple[Any, int] | None] = ContextVar("rendering", default=None)
@@ -372,7 +373,7 @@ class Session:
         """The host's picture without thresholds, from our engine."""
         inputs = self._dialect.unpack(call)
         engine = self.engine(inputs.splats.device)
-        return self._dialect.answer(call, inputs, lambda inputs: engine.rasterize(inputs, None))
+        return self._dialect.answer(call, inputs, lambda each, _=0: engine.rasterize(each, None))
 
     # -- roles -----------------------------------------------------------------------------------
 
@@ -380,15 +381,25 @@ class Session:
         """Hand a call to the handler of its role: as it is, or with the model it is about."""
         if seam.role in _OF_CALLS:
             return _OF_CALLS[seam.role](self, seam, wrapped, instance, args, kwargs)
-        model = self.adapter.model_of(instance, _named(wrapped, args, kwargs))
+        model = self._model_of(instance, _named(wrapped, args, kwargs))
+        if model is None:
+            return wrapped(*args, **kwargs)
         return _OF_MODELS[seam.role](self, seam, wrapped, model, args, kwargs)
+
+    def _model_of(self, instance: Any, arguments: dict[str, Any]) -> Any:
+        """The model a call is about, by its means where the adapter knows no more; or None."""
+        found = self.adapter.model_of(instance, arguments)
+        if not isinstance(found, Tensor):
+            return found
+        known = ((model, self.adapter.means(model)) for model in self._models)
+        return next((m for m, means in known if means.data_ptr() == found.data_ptr()), None)
 
     def _learned(self, state: _ModelState) -> int:
         return max(0, state.steps - self.from_step) if self.learn else 0
 
     def _standing_still(self, model: Any) -> bool:
-        """Whether the model is frozen now: stage 2 has begun."""
-        state = self._models.get(model)
+        """Whether the model is frozen now: stage 2 has begun. Without one: the last's."""
+        state = self._models.get(model) if model is not None else self._last_state
         return bool(
             self.learn and self.freeze and state is not None and state.steps > self.from_step
         ) or (self.learn and self.freeze and self.from_step == 0)
@@ -548,7 +559,12 @@ class Session:
     def _on_view(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         arguments = _named(wrapped, args, kwargs)
         camera = arguments[seam.needs[0]]
-        model = arguments[seam.needs[1]] if len(seam.needs) > 1 else instance
+        own = len(seam.needs) > 1  # a function's; a method's is what it was called on
+        model = arguments[seam.needs[1]] if own else self._model_of(instance, arguments)
+        if model is None:
+            if self.learn and torch.is_grad_enabled():
+                self._warn_unknown(seam)
+            return wrapped(*args, **kwargs)
         if self._unpacked is not None and model not in self._models:
             self._adopt(model, *self._unpacked)
         state, view = self._models.get(model), self.adapter.view(camera)
@@ -560,6 +576,11 @@ class Session:
         if measured and state is not None and state.plan is not None and torch.is_grad_enabled():
             state.views[view] = again
         return again()
+
+    def _warn_unknown(self, seam: Seam) -> None:
+        if not self._warned:
+            self._warned = True
+            log.warning("%s draws Gaussians that no seam attached: without thresholds", seam)
 
     def _render(self, render: Any, model: Any, view: int, args: Any, kwargs: Any) -> Any:
         token = self._rendering.set((model, view))
@@ -573,11 +594,16 @@ class Session:
     ) -> Any:
         rendering = self._rendering.get()
         state = self._models.get(rendering[0]) if rendering else None
+        settings = getattr(rasterizer, "raster_settings", None)
+        call = HostCall.bind(wrapped, settings, args, kwargs, str(seam))
+        if self._dialect.stands_in(call):
+            wrapped, args, kwargs = self._draw, (call,), {}
         if rendering is None or state is None or self._paused.get():
             return wrapped(*args, **kwargs)
-        call = HostCall.bind(wrapped, rasterizer.raster_settings, args, kwargs, str(seam))
         rows = self.adapter.rows_drawn(rendering[0], call)
-        means, expected = call["means3D"], len(state.store if rows is None else rows)
+        if rows is not None:
+            self._expect_rows(rendering[0], state, f"{self.adapter.name}: rasterizer call")
+        means, expected = call[self._dialect.means], len(state.store if rows is None else rows)
         if len(means) != expected:
             raise AlignmentError(
                 f"{self.adapter.name}: rasterizer call",
@@ -596,9 +622,10 @@ class Session:
         return self._dialect.answer(call, inputs, draw)
 
     def _rasterize(
-        self, state: _ModelState, view: int, thresholds: Tensor, inputs: RasterInputs
+        self, state: _ModelState, view: int, thresholds: Tensor, inputs: RasterInputs, part: int = 0
     ) -> RasterOutputs:
         """With thresholds; learning, with the fragment pressure in the loss."""
+        view = hash((view, part)) if part else view
         engine = self.engine(inputs.splats.device)
         outputs = engine.rasterize(inputs, thresholds)
         state.last_drawn = float(outputs.fragments_per_pixel.detach())
@@ -751,7 +778,7 @@ class Session:
         state = self._models.get(model)
         if state is None:
             return wrapped(*args, **kwargs)
-        with self.adapter.tracing(model, _named(wrapped, args, kwargs)) as trace:
+        with self.adapter.tracing(model, wrapped, _named(wrapped, args, kwargs)) as trace:
             result = wrapped(*args, **kwargs)
         if trace.origins is not None and trace.fresh is not None:
             before = len(state.store)
@@ -771,16 +798,27 @@ class Session:
 
     def _on_save(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         result = wrapped(*args, **kwargs)
-        state = self._models.get(model)
-        if state is not None:
-            path = Path(signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]])
-            self._expect_rows(model, state, str(seam))
-            if state.store.neutral:
-                # A sidecar of an earlier model under this name would now be refused as stale.
-                sidecar.path_beside(path).unlink(missing_ok=True)
-            else:
-                self._save(path, state.store)
+        path = _named(wrapped, args, kwargs)[seam.needs[0]]
+        if model in self._models and path is not None:
+            self.save(model, Path(path))
         return result
+
+    def save(self, model: Any, path: Path) -> None:
+        """Write a model's thresholds beside the file ``path`` that holds the model; none if neutral.
+
+        Raises:
+            SessionError: the model is not one of this session's.
+            AlignmentError: it has other rows than thresholds.
+        """
+        state = self._models.get(model)
+        if state is None:
+            raise SessionError("save()", "a model without thresholds", "one attached", "Train it.")
+        self._expect_rows(model, state, str(path))
+        if state.store.neutral:
+            # A sidecar of an earlier model under this name would now be refused as stale.
+            sidecar.path_beside(path).unlink(missing_ok=True)
+        else:
+            self._save(path, state.store)
 
     def _save(self, path: Path, store: ThresholdStore) -> None:
         written = sidecar.save(
@@ -796,15 +834,24 @@ class Session:
         result = wrapped(*args, **kwargs)
         path = Path(signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]])
         if sidecar.path_beside(path).exists():
-            store = ThresholdStore(self.adapter.rows(model), self.adapter.means(model).device)
-            sidecar.load(path, store)
-            means = weakref.ref(self.adapter.means(model))
-            self._models[model] = _ModelState(store, loaded=means)
-            self._follow(model, self._models[model])
-            self.hook.fragprune_attached(model=model, store=store)
+            self.load(model, path)
         else:
             self._models.pop(model, None)  # another population: what we knew is not about it
         return result
+
+    def load(self, model: Any, path: Path) -> None:
+        """Take a model's thresholds from beside the file ``path`` that it was just loaded from.
+
+        Raises:
+            SidecarError: there are none, or they belong to another file.
+        """
+        store = ThresholdStore(self.adapter.rows(model), self.adapter.means(model).device)
+        sidecar.load(path, store)
+        means = weakref.ref(self.adapter.means(model))
+        state = self._models[model] = _ModelState(store, loaded=means)
+        self._expect_rows(model, state, str(path))
+        self._follow(model, state)
+        self.hook.fragprune_attached(model=model, store=store)
 
     def _on_pack(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         result = wrapped(*args, **kwargs)

@@ -1,0 +1,130 @@
+"""ASU-ESIC-FAN-Lab/LP-3DGS: learns a pruning mask over an importance score, for several models.
+
+Which model and score it trains with is chosen by ``--prune_method``. Its rasterizer always returns
+four values, the last two None unless a setting asks for a score.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.errors import EngineError, UsageError
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.seams import Role, Seam
+
+if TYPE_CHECKING:
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+SCORES = ("f_count", "bw_score", "mw_score", "top_K_dT")
+MINI, RAD = "scene.gaussian_model_mini_splatting", "scene.gaussian_model_rad_splat"
+NO_METRICS = dict.fromkeys(("SSIM", "PSNR", "LPIPS"), math.nan)
+
+
+@dataclass(frozen=True)
+class LP3DGSDialect(GraphdecoDialect):
+    """Vanilla's call of 2023, and its form that sums blending weights."""
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Scores are asked for where the host asks for blending weights.
+
+        Raises:
+            EngineError: another score is wanted.
+        """
+        foreign = [n for n in SCORES if n != "bw_score" and getattr(call.settings, n)]
+        if foreign:
+            raise EngineError(
+                "the rasterizer's scores",
+                f"{foreign[0]}, which RadSplat's pruning follows",
+                "bw_score or none: our engines compute no other",
+                "Train with the host's own rasterizer and start from what it saved with "
+                "--stage finetune.",
+            )
+        return replace(super().unpack(call), scores=bool(call.settings.bw_score))
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
+        """(colour (3, H, W), radii (P,), None, score (P,) sum of alpha T or None)."""
+        return outputs.image, outputs.radii, None, outputs.weights_per_gaussian
+
+    def spares(self) -> dict[str, ModuleType]:
+        """A wandb that keeps no record and names no sweep."""
+        module = ModuleType("wandb", "Stand-in of fragprune: records nothing.")
+        run = SimpleNamespace(sweep_id=None)
+        vars(module).update(init=lambda **_: run, define_metric=_nothing, log=_nothing)
+        return {"wandb": module}
+
+
+def _nothing(*_: Any, **__: Any) -> None:
+    """Records nothing."""
+
+
+class LP3DGS(GraphdecoAdapter):
+    """LP-3DGS."""
+
+    name = "lp-3dgs"
+    info = HostInfo(
+        "LP-3DGS",
+        repo="ASU-ESIC-FAN-Lab/LP-3DGS",
+        states="2024; prune methods 3dgs, mini_splatting, rad_splat",
+        limits=(
+            "--prune_method compact_3dgs: its model has groups of its own and is refused.",
+            "--prune_method rad_splat: pruning needs the host's own rasterizer; stage 2 does not.",
+            "Trained for other than 30,000 iterations the host ends in a KeyError of its own, once "
+            "it has saved: begin stage 2 with --stage finetune then.",
+        ),
+    )
+    contracts = (Contract(frozenset(SCORES), None),)
+    seams = (
+        *GraphdecoAdapter.seams,
+        *(
+            Seam(Role.STILL, module, f"{model}.{method}")
+            for module, model, method in (
+                (MINI, "MiniSplatting", "prune_after_render"),
+                (MINI, "MiniSplatting", "oneupSHdegree"),
+                (RAD, "RadSplat", "prune_after_render"),
+            )
+        ),
+        Seam(Role.STILL, "render", "render_sets"),
+        Seam(Role.STILL, "metrics", "evaluate", ("model_paths",)),
+        Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
+    )
+
+    def dialect(self, repo: HostRepo) -> LP3DGSDialect:
+        """As the lineage reads it."""
+        return LP3DGSDialect(**vars(super().dialect(repo)))
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """The same script; one of its models is another.
+
+        Raises:
+            UsageError: ``--prune_method compact_3dgs``.
+        """
+        if "compact_3dgs" in arguments or "--prune_method=compact_3dgs" in arguments:
+            raise UsageError(
+                "--prune_method compact_3dgs",
+                "a model with a mask among its parameters, and a resume that fails in the host",
+                "3dgs, mini_splatting or rad_splat",
+                "Fine-tune its PLY with fragprune finetune.",
+            )
+        return script, arguments
+
+    def stand_still(self, wrapped: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+        """The script ends by rendering and evaluating iteration 30,000, which stage 2 is past."""
+        if wrapped.__name__ == "render_sets":
+            return dict.fromkeys(("train", "test"), math.nan)
+        if wrapped.__name__ == "evaluate":
+            return {path: {"ours_30000": NO_METRICS} for path in arguments["model_paths"]}
+        return super().stand_still(wrapped, arguments)
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Offer LP-3DGS."""
+    register(LP3DGS())

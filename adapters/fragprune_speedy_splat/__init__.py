@@ -1,0 +1,114 @@
+"""j-alex-hanson/speedy-splat: prunes Gaussians by squared gradients, draws them in exact tiles.
+
+Its pruning score is the sum, over a Gaussian's fragments, of the squared gradient of the picture
+by the falloff; the host's rasterizer writes it into a gradient. Our engines do not compute it, so
+stage 1 with its pruning needs the host's own rasterizer. Stage 2 prunes nothing and needs no score.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.seams import Role, Seam
+
+if TYPE_CHECKING:
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+UNTIL = "--prune_until_iter"
+
+
+@dataclass(frozen=True)
+class SpeedySplatDialect(GraphdecoDialect):
+    """Vanilla's call of 2023 with a tensor for scores, and the time taken as third output."""
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Vanilla's, unless the scores are really wanted: zeros would prune every Gaussian.
+
+        Raises:
+            EngineError: the host is about to prune.
+        """
+        scores = call.get("scores")
+        if scores is not None and scores.requires_grad:
+            raise EngineError(
+                "the rasterizer's scores",
+                "a pruning pass of Speedy-Splat, which wants squared gradients per fragment",
+                "pictures only: our engines do not compute that score",
+                "Train with the host's own rasterizer and start from what it saved with "
+                f"--stage finetune; or give {UNTIL} 0 to train without pruning.",
+            )
+        return super().unpack(call)
+
+    def answer(
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
+    ) -> Any:
+        """(colour (3, H, W), radii (P,), milliseconds (1,)): the host divides by the time."""
+        import torch
+
+        begun = time.perf_counter()
+        outputs = draw(inputs)
+        if outputs.image.is_cuda:
+            torch.cuda.synchronize()
+        took = torch.tensor([(time.perf_counter() - begun) * 1e3])
+        return outputs.image, outputs.radii, took
+
+
+class SpeedySplat(GraphdecoAdapter):
+    """Speedy-Splat."""
+
+    name = "speedy-splat"
+    info = HostInfo(
+        "Speedy-Splat",
+        repo="j-alex-hanson/speedy-splat",
+        states="December 2024",
+        limits=(
+            "Its pruning needs the host's own rasterizer, so a GPU; stage 2 does not.",
+            "Our engines clip to the tiles of three sigma, as vanilla does; the host's own "
+            "rasterizer also draws fragments beyond, of an alpha below 0.0111.",
+        ),
+    )
+    contracts = (Contract(outputs=3),)
+    seams = (
+        *GraphdecoAdapter.seams,
+        Seam(Role.STILL, "scene.gaussian_model", "GaussianModel.prune_gaussians"),
+        Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Kernel times among the rasterizer's outputs."""
+        findings = super().fingerprint(repo)
+        if repo.mentions(["gaussian_renderer"], ["kernel_times"]):
+            return findings
+        return [
+            *findings,
+            Finding(
+                "error",
+                "other-host",
+                repo.place("gaussian_renderer", "render"),
+                "no kernel_times among what the rasterizer returns",
+                "them, as Speedy-Splat has it",
+                "Use the adapter of that host.",
+            ),
+        ]
+
+    def dialect(self, repo: HostRepo) -> SpeedySplatDialect:
+        """As the lineage reads it."""
+        return SpeedySplatDialect(**vars(super().dialect(repo)))
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """The same script, without pruning: its scores would be computed for nothing."""
+        return script, [*arguments, UNTIL, "0"]
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Offer Speedy-Splat."""
+    register(SpeedySplat())
