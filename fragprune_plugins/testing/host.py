@@ -256,6 +256,7 @@ class Host:
 def prune(model: Any, arguments: Any, chance: Chance) -> None:
     """Remove rows, by a mask of torch's or, as some hosts have it, of NumPy's."""
     gone = chance.rows(len(model.get_xyz))
+    _with_radii(model)
     model.prune_points(gone.numpy() if chance.heads else gone)
 
 
@@ -271,6 +272,7 @@ def split(model: Any, arguments: Any, chance: Chance) -> None:
 
 def _densify(method: Any, model: Any, all_rows: float, chance: Chance) -> None:
     grads = chance.uniform(len(model.get_xyz), 1)
+    _with_radii(model)
     method(grads, 1 - chance.share, all_rows if chance.seed % 3 else 3.0)
 
 
@@ -289,6 +291,12 @@ def densify_and_prune(model: Any, arguments: Any, chance: Chance) -> None:
 
 def _takes_radii(method: Any) -> bool:
     return "radii" in inspect.signature(method).parameters
+
+
+def _with_radii(model: Any) -> None:
+    """Revisions whose ``densify_and_prune`` takes radii keep them on the model meanwhile."""
+    if _takes_radii(model.densify_and_prune):
+        model.tmp_radii = torch.ones(len(model.get_xyz))
 
 
 @dataclass

@@ -45,6 +45,29 @@ def rename_parameter(repo: HostRepo, seam: Seam, name: str) -> None:
     path.write_bytes(b"".join(lines))
 
 
+def unpack_one_more(repo: HostRepo, seam: Seam) -> int | None:
+    """The seam's function takes one value more from its rasterizer, wherever it unpacks radii.
+
+    Returns:
+        The line of the first; None where it unpacks none.
+    """
+    path, function = _definition(repo, seam)
+    targets = [
+        target
+        for node in ast.walk(function)
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
+        for target in node.targets
+        if isinstance(target, ast.Tuple) and "radii" in ast.unparse(target)
+    ]
+    lines = path.read_bytes().splitlines(keepends=True)
+    for target in targets:
+        first, start = target.elts[0], target.elts[0].col_offset
+        line = lines[first.lineno - 1]
+        lines[first.lineno - 1] = line[:start] + f"{RENAMED}, ".encode() + line[start:]
+    path.write_bytes(b"".join(lines))
+    return min((target.lineno for target in targets), default=None)
+
+
 def _definition(repo: HostRepo, seam: Seam) -> tuple[Path, ast.FunctionDef | ast.AsyncFunctionDef]:
     path, function = repo.path(seam.module), repo.function(seam.module, seam.attribute)
     if path is None or function is None:

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from fragprune_plugins import session as sessions
 from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.errors import FragpruneError, SeamError
-from fragprune_plugins.seams import Seam
+from fragprune_plugins.seams import Role, Seam
 from fragprune_plugins.testing import mutations
 from fragprune_plugins.testing.host import running
 from fragprune_plugins.testing.invariants.case import Case, require
@@ -30,6 +30,13 @@ def refuse(case: Case) -> str:
                     mutations.rename_parameter(repo, seam, name)
                 _expect_refusal(case, HostRepo(Path(folder)), seam, name)
                 changes += 1
+    for seam in (seam for seam in case.seams if seam.role is Role.VIEW):
+        with TemporaryDirectory() as folder:
+            repo = mutations.copy_source(case.root, Path(folder))
+            line = mutations.unpack_one_more(repo, seam)
+            if line is not None:
+                _expect_place(case, HostRepo(Path(folder)), seam, line)
+                changes += 1
     with TemporaryDirectory() as folder:
         match = case.adapter.match(HostRepo(Path(folder)))
         require(not match.fits, "an empty folder is taken for the host")
@@ -45,6 +52,14 @@ def _expect_refusal(case: Case, repo: HostRepo, seam: Seam, name: str | None) ->
     code = "seam-missing" if name is None else "seam-signature"
     named = [f for f in errors if f.code == code and f.where.startswith(str(seam))]
     require(named, f"{what}: not named; said {[str(error) for error in errors]}")
+
+
+def _expect_place(case: Case, repo: HostRepo, seam: Seam, line: int) -> None:
+    """Another number of values from the rasterizer is refused, and the line is said."""
+    errors = [f for f in case.adapter.match(repo).findings if f.level == "error"]
+    at = f"{seam} ({repo.at(seam.module, line)})"
+    what = f"{seam} takes one value more from its rasterizer in line {line}"
+    require(any(f.where == at for f in errors), f"{what}: said {[str(error) for error in errors]}")
 
 
 def _import_is_refused(case: Case) -> None:

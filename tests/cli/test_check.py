@@ -1,0 +1,165 @@
+"""``fragprune check`` says what is where, what changed, and what a codebase is not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from cli.commands import run, run_json
+from skeleton import STATES, skeleton
+
+from fragprune_plugins import demo
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.testing import mutations
+
+MINIATURE = Path(demo.__file__).with_name("host")
+MODEL, RENDERER = "scene/gaussian_model.py", "gaussian_renderer/__init__.py"
+
+
+@pytest.fixture
+def host(tmp_path):
+    return mutations.copy_source(MINIATURE, tmp_path).root
+
+
+def of(report, name="vanilla-3dgs"):
+    return next(each for each in report["adapters"] if each["adapter"] == name)
+
+
+def refused(host, *words):
+    result = run("check", host, *words, "--json")
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert report["fits"] is None
+    return report
+
+
+def line_of(host, file, text):
+    lines = (host / file).read_text().splitlines()
+    return next(number for number, line in enumerate(lines, 1) if text in line)
+
+
+def test_the_host_that_fits_with_every_seam_in_its_place(host):
+    report = run_json("check", host)
+    assert report["fits"] == report["adapters"][0]["adapter"] == "vanilla-3dgs"
+    best = report["adapters"][0]
+    assert best["seams_held"] == best["seams_looked_up"] > 10
+    for seam in best["seams"]:
+        assert seam["status"] in ("found", "at import")
+        if seam["status"] == "found":
+            file, line = seam["at"].split(":")
+            name = seam["seam"].split(":")[1].split(".")[-1]
+            assert f"def {name}(" in (host / file).read_text().splitlines()[int(line) - 1]
+    text = run("check", host)
+    assert text.exit_code == 0
+    assert f"{MODEL}:{line_of(host, MODEL, 'def densify_and_split')}" in text.stdout
+    assert f"fragprune run -- python {host / 'train.py'}" in text.stdout
+
+
+def test_nothing_is_imported(host, python):
+    for file in host.rglob("*.py"):
+        file.write_text(file.read_text() + "\nraise SystemExit('imported')\n")
+    code = (
+        "import json, sys\n"
+        "from click.testing import CliRunner\n"
+        "from fragprune_plugins.cli import cli\n"
+        "result = CliRunner().invoke(cli, ['check', sys.argv[1], '--json'])\n"
+        "print(json.dumps([result.exit_code, 'torch' in sys.modules, 'scene' in sys.modules]))\n"
+    )
+    assert python(code, host) == [0, False, False]
+
+
+CLONE = Seam(Role.PARENTS, "scene.gaussian_model", "GaussianModel.densify_and_clone")
+RENDER = Seam(Role.VIEW, "gaussian_renderer", "render")
+
+
+def test_a_renamed_method_is_missing_from_its_class(host):
+    mutations.rename_function(HostRepo(host), CLONE)
+    report = of(refused(host))
+    (error,) = [f for f in report["findings"] if f["level"] == "error"]
+    at = f"{MODEL}:{line_of(host, MODEL, 'class GaussianModel')}"
+    assert (error["code"], error["where"]) == ("seam-missing", f"{CLONE} ({at})")
+    (seam,) = [s for s in report["seams"] if s["seam"] == str(CLONE)]
+    assert (seam["status"], seam["at"]) == ("missing", at)
+    assert f"MISSING in {at}" in run("check", host).stdout
+
+
+def test_a_dropped_parameter_is_named_where_the_method_is(host):
+    line = line_of(host, MODEL, "def densify_and_clone(")
+    mutations.rename_parameter(HostRepo(host), CLONE, "scene_extent")
+    report = of(refused(host))
+    (error,) = [f for f in report["findings"] if f["level"] == "error"]
+    assert (error["code"], error["where"]) == ("seam-signature", f"{CLONE} ({MODEL}:{line})")
+    assert error["expected"] == "also scene_extent"
+    assert f"CHANGED at {MODEL}:{line}: parameters (grads, " in run("check", host).stdout
+
+
+def test_another_number_of_values_from_the_rasterizer_is_named_in_its_line(host):
+    line = mutations.unpack_one_more(HostRepo(host), RENDER)
+    (error,) = [f for f in of(refused(host))["findings"] if f["level"] == "error"]
+    assert (error["code"], error["where"]) == ("rasterizer-call", f"{RENDER} ({RENDERER}:{line})")
+    assert error["found"].endswith("3 values back")
+
+
+def test_another_setting_of_the_rasterizer_is_named(host):
+    text = (host / RENDERER).read_text()
+    (host / RENDERER).write_text(text.replace("debug=pipe", "sharpness=1.0,\n        debug=pipe"))
+    (error,) = [f for f in of(refused(host))["findings"] if f["level"] == "error"]
+    assert error["code"] == "rasterizer-call"
+    assert error["found"].startswith("sharpness besides the shared settings")
+
+
+def test_a_file_that_is_no_python_is_said_to_be_none(host):
+    (host / MODEL).write_text("class GaussianModel(:\n")
+    found = {f["found"] for f in of(refused(host))["findings"] if f["level"] == "error"}
+    assert found == {"source that is no Python"}
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_public_states_are_told_apart(tmp_path, state):
+    skeleton(tmp_path, state)
+    findings = of(run_json("check", tmp_path))["findings"]
+    assert [f["found"] for f in findings if f["code"] == "revision"] == [state]
+
+
+@pytest.mark.parametrize(
+    ("marker", "cousin"),
+    [
+        ("_deformation", "4DGaussians"),
+        ("get_view2gaussian", "Gaussian Opacity Fields"),
+        ("clamp_color", "c3dgs"),
+        ("depth_ratio", "2D Gaussian Splatting"),
+    ],
+)
+def test_a_cousin_is_called_by_its_name(tmp_path, marker, cousin):
+    skeleton(tmp_path, **{marker: ""})
+    refused(tmp_path)
+    result = run("check", tmp_path)
+    assert f"{marker}, which belongs to {cousin}" in result.stdout
+    assert "No adapter fits" in result.stdout
+
+
+def test_a_folder_that_is_no_host(tmp_path):
+    (tmp_path / "train.py").write_text("print('another project')")
+    report = refused(tmp_path)
+    assert all(each["seams_held"] == 0 for each in report["adapters"])
+    text = run("check", tmp_path).stdout
+    assert "None of these adapters finds anything of its host" in text
+    assert "write-an-adapter.md" in text
+
+
+def test_an_adapter_can_be_asked_for(host):
+    report = refused(host, "--adapter", "light_gaussian")
+    assert [each["adapter"] for each in report["adapters"]] == ["light-gaussian"]
+    assert run_json("check", host, "--adapter", "vanilla-3dgs")["fits"] == "vanilla-3dgs"
+
+
+def test_unknown_folders_and_adapters_are_stated_failures(host, tmp_path):
+    for words, found in (
+        ((tmp_path / "nowhere",), "no such folder"),
+        ((host, "--adapter", "my-host"), "'my-host'"),
+    ):
+        result = run("check", *words, "--json")
+        assert result.exit_code == 1
+        assert found in json.loads(result.stdout)["error"]["found"]
