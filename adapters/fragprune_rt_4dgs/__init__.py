@@ -17,8 +17,8 @@ from fragprune_plugins.adapter import CommandLine, HostAdapter, HostCall, HostIn
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
 from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.lineage import Contract, GraphdecoAdapter
+from fragprune_plugins.seams import Role
 from fragprune_rt_4dgs.config import YAMLFile
 from fragprune_rt_4dgs.dialect import OUTPUTS, RASTERIZER, SETTINGS, RT4DGSDialect
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 MODEL = "scene.gaussian_model"
 
-LACKING = (Role.SAVE, Role.LOAD, Role.RASTERIZE)
-"""Roles whose seams of the lineage are missing here, or are elsewhere."""
+OWN = ("flow_2d", "ts", "scales_t", "rotations_r", "prefilter_var")
+"""What its rasterizer takes and vanilla's does not."""
 
 
 class RT4DGS(GraphdecoAdapter):
@@ -36,59 +36,27 @@ class RT4DGS(GraphdecoAdapter):
 
     name = "rt-4dgs"
     info = HostInfo(
-        "Real-time Photorealistic Dynamic Scene Representation with 4D Gaussian Splatting",
+        "RT-4DGS",
         repo="fudan-zvg/4d-gaussian-splatting",
         states="January 2026",
     )
     package = RASTERIZER
+    contracts = (Contract(SETTINGS, OUTPUTS),)
     gradients_read = frozenset({"t"})
-    seams = (
-        *(seam for seam in GraphdecoAdapter.seams if seam.role not in LACKING),
-        Seam(
-            Role.RASTERIZE,
-            RASTERIZER,
-            "GaussianRasterizer.forward",
-            ("means3D", "means2D", "opacities"),
-            external=True,
-        ),
+    seams = tuple(
+        replace(seam, module=RASTERIZER) if seam.role is Role.RASTERIZE else seam
+        for seam in GraphdecoAdapter.seams
+        if seam.role not in (Role.SAVE, Role.LOAD)
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Gaussians with a marginal in time, and a rasterizer of their own inside the host."""
-        findings = super().fingerprint(repo)
-        dialect = self.dialect(repo)
-        checks = {
-            "no-marginal": (
-                f"{MODEL}:GaussianModel.get_marginal_t",
-                bool(repo.function(MODEL, "GaussianModel.get_marginal_t")),
-                "no such function",
-                "one, as RT-4DGS has it",
-            ),
-            "rasterizer-settings": (
-                "gaussian_renderer:render",
-                dialect.settings == SETTINGS,
-                f"settings ({', '.join(dialect.settings)})",
-                f"({', '.join(SETTINGS)})",
-            ),
-            "rasterizer-outputs": (
-                "gaussian_renderer:render",
-                dialect.outputs == OUTPUTS,
-                f"{dialect.outputs} values unpacked from the rasterizer",
-                f"{OUTPUTS}: colour, radii, depth, alpha, flow, covariances",
-            ),
-            "rasterizer-call": (
-                RASTERIZER,
-                {"ts", "scales_t", "rotations_r", "prefilter_var"}
-                <= set(repo.parameters(RASTERIZER, "GaussianRasterizer.forward") or ()),
-                "no forward() that takes ts, scales_t, rotations_r and prefilter_var",
-                "the host's own rasterizer",
-            ),
-        }
-        return findings + [
-            Finding("error", code, where, found, expected, "Use the adapter of that host.")
-            for code, (where, holds, found, expected) in checks.items()
-            if not holds
-        ]
+        found = []
+        if not repo.function(MODEL, "GaussianModel.get_marginal_t"):
+            found.append("no get_marginal_t")
+        taken = repo.parameters(RASTERIZER, "GaussianRasterizer.forward") or ()
+        found += [f"no {name} for {RASTERIZER}" for name in OWN if name not in taken]
+        return [*super().fingerprint(repo), *self.other_host(repo, found)]
 
     def dialect(self, repo: HostRepo) -> RT4DGSDialect:
         """As the lineage reads it from ``render``."""
@@ -139,11 +107,13 @@ class RT4DGS(GraphdecoAdapter):
         """
         import torch
 
+        from fragprune_rt_4dgs.slice4d import MARGINAL_MIN
+
         if call.get("cov3D_precomp") is None or model.gaussian_dim != 4:
             return None
         with torch.no_grad():
             marginal = model.get_marginal_t(call.settings.timestamp)
-            rows: Tensor = (marginal[:, 0] > 0.05).nonzero()[:, 0]
+            rows: Tensor = (marginal[:, 0] > MARGINAL_MIN).nonzero()[:, 0]
             expected = (model.get_opacity * marginal)[rows]
         if not torch.equal(expected, call["opacities"]):
             raise AlignmentError(

@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from fragprune_plugins.types import RasterInputs, RasterOutputs
     from fragprune_rt_4dgs.slice4d import Moment
 
-RENDERER = "gaussian_renderer"
-RASTERIZER = f"{RENDERER}.diff_gaussian_rasterization"
-SETTINGS = (
-    *("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier"),
-    *("viewmatrix", "projmatrix", "sh_degree", "sh_degree_t", "campos", "timestamp"),
-    *("time_duration", "rot_4d", "gaussian_dim", "force_sh_3d", "prefiltered", "debug"),
+RASTERIZER = "gaussian_renderer.diff_gaussian_rasterization"
+"""A file of the host, compiled when it is imported."""
+
+SETTINGS = frozenset(
+    ("sh_degree_t", "timestamp", "time_duration", "rot_4d", "gaussian_dim", "force_sh_3d")
 )
+"""Those that vanilla does not have."""
+
 OUTPUTS = 6
 
 
@@ -71,15 +72,6 @@ class RT4DGSDialect(GraphdecoDialect):
         features = outputs.features
         assert features is not None  # unpack asked for them
         return outputs.image, outputs.radii, features[:1], outputs.alpha, features[1:]
-
-    def present(self, package: str) -> bool:
-        """The rasterizer is a file of the host that compiles itself when it is imported."""
-        if package != RENDERER:
-            return super().present(package)
-        import torch
-        from torch.utils.cpp_extension import CUDA_HOME
-
-        return CUDA_HOME is not None and torch.cuda.is_available()
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizer, simple_knn and the neighbours of the rigidity loss."""

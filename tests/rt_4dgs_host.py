@@ -1,0 +1,585 @@
+"""A miniature RT-4DGS: the demo's host with space and time, from the method's interface."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import inspect
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+from light_gaussian_host import changed
+
+from fragprune_plugins.testing.host import Chance, Host
+
+ATTRIBUTES = {
+    "xyz": "_xyz",
+    "f_dc": "_features_dc",
+    "f_rest": "_features_rest",
+    "opacity": "_opacity",
+    "scaling": "_scaling",
+    "rotation": "_rotation",
+    "t": "_t",
+    "scaling_t": "_scaling_t",
+    "rotation_r": "_rotation_r",
+}
+
+
+class Added:
+    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
+
+    def __init__(
+        self,
+        sh_degree,
+        gaussian_dim=3,
+        time_duration=(-0.5, 0.5),
+        rot_4d=False,
+        force_sh_3d=False,
+        sh_degree_t=0,
+        prefilter_var=-1.0,
+    ):
+        self.active_sh_degree, self.max_sh_degree = 0, sh_degree
+        self.active_sh_degree_t, self.max_sh_degree_t = 0, sh_degree_t
+        self.gaussian_dim, self.time_duration, self.rot_4d = gaussian_dim, time_duration, rot_4d
+        self.force_sh_3d, self.prefilter_var = force_sh_3d, prefilter_var
+        for name in ATTRIBUTES.values():
+            setattr(self, name, torch.empty(0))
+        self.max_radii2D, self.xyz_gradient_accum = torch.empty(0), torch.empty(0)
+        self.t_gradient_accum, self.denom, self.env_map = (torch.empty(0),) * 3
+        self.optimizer, self.percent_dense, self.spatial_lr_scale = None, 0, 0
+        self.setup_functions()
+
+    def capture(self):
+        space = (
+            self.active_sh_degree,
+            self._xyz,
+            self._features_dc,
+            self._features_rest,
+            self._scaling,
+            self._rotation,
+            self._opacity,
+            self.max_radii2D,
+            self.xyz_gradient_accum,
+        )
+        state = (self.denom, self.optimizer.state_dict(), self.spatial_lr_scale)
+        if self.gaussian_dim == 3:
+            return (*space, *state)
+        time = (self._t, self._scaling_t, self._rotation_r, self.rot_4d, self.env_map)
+        return (*space, self.t_gradient_accum, *state, *time, self.active_sh_degree_t)
+
+    def restore(self, model_args, training_args):
+        (self.active_sh_degree, self._xyz, self._features_dc, self._features_rest) = model_args[:4]
+        self._scaling, self._rotation, self._opacity, self.max_radii2D = model_args[4:8]
+        if self.gaussian_dim == 4:
+            self.spatial_lr_scale = model_args[12]
+            (self._t, self._scaling_t, self._rotation_r, self.rot_4d) = model_args[13:17]
+            self.env_map, self.active_sh_degree_t = model_args[17:]
+            accumulated, in_time, denominator, optimizer_state = model_args[8:12]
+        if training_args is not None:
+            self.training_setup(training_args)
+            self.xyz_gradient_accum, self.t_gradient_accum = accumulated, in_time
+            self.denom = denominator
+            self.optimizer.load_state_dict(optimizer_state)
+
+    def _names(self):
+        many = 6 if self.gaussian_dim == 3 else 9 if self.rot_4d else 8
+        return list(ATTRIBUTES)[:many]
+
+    def _adopt(self, tensors):
+        for name, tensor in tensors.items():
+            known = isinstance(tensor, nn.Parameter)  # noqa: F821 - imported where this is put
+            parameter = tensor if known else nn.Parameter(tensor.requires_grad_(True))  # noqa: F821
+            setattr(self, ATTRIBUTES[name], parameter)
+
+    def _reset_statistics(self):
+        n = self.get_xyz.shape[0]
+        self.xyz_gradient_accum, self.denom = torch.zeros((n, 1)), torch.zeros((n, 1))
+        self.t_gradient_accum = torch.zeros((n, 1))
+
+    def create_from_pcd(self, pcd, spatial_lr_scale):
+        points = torch.tensor(np.asarray(pcd.points)).float()  # noqa: F821
+        colours = RGB2SH(torch.tensor(np.asarray(pcd.colors)).float())  # noqa: F821
+        self.spatial_lr_scale, n = spatial_lr_scale, len(points)
+        width = torch.sqrt(torch.clamp_min(distCUDA2(points), 1e-7))  # noqa: F821
+        still = torch.eye(1, 4).repeat(n, 1)
+        start, end = self.time_duration
+        given = getattr(pcd, "time", None)
+        times = torch.rand(n, 1) if given is None else (torch.tensor(given).float() - start)
+        values = {
+            "xyz": points,
+            "f_dc": colours[:, None, :],
+            "f_rest": torch.zeros(n, self.get_max_sh_channels - 1, 3),
+            "opacity": torch.full((n, 1), -2.197),
+            "scaling": width.log()[:, None].repeat(1, 3),
+            "rotation": still,
+            "t": start + (end - start) * times,
+            "scaling_t": torch.full((n, 1), ((end - start) / 5) ** 0.5).log(),
+            "rotation_r": still.clone(),
+        }
+        self._adopt({name: values[name] for name in self._names()})
+        self.max_radii2D = torch.zeros(n)
+
+    def training_setup(self, training_args):
+        self.percent_dense = training_args.percent_dense
+        self._reset_statistics()
+        rates = [training_args.position_lr_init * self.spatial_lr_scale, training_args.feature_lr]
+        rates += [training_args.feature_lr / 20, training_args.opacity_lr]
+        rates += [training_args.scaling_lr, training_args.rotation_lr, rates[0]]
+        rates += [training_args.scaling_lr, training_args.rotation_lr]
+        groups = [
+            {"params": [getattr(self, ATTRIBUTES[name])], "lr": rate, "name": name}
+            for name, rate in zip(self._names(), rates, strict=False)
+        ]
+        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
+        self.xyz_scheduler_args = get_expon_lr_func(  # noqa: F821
+            rates[0], rates[0] / 100, training_args.position_lr_max_steps
+        )
+
+    @property
+    def get_max_sh_channels(self):
+        waves = 0 if self.gaussian_dim == 3 or self.force_sh_3d else self.max_sh_degree_t
+        return (self.max_sh_degree + 1) ** 2 * (waves + 1)
+
+    @property
+    def get_t(self):
+        return self._t
+
+    @property
+    def get_scaling_t(self):
+        return self.scaling_activation(self._scaling_t)
+
+    @property
+    def get_rotation_r(self):
+        return self.rotation_activation(self._rotation_r)
+
+    def _covariance_4d(self, scaling_modifier=1):
+        """Images of the axes under v -> l v r*, written out by Hamilton's table."""
+        units = torch.eye(4)
+        table = torch.zeros(4, 4, 4)
+        for i in range(4):
+            table[0, i, i] = table[i, 0, i] = 1
+        for i in range(1, 4):
+            table[i, i, 0] = -1
+            j, k = i % 3 + 1, (i + 1) % 3 + 1
+            table[i, j, k], table[j, i, k] = 1, -1
+        left = torch.einsum("ni,ijk->njk", self.get_rotation, table)
+        back = self.get_rotation_r * torch.tensor([1.0, -1, -1, -1])
+        right = torch.einsum("ni,jik->njk", back, table)
+        turned = torch.einsum("aj,njk,nkl->nal", units, left, right).flip(1, 2)
+        scales = torch.cat([self.get_scaling, self.get_scaling_t], dim=1) * scaling_modifier
+        return torch.einsum("nak,na,nal->nkl", turned, scales.square(), turned)
+
+    def get_cov_t(self, scaling_modifier=1):
+        if self.rot_4d:
+            return self._covariance_4d(scaling_modifier)[:, 3, 3:]
+        return self.get_scaling_t * scaling_modifier
+
+    def get_marginal_t(self, timestamp, scaling_modifier=1):
+        variance = self.get_cov_t(scaling_modifier) + max(self.prefilter_var, 0)
+        return torch.exp(-0.5 * (self.get_t - timestamp) ** 2 / variance)
+
+    def get_current_covariance_and_mean_offset(self, scaling_modifier=1, timestamp=0.0):
+        full = self._covariance_4d(scaling_modifier)
+        across, in_time = full[:, :3, 3:], full[:, 3:, 3:]
+        space = full[:, :3, :3] - across @ across.transpose(1, 2) / in_time
+        row, column = torch.triu_indices(3, 3)
+        offset = across[..., 0] / in_time[..., 0] * (timestamp - self.get_t)
+        return space[:, row, column], offset
+
+    def oneupSHdegree(self):  # noqa: N802 - the name callers use
+        if self.active_sh_degree < self.max_sh_degree:
+            self.active_sh_degree += 1
+        elif self.active_sh_degree_t < self.max_sh_degree_t:
+            self.active_sh_degree_t += 1
+
+    def densification_postfix(
+        self,
+        new_xyz,
+        new_features_dc,
+        new_features_rest,
+        new_opacities,
+        new_scaling,
+        new_rotation,
+        new_t,
+        new_scaling_t,
+        new_rotation_r,
+    ):
+        new = [new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling]
+        new += [new_rotation, new_t, new_scaling_t, new_rotation_r]
+        self._adopt(self.cat_tensors_to_optimizer(dict(zip(self._names(), new, strict=False))))
+        self._reset_statistics()
+        self.max_radii2D = torch.zeros(self.get_xyz.shape[0])
+
+    def _rows(self, chosen, copies=1):
+        for name in ATTRIBUTES.values():
+            tensor = getattr(self, name)
+            yield (tensor[chosen].repeat(copies, *[1] * (tensor.ndim - 1)) if len(tensor) else None)
+
+    def densify_and_clone(self, grads, grad_threshold, scene_extent, grads_t, grad_t_threshold):
+        chosen = self._needy(grads, grad_threshold, scene_extent, large=False)
+        self.densification_postfix(*self._rows(chosen))
+
+    def densify_and_split(
+        self, grads, grad_threshold, scene_extent, grads_t, grad_t_threshold, N=2
+    ):
+        chosen = self._needy(grads, grad_threshold, scene_extent, large=True)
+        xyz, dc, rest, opacity, scaling, *others = self._rows(chosen, N)
+        xyz = xyz + torch.normal(torch.zeros_like(xyz), scaling.exp())
+        self.densification_postfix(xyz, dc, rest, opacity, scaling - 0.47, *others)
+        children = torch.zeros(len(xyz), dtype=torch.bool)
+        self.prune_points(torch.cat((chosen, children)))
+
+    def densify_and_prune(
+        self, max_grad, min_opacity, extent, max_screen_size, max_grad_t=None, prune_only=False
+    ):
+        if not prune_only:
+            grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
+            grads_t = (self.t_gradient_accum / self.denom).nan_to_num(0.0)
+            self.densify_and_clone(grads, max_grad, extent, grads_t, max_grad_t)
+            self.densify_and_split(grads, max_grad, extent, grads_t, max_grad_t)
+        unwanted = (self.get_opacity < min_opacity).squeeze(-1)
+        if max_screen_size:
+            unwanted |= self.max_radii2D > max_screen_size
+        self.prune_points(unwanted)
+
+    def prune_points(self, mask):
+        keep = ~mask
+        self._adopt(self._prune_optimizer(keep))
+        self.xyz_gradient_accum = self.xyz_gradient_accum[keep]
+        self.t_gradient_accum = self.t_gradient_accum[keep]
+        self.denom, self.max_radii2D = self.denom[keep], self.max_radii2D[keep]
+
+    def add_densification_stats(self, viewspace_point_tensor, update_filter, avg_t_grad=None):
+        moved = torch.norm(viewspace_point_tensor.grad[update_filter, :2], dim=-1, keepdim=True)
+        self.xyz_gradient_accum[update_filter] += moved
+        self.t_gradient_accum[update_filter] += avg_t_grad[update_filter]
+        self.denom[update_filter] += 1
+
+
+RASTERIZER = '''"""Compiles itself when it is imported, where there is a compiler."""
+
+raise ImportError("nvcc is not to be found")
+
+
+class GaussianRasterizer:
+    def forward(
+        self, means3D, means2D, opacities, shs=None, colors_precomp=None, flow_2d=None, ts=None,
+        scales=None, scales_t=None, rotations=None, rotations_r=None, cov3D_precomp=None,
+        prefilter_var=-1.0,
+    ):
+        ...
+'''
+
+RENDERER = '''"""One view of the model at one moment."""
+
+import math
+
+import torch
+
+from .diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+
+
+def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, override_color=None):
+    screenspace = torch.zeros_like(pc.get_xyz, requires_grad=True) + 0
+    if screenspace.requires_grad:
+        screenspace.retain_grad()
+    now = viewpoint_camera.timestamp
+    settings = GaussianRasterizationSettings(
+        image_height=int(viewpoint_camera.image_height),
+        image_width=int(viewpoint_camera.image_width),
+        tanfovx=math.tan(viewpoint_camera.FoVx / 2),
+        tanfovy=math.tan(viewpoint_camera.FoVy / 2),
+        bg=torch.zeros(3) if pipe.env_map_res else bg_color,
+        scale_modifier=scaling_modifier,
+        viewmatrix=viewpoint_camera.world_view_transform,
+        projmatrix=viewpoint_camera.full_proj_transform,
+        sh_degree=pc.active_sh_degree,
+        sh_degree_t=pc.active_sh_degree_t,
+        campos=viewpoint_camera.camera_center,
+        timestamp=now,
+        time_duration=pc.time_duration[1] - pc.time_duration[0],
+        rot_4d=pc.rot_4d,
+        gaussian_dim=pc.gaussian_dim,
+        force_sh_3d=pc.force_sh_3d,
+        prefiltered=False,
+        debug=pipe.debug,
+    )
+    given = {"means3D": pc.get_xyz, "means2D": screenspace, "opacities": pc.get_opacity}
+    given.update(shs=pc.get_features, flow_2d=torch.zeros_like(pc.get_xyz[:, :2]))
+    if pc.gaussian_dim == 4:
+        given["ts"] = pc.get_t
+    mask = torch.ones(len(pc.get_xyz), dtype=torch.bool)
+    if pipe.compute_cov3D_python:
+        if pc.rot_4d:
+            given["cov3D_precomp"], offset = pc.get_current_covariance_and_mean_offset(
+                scaling_modifier, now
+            )
+            given["means3D"] = given["means3D"] + offset
+        else:
+            given["cov3D_precomp"] = pc.get_covariance(scaling_modifier)
+        if pc.gaussian_dim == 4:
+            marginal = pc.get_marginal_t(now)
+            given["opacities"] = given["opacities"] * marginal
+            mask = marginal[:, 0] > 0.05
+            given = {name: tensor[mask] for name, tensor in given.items()}
+    else:
+        given.update(scales=pc.get_scaling, rotations=pc.get_rotation)
+        if pc.gaussian_dim == 4:
+            given["scales_t"] = pc.get_scaling_t
+            if pc.rot_4d:
+                given["rotations_r"] = pc.get_rotation_r
+            if pc.prefilter_var > 0:
+                given["prefilter_var"] = pc.prefilter_var
+    rasterizer = GaussianRasterizer(raster_settings=settings)
+    image, radii, depth, alpha, flow, covs_com = rasterizer(**given)
+    if pipe.env_map_res:
+        image = image + (1 - alpha) * pc.env_map
+    everyone = radii.new_zeros(mask.shape)
+    everyone[mask] = radii
+    return {
+        "render": image,
+        "viewspace_points": screenspace,
+        "visibility_filter": everyone > 0,
+        "radii": everyone,
+        "depth": depth,
+        "alpha": alpha,
+        "flow": flow,
+    }
+'''
+
+args = SimpleNamespace()  # the host's script holds its options under this name
+
+
+class Timed:
+    """A view and its moment; every use of it is a copy."""
+
+    def __init__(self, camera, timestamp):
+        vars(self).update(vars(camera))
+        self.timestamp = timestamp
+
+    def cuda(self):
+        return copy.deepcopy(self)
+
+
+def training(dataset, opt, pipe):
+    """The loop: the first iteration is 2, the model is saved before it changes."""
+    prepare_output_and_logger(dataset)  # noqa: F821
+    gaussians = GaussianModel(  # noqa: F821
+        dataset.sh_degree,
+        gaussian_dim=args.gaussian_dim,
+        time_duration=args.time_duration,
+        rot_4d=args.rot_4d,
+        sh_degree_t=2 if pipe.eval_shfs_4d else 0,
+    )
+    scene, iteration = Scene(dataset, gaussians), 0  # noqa: F821
+    gaussians.training_setup(opt)
+    if args.start_checkpoint:
+        model_params, iteration = torch.load(args.start_checkpoint)
+        gaussians.restore(model_params, opt)
+    size, optimizer = pipe.env_map_res, None
+    gaussians.env_map = None
+    if size:
+        gaussians.env_map = torch.nn.Parameter(torch.zeros(3, size, size))
+        optimizer = torch.optim.Adam([gaussians.env_map], lr=opt.feature_lr)
+    cameras = scene.getTrainCameras()
+    views = [Timed(view, number / len(cameras)) for number, view in enumerate(cameras)]
+    background = torch.zeros(3)
+    loader = torch.utils.data.DataLoader(
+        views, batch_size=args.batch_size, shuffle=True, collate_fn=list, drop_last=True
+    )
+    iteration += 1
+    while iteration < opt.iterations + 1:
+        for batch in loader:
+            iteration += 1
+            if iteration > opt.iterations:
+                break
+            gaussians.update_learning_rate(iteration)
+            if iteration % opt.sh_increase_interval == 0:
+                gaussians.oneupSHdegree()
+            moved, seen, radii = [], [], []
+            for view in batch:
+                camera = view.cuda()
+                package = render(camera, gaussians, pipe, background)  # noqa: F821
+                loss = l1_loss(package["render"], camera.original_image)  # noqa: F821
+                sky = -torch.log(1 - package["alpha"].clamp(1e-6, 1 - 1e-6)).mean()
+                loss = loss + opt.lambda_opa_mask * sky
+                (loss / args.batch_size).backward()
+                moved.append(torch.norm(package["viewspace_points"].grad[:, :2], dim=-1))
+                seen.append(package["visibility_filter"])
+                radii.append(package["radii"])
+            in_time = gaussians._t.grad.clone() if args.gaussian_dim == 4 else None
+            with torch.no_grad():
+                if iteration in args.save_iterations:
+                    scene.save(iteration)
+                if iteration < opt.densify_until_iter:
+                    update = torch.stack(seen).any(0)
+                    gaussians.max_radii2D[update] = torch.stack(radii).max(0).values[update].float()
+                    point = type("Point", (), {"grad": torch.stack(moved).sum(0)[:, None]})
+                    gaussians.add_densification_stats(point, update, in_time)
+                    due = iteration % opt.densification_interval == 0
+                    if iteration > opt.densify_from_iter and due:
+                        extent = scene.cameras_extent
+                        gaussians.densify_and_prune(
+                            opt.densify_grad_threshold, 0.005, extent, None, 1.0
+                        )
+                if iteration < opt.iterations:
+                    gaussians.optimizer.step()
+                    gaussians.optimizer.zero_grad(set_to_none=True)
+                    if optimizer:
+                        optimizer.step()
+                        optimizer.zero_grad(set_to_none=True)
+
+
+SAVE = """    def save(self, iteration):
+        path = f"{self.model_path}/chkpnt{iteration}.pth"
+        torch.save((self.gaussians.capture(), iteration), path)
+
+"""
+SCENE = [
+    ("import numpy as np\n", "import numpy as np\nimport torch\n"),
+    ("    def getTrainCameras(", SAVE + "    def getTrainCameras("),
+]
+THRESHOLD = "        self.densify_grad_threshold = 0.0002\n"
+DEBUG = "        self.debug = False\n"
+OPTIONS = [
+    (
+        THRESHOLD,
+        THRESHOLD
+        + "        self.sh_increase_interval = 1000\n        self.lambda_opa_mask = 0.0\n",
+    ),
+    (DEBUG, DEBUG + "        self.env_map_res = 0\n        self.eval_shfs_4d = False\n"),
+]
+OMEGA = "from omegaconf import OmegaConf\nfrom omegaconf.dictconfig import DictConfig\n"
+IMPORTS = [
+    ("import random\n", "import copy\nimport random\n"),
+    ("import torch\n", "import torch\n" + OMEGA),
+]
+MAIN = """    parser.add_argument("--config")
+    parser.add_argument("--gaussian_dim", type=int, default=3)
+    parser.add_argument("--time_duration", nargs=2, type=float, default=[-0.5, 0.5])
+    parser.add_argument("--rot_4d", action="store_true")
+    parser.add_argument("--batch_size", type=int, default=1)
+    args = parser.parse_args()
+    args.save_iterations.append(args.iterations)
+
+    def walk(section):
+        for key in section.keys():
+            if isinstance(section[key], DictConfig):
+                walk(section[key])
+            else:
+                assert hasattr(args, key), key
+                setattr(args, key, section[key])
+
+    walk(OmegaConf.load(args.config))
+    safe_state(args.seed)
+    training(lp.extract(args), op.extract(args), pp.extract(args))
+"""
+
+
+def without(text: str, names: set[str]) -> str:
+    """A module's text without these methods of its classes."""
+    lines, gone = text.splitlines(), set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef) and node.name in names:
+            gone |= set(range(node.lineno, (node.end_lineno or 0) + 1))
+    return "\n".join(line for i, line in enumerate(lines, 1) if i not in gone) + "\n"
+
+
+def change(path: Path, changes: list[tuple[str, str]], *gone: str) -> Path:
+    """Rewrite a module without some of its functions, and changed."""
+    path.write_text(changed(without(path.read_text(), set(gone)), changes))
+    return path
+
+
+class RT4DGSHost(Host):
+    """Space and time; no PLY, several views a step, and a gradient that the loop reads."""
+
+    rot_4d = True
+    python = False
+
+    def write(self, root: Path) -> None:
+        super().write(root)
+        (root / "gaussian_renderer" / "__init__.py").write_text(RENDERER)
+        (root / "gaussian_renderer" / "diff_gaussian_rasterization.py").write_text(RASTERIZER)
+        own = {name for name in vars(Added) if callable(getattr(Added, name))}
+        own |= {"save_ply", "load_ply", "construct_list_of_attributes"}
+        begin = "\n\nclass GaussianModel:\n"
+        model = root / "scene" / "gaussian_model.py"
+        names = [(begin, f"\n\nATTRIBUTES = {ATTRIBUTES}\n{begin}")]
+        methods = "".join(inspect.getsourcelines(Added)[0][2:])
+        model.write_text(changed(without(model.read_text(), own), names) + methods)
+        change(root / "scene" / "__init__.py", SCENE, "save")
+        change(root / "arguments" / "__init__.py", OPTIONS)
+        train = change(root / "train.py", IMPORTS, "training")
+        text, _ = train.read_text().split("    args = parser.parse_args()\n")
+        loop = "\n\n".join(inspect.getsource(each) for each in (Timed, training))
+        train.write_text(text.replace("if __name__", loop + "\n\nif __name__") + MAIN)
+
+    def new_model(self, degree):
+        model = import_module("scene.gaussian_model").GaussianModel
+        return model(degree, gaussian_dim=4, rot_4d=self.rot_4d, sh_degree_t=2)
+
+    def fill(self, model, cloud):
+        model.create_from_pcd(cloud, 1.0)
+
+    def camera(self, width, height, *, side=0.0):
+        return Timed(super().camera(width, height, side=side), 0.1)
+
+    def pipe(self):
+        pipe = super().pipe()
+        pipe.env_map_res, pipe.compute_cov3D_python = 0, self.python
+        return pipe
+
+    def step(self, model, camera, iteration, background):
+        model.update_learning_rate(iteration)
+        total = 0.0
+        for _ in range(2):
+            package = self.render(camera.cuda(), model, background)
+            loss = (package["render"] - camera.original_image).abs().mean() / 2
+            loss.backward()
+            total += float(loss.detach())
+        with torch.no_grad():
+            in_time = model._t.grad.clone()
+            points, seen = package["viewspace_points"], package["visibility_filter"]
+            model.add_densification_stats(points, seen, in_time)
+            self.descend(model)
+        return total
+
+    def actions(self):
+        return {**super().actions(), "clone": clone, "split": split}
+
+    def hide(self, model, row):
+        with torch.no_grad():
+            model._opacity[row] = -30.0
+
+
+class RigidHost(RT4DGSHost):
+    """Without 4D rotation: the host's backward pass gives time and its scale zeros."""
+
+    rot_4d = False
+
+    def parameters(self, model):
+        moving = super().parameters(model)
+        return {name: moving[name] for name in moving if name not in ("t", "scaling_t")}
+
+
+class PythonHost(RT4DGSHost):
+    """Slicing in Python, and leaving out who is not there."""
+
+    python = True
+
+
+def clone(model, arguments, chance: Chance):
+    _densify(model.densify_and_clone, model, 1e6, chance)
+
+
+def split(model, arguments, chance: Chance):
+    _densify(model.densify_and_split, model, 1e-6, chance)
+
+
+def _densify(method, model, all_rows, chance):
+    grads = chance.uniform(len(model.get_xyz), 1)
+    extent = all_rows if chance.seed % 3 else 3.0
+    method(grads, 1 - chance.share, extent, torch.zeros_like(grads), 1.0)
