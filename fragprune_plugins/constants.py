@@ -32,6 +32,9 @@ ANTIALIASING_FLOOR: Final = 2.5e-5
 MIP_FLOOR: Final = 1e-6
 """Mip-Splatting draws no Gaussian whose 2D covariance has a determinant this small, pixels^4."""
 
+FEATURES_MAX: Final = 8
+"""Most channels that one rasterization blends beside colour."""
+
 RIM_WIDTH: Final = 0.01
 """Width w, in falloff, of the surrogate s((g - tau)/w) at the rim; results are flat .003 to .03."""
 

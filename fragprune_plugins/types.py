@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
-from fragprune_plugins.constants import ALPHA_MAX, ALPHA_MIN, DILATION, NEAR
+from fragprune_plugins.constants import ALPHA_MAX, ALPHA_MIN, DILATION, FEATURES_MAX, NEAR
 from fragprune_plugins.errors import InputError
 
 if TYPE_CHECKING:
@@ -14,9 +14,6 @@ if TYPE_CHECKING:
 
 Compensation = Literal["none", "antialiasing", "mip"]
 """What keeps a dilated Gaussian's weight, by name; ``RasterInputs`` has the formulas."""
-
-FEATURES_MAX = 8
-"""Most channels that one rasterization blends beside colour."""
 
 
 def _check(name: str, tensor: Tensor | None, *shape: int | None) -> None:

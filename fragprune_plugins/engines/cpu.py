@@ -6,31 +6,40 @@ import ctypes
 import math
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, get_args
 
 import torch
 from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.native import loader
-from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats
+from fragprune_plugins.types import Compensation, Footprints, RasterOutputs, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from fragprune_plugins.types import RasterInputs
+
 # The differentiable inputs, in the order in which the autograd function takes them.
 _NAMES = (
     "means",
-    "means2d",
+    "hook",
     "opacities",
     "scales",
     "rotations",
     "cov3d",
     "sh",
     "colors",
+    "features",
     "thresholds",
+    "means2d",
+    "conics",
+    "depths",
     "background",
 )
+
+_COMPENSATIONS = get_args(Compensation)
+"""In the order of enum fragprune_compensation."""
 
 
 _SMALL = 1 << 16
@@ -80,8 +89,7 @@ class _Drawing:
         state: what backward needs; None when nothing wants gradients.
         evaluated: lanes spent.
         stages: milliseconds by stage.
-        fragments: (H, W) int32, when asked for.
-        fragments_per_gaussian: (N,) int32, when asked for.
+        found: what counts and scores ask for, by the names of ``RasterOutputs``.
     """
 
     inputs: RasterInputs
@@ -91,24 +99,28 @@ class _Drawing:
     state: loader.State | None = None
     evaluated: int = 0
     stages: dict[str, float] = field(default_factory=dict)
-    fragments: Tensor | None = None
-    fragments_per_gaussian: Tensor | None = None
+    found: dict[str, Tensor] = field(default_factory=dict)
 
     def fill(self, widen: bool) -> loader.Inputs:
         """The C struct; it points into ``arrays``."""
         view, splats = self.inputs.view, self.inputs.splats
-        assert isinstance(splats, Splats)
+        sh = splats.sh if isinstance(splats, Splats) else None
         return loader.Inputs(
-            threads=torch.get_num_threads(),
+            threads=_threads(),
             width=view.width,
             height=view.height,
             tan_fov_x=view.tan_fov_x,
             tan_fov_y=view.tan_fov_y,
             scale_modifier=self.inputs.scale_modifier,
             dilation=self.inputs.dilation,
-            antialiasing=self.inputs.compensation == "antialiasing",
-            sh_degree=splats.sh_degree,
-            sh_coefficients=0 if splats.sh is None else splats.sh.shape[1],
+            near=self.inputs.near,
+            alpha_max=self.inputs.alpha_max,
+            compensation=_COMPENSATIONS.index(self.inputs.compensation),
+            cap_gradient=self.inputs.cap_gradient,
+            absolute_gradient=self.inputs.absolute_gradient,
+            sh_degree=splats.sh_degree if isinstance(splats, Splats) else 0,
+            sh_coefficients=0 if sh is None else sh.shape[1],
+            feature_count=_channels(splats.features),
             widen=widen,
             count=len(splats),
             workspace=self.workspace.handle,
@@ -116,22 +128,27 @@ class _Drawing:
         )
 
     def draw(self, wants: dict[str, bool]) -> tuple[Tensor, ...]:
-        """Run the forward pass; image, invdepth, alpha, radii, fragments per pixel."""
+        """Run the forward pass; image, invdepth, alpha, features, radii, fragments per pixel."""
         view, n = self.inputs.view, len(self.inputs.splats)
         size = (view.height, view.width)
         empty = partial(_empty, self.workspace)
         image, invdepth, alpha = empty(3, *size), empty(1, *size), empty(1, *size)
-        radii = empty(n, dtype=torch.int32)
+        features = empty(_channels(self.inputs.splats.features), *size)
+        radii, whole = empty(n, dtype=torch.int32), torch.int32
         if self.inputs.counts:
-            self.fragments = empty(*size, dtype=torch.int32)
-            self.fragments_per_gaussian = empty(n, dtype=torch.int32)
+            self.found["fragments"] = empty(*size, dtype=whole)
+            self.found["fragments_per_gaussian"] = empty(n, dtype=whole)
+        if self.inputs.scores:
+            self.found["weights_per_gaussian"] = empty(n)
+            self.found["wins_per_gaussian"] = empty(n, dtype=whole)
+            self.found["winners"] = empty(*size, dtype=whole)
         outputs = loader.Outputs(
             image=_address(image),
             invdepth=_address(invdepth),
             alpha=_address(alpha),
             radii=_address(radii),
-            fragments=_address(self.fragments),
-            fragments_per_gaussian=_address(self.fragments_per_gaussian),
+            features=_address(features),
+            **{name: _address(tensor) for name, tensor in self.found.items()},
         )
         error = loader.Error()
         handle = ctypes.c_void_p()
@@ -152,29 +169,30 @@ class _Drawing:
         self.evaluated = outputs.evaluated
         self.stages = {name: getattr(outputs, f"{name}_ms") for name in _STAGES}
         drawn = torch.tensor(outputs.drawn / (view.width * view.height), dtype=torch.float32)
-        return image, invdepth, alpha, radii, drawn
+        return image, invdepth, alpha, features, radii, drawn
 
     def undraw(self, upstream: tuple[Tensor | None, ...], wants: dict[str, bool]) -> dict[str, Any]:
         """Run the backward pass; gradients by name, float32 on the CPU."""
         assert self.state is not None
         plain = [None if g is None else _plain(g) for g in upstream]
-        image, invdepth, alpha, per_pixel = plain
+        image, invdepth, alpha, features, per_pixel = plain
         output_grads = loader.OutputGrads(
             fragments_per_pixel=0.0 if per_pixel is None else per_pixel.item(),
             image=_address(image),
             invdepth=_address(invdepth),
             alpha=_address(alpha),
+            features=_address(features),
         )
         n = len(self.inputs.splats)
         shapes = {name: array.shape for name, array in self.arrays.items()}
-        shapes["means2d"] = torch.Size((n, 3))
+        shapes["hook"] = torch.Size((n, 3))
         grads = {k: _empty(self.workspace, *shapes[k]) for k, wanted in wants.items() if wanted}
         error = loader.Error()
         status = self.library.calls.fragprune_backward(
             self.state.handle,
             ctypes.byref(output_grads),
             ctypes.byref(loader.InputGrads(**{k: _address(g) for k, g in grads.items()})),
-            torch.get_num_threads(),
+            _threads(),
             ctypes.byref(error),
         )
         if status != loader.OK:
@@ -189,7 +207,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, drawing: _Drawing, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         wants = dict(zip(_NAMES, ctx.needs_input_grad[1:], strict=True))
         outputs = drawing.draw(wants)
-        ctx.mark_non_differentiable(outputs[3])
+        ctx.mark_non_differentiable(outputs[4])
         ctx.set_materialize_grads(False)
         ctx.drawing, ctx.wants = drawing, wants
         # Saved for the sake of autograd's check against changes in place: the state reads these.
@@ -200,16 +218,16 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         tensors = ctx.saved_tensors
-        image, invdepth, alpha, _, per_pixel = upstream
-        grads = ctx.drawing.undraw((image, invdepth, alpha, per_pixel), ctx.wants)
+        image, invdepth, alpha, features, _, per_pixel = upstream
+        grads = ctx.drawing.undraw((image, invdepth, alpha, features, per_pixel), ctx.wants)
         given: list[Tensor | None] = [None]
         for name, tensor in zip(_NAMES, tensors, strict=True):
             if name not in grads:
                 given.append(None)
                 continue
             grad = grads[name]
-            if name == "means2d" and tensor.shape[1] != 3:  # a hook with absolute gradients too
-                grad = torch.nn.functional.pad(grad[:, :2], (0, tensor.shape[1] - 2))
+            if name == "hook" and tensor.shape[1] != 3:
+                grad = torch.nn.functional.pad(grad, (0, tensor.shape[1] - 3))
             given.append(grad.to(tensor.device, tensor.dtype))
         return tuple(given)
 
@@ -229,29 +247,25 @@ class CpuEngine:
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
-        _refuse_what_is_missing(inputs)
         view, splats = inputs.view, inputs.splats
-        assert isinstance(splats, Splats)
-        tensors: dict[str, Tensor | None] = {
-            "means": splats.means,
-            "means2d": inputs.means2d_hook,
-            "opacities": splats.opacities,
-            "scales": splats.scales,
-            "rotations": splats.rotations,
-            "cov3d": splats.cov3d,
-            "sh": splats.sh,
-            "colors": splats.colors,
+        others = {
+            "hook": inputs.means2d_hook,
             "thresholds": thresholds,
             "background": view.background,
         }
-        read = {k: t for k, t in tensors.items() if t is not None and k != "means2d"}
-        cameras = {k: getattr(view, k) for k in ("viewmatrix", "projmatrix", "campos")}
-        arrays = {name: _plain(tensor) for name, tensor in {**read, **cameras}.items()}
+        tensors = {name: others.get(name, getattr(splats, name, None)) for name in _NAMES}
+        constants = {k: getattr(view, k) for k in ("viewmatrix", "projmatrix", "campos")}
+        constants["sample_offsets"] = inputs.sample_offsets
+        read = {k: t for k, t in {**tensors, **constants}.items() if t is not None and k != "hook"}
+        arrays = {name: _plain(tensor) for name, tensor in read.items()}
+        if isinstance(splats, Footprints):
+            arrays["tiles"] = splats.tiles.detach().to("cpu", torch.int32).contiguous()
         drawing = _Drawing(inputs, self._library, self._workspace, arrays)
-        image, invdepth, alpha, radii, per_pixel = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        outputs = _Rasterize.apply(  # type: ignore[no-untyped-call]
             drawing, *(tensors[name] for name in _NAMES)
         )
-        device = splats.means.device
+        image, invdepth, alpha, features, radii, per_pixel = outputs
+        device = splats.device
         return RasterOutputs(
             image=image.to(device),
             radii=radii.to(device),
@@ -259,24 +273,16 @@ class CpuEngine:
             alpha=alpha.to(device),
             fragments_per_pixel=per_pixel.to(device),
             evaluated_per_pixel=drawing.evaluated / (view.width * view.height),
-            fragments=_on(device, drawing.fragments),
-            fragments_per_gaussian=_on(device, drawing.fragments_per_gaussian),
+            features=None if splats.features is None else features.to(device),
             stages=drawing.stages,
+            **{name: tensor.to(device) for name, tensor in drawing.found.items()},
         )
 
 
-def _refuse_what_is_missing(inputs: RasterInputs) -> None:
-    plain = RasterInputs(inputs.view, inputs.splats)
-    names = ("near", "sample_offsets", "absolute_gradient", "scores", "alpha_max", "cap_gradient")
-    lacks = [name for name in names if getattr(inputs, name) != getattr(plain, name)]
-    lacks += ["compensation 'mip'"] * (inputs.compensation == "mip")
-    lacks += ["Footprints"] * isinstance(inputs.splats, Footprints)
-    lacks += ["features"] * (inputs.splats.features is not None)
-    if lacks:
-        raise EngineError(
-            "engine 'cpu'", ", ".join(lacks), "inputs it can draw", "Use the engine 'reference'."
-        )
+def _channels(features: Tensor | None) -> int:
+    return 0 if features is None else features.shape[1]
 
 
-def _on(device: torch.device, tensor: Tensor | None) -> Tensor | None:
-    return None if tensor is None else tensor.to(device)
+def _threads() -> int:
+    """As many as torch uses; the C side takes no more than this."""
+    return min(torch.get_num_threads(), 1024)

@@ -10,7 +10,7 @@ import weakref
 from dataclasses import dataclass
 from typing import Any, Final
 
-API_VERSION: Final = 2
+API_VERSION: Final = 3
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -54,13 +54,19 @@ class Inputs(_Sized):
         ("tan_fov_y", ctypes.c_float),
         ("scale_modifier", ctypes.c_float),
         ("dilation", ctypes.c_float),
-        ("antialiasing", ctypes.c_int32),
+        ("near", ctypes.c_float),
+        ("alpha_max", ctypes.c_float),
+        ("compensation", ctypes.c_int32),
+        ("cap_gradient", ctypes.c_int32),
+        ("absolute_gradient", ctypes.c_int32),
         ("sh_degree", ctypes.c_int32),
         ("sh_coefficients", ctypes.c_int32),
+        ("feature_count", ctypes.c_int32),
         ("widen", ctypes.c_int32),
         ("count", ctypes.c_int64),
         *_pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
-        *_pointers("cov3d sh colors thresholds workspace"),
+        *_pointers("cov3d sh colors features thresholds sample_offsets"),
+        *_pointers("means2d conics depths tiles workspace"),
     )
 
 
@@ -69,7 +75,8 @@ class Outputs(_Sized):
 
     _fields_ = (
         ("size", ctypes.c_uint32),
-        *_pointers("image invdepth alpha radii fragments fragments_per_gaussian"),
+        *_pointers("image invdepth alpha radii features fragments fragments_per_gaussian"),
+        *_pointers("weights_per_gaussian wins_per_gaussian winners"),
         ("drawn", ctypes.c_int64),
         ("evaluated", ctypes.c_int64),
         ("projection_ms", ctypes.c_float),
@@ -84,7 +91,7 @@ class OutputGrads(_Sized):
     _fields_ = (
         ("size", ctypes.c_uint32),
         ("fragments_per_pixel", ctypes.c_float),
-        *_pointers("image invdepth alpha"),
+        *_pointers("image invdepth alpha features"),
     )
 
 
@@ -93,8 +100,8 @@ class InputGrads(_Sized):
 
     _fields_ = (
         ("size", ctypes.c_uint32),
-        *_pointers("means means2d opacities scales rotations cov3d sh colors thresholds"),
-        *_pointers("background"),
+        *_pointers("means hook opacities scales rotations cov3d sh colors features thresholds"),
+        *_pointers("means2d conics depths background"),
     )
 
 

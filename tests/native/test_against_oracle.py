@@ -54,8 +54,11 @@ def check_images(
     tolerance: float = IMAGE_TOLERANCE,
 ) -> None:
     assert (~same).sum() <= 1 + same.numel() // 500
-    for name in ("image", "invdepth", "alpha"):
+    for name in ("image", "invdepth", "alpha", "features"):
         expected = getattr(truth, name)
+        if expected is None:
+            assert getattr(ours, name) is None
+            continue
         difference = (expected - getattr(ours, name))[:, same].abs()
         scale = max(1.0, expected.abs().max().item())
         assert difference.numel() == 0 or difference.max() < tolerance * scale, name
@@ -80,7 +83,9 @@ def gradients(
     out = engine.rasterize(made, thresholds)
     generator = torch.Generator().manual_seed(7)
     loss = out.image.new_zeros(())
-    for tensor in (out.image, out.invdepth, out.alpha):
+    for tensor in (out.image, out.invdepth, out.alpha, out.features):
+        if tensor is None:
+            continue
         weight = torch.randn(tensor.shape, generator=generator) * same
         loss = loss + (tensor * weight.to(tensor.dtype)).sum()
     if thresholds is not None:

@@ -24,14 +24,20 @@ def everything(
     engine: CpuEngine, inputs: RasterInputs, thresholds: torch.Tensor | None
 ) -> dict[str, torch.Tensor]:
     """All outputs and all gradients of one loss."""
-    made, leaves = scenes.leaves(inputs.with_counts())
+    made, leaves = scenes.leaves(replace(inputs, counts=True, scores=True))
     if thresholds is not None:
         leaves["thresholds"] = thresholds = thresholds.detach().clone().requires_grad_()
     out = engine.rasterize(made, thresholds)
     loss = out.image.square().sum() + out.invdepth.sum() + out.alpha.sum()
+    if out.features is not None:
+        loss = loss + out.features.square().sum()
     (loss + out.fragments_per_pixel).backward()
     kept = {name: getattr(out, name).detach() for name in ("image", "invdepth", "alpha", "radii")}
-    kept |= {"fragments": out.fragments, "each": out.fragments_per_gaussian}
+    scores = ("weights_per_gaussian", "wins_per_gaussian", "winners")
+    counts = ("fragments", "fragments_per_gaussian")
+    kept |= {name: getattr(out, name) for name in counts + scores}
+    if out.features is not None:
+        kept["features"] = out.features.detach()
     return kept | {f"grad {name}": leaf.grad for name, leaf in leaves.items()}
 
 
@@ -40,8 +46,11 @@ def assert_identical(first: dict[str, torch.Tensor], second: dict[str, torch.Ten
         assert torch.equal(tensor, second[name]), name
 
 
-def test_threads_and_runs_do_not_change_a_bit(engine: CpuEngine, single_thread: None) -> None:
-    inputs = scenes.random_scene(3, **LARGE)
+@pytest.mark.parametrize("kind", [{}, {"features": 2, "offsets": True}], ids=["plain", "extras"])
+def test_threads_and_runs_do_not_change_a_bit(
+    engine: CpuEngine, single_thread: None, kind: dict
+) -> None:
+    inputs = replace(scenes.random_scene(3, **LARGE, **kind), absolute_gradient=bool(kind))
     thresholds = scenes.random_thresholds(3, LARGE["n"])
     alone = everything(engine, inputs, thresholds)
     assert_identical(alone, everything(engine, inputs, thresholds))

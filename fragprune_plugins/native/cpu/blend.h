@@ -7,6 +7,8 @@
 #pragma once
 
 #include <cstring>
+#include <optional>
+#include <vector>
 
 #include "projection.h"
 
@@ -80,19 +82,21 @@ inline Brush<Lanes> stage(const Splat* splats, const Tile& tile, int first, int 
   return b;
 }
 
-// Sets bit i + lane of each block that a lane's Gaussian reaches.
-inline void find_blocks(const Brush<Lanes>& b, int i, uint64_t* reached) {
-  const Lanes one = broadcast<Lanes>(1.f);
-  const Ellipse<Lanes> e = ellipse_of(b.scale, b.skew, b.down, b.log_opacity - b.list_cut);
+// Sets bit i + lane of each block that a lane's Gaussian reaches. Pixels are sampled up to `spread`
+// from their centres.
+inline void find_blocks(const Brush<Lanes>& b, float spread, int i, uint64_t* reached) {
+  const Lanes one = broadcast<Lanes>(1.f), away = broadcast<Lanes>(spread);
+  const Ellipse<Lanes> e = ellipse_of(b.scale, b.skew, b.down, b.log_opacity - b.list_cut, away);
   const Lanes top = ceil(b.y - e.half_height), bottom = floor(b.y + e.half_height);
+  const Lanes above = b.y - away, below = b.y + away;
   for (int row = 0; row < kBlockRows; row++) {
     const float first = static_cast<float>(row * kBlockHeight);
     const Lanes low = max(broadcast<Lanes>(first), top);
     const Lanes high = min(broadcast<Lanes>(first + (kBlockHeight - 1)), bottom);
     const Mask crosses = ge(high, low);
     if (!bits(crosses)) continue;
-    const Lanes right = floor(b.x + span_end(e, low - b.y, high - b.y, one));
-    const Lanes left = ceil(b.x + span_end(e, low - b.y, high - b.y, -one));
+    const Lanes right = floor(b.x + span_end(e, low - below, high - above, one));
+    const Lanes left = ceil(b.x + span_end(e, low - below, high - above, -one));
     const Mask some = both(crosses, ge(right, left));
     for (int column = 0; column < 4; column++) {
       const float from = static_cast<float>(column * kBlockWidth);
@@ -104,12 +108,12 @@ inline void find_blocks(const Brush<Lanes>& b, int i, uint64_t* reached) {
 }
 
 // Stages a word's worth of the list and finds its blocks' bits.
-inline void stage_word(const Splat* splats, const Tile& tile, int first, int at, Batch& batch,
-                       uint64_t* reached) {
+inline void stage_word(const Splat* splats, const Tile& tile, float spread, int first, int at,
+                       Batch& batch, uint64_t* reached) {
   std::memset(reached, 0, kBlocks * sizeof *reached);
   const int count = std::min(kWord, tile.length - first);
   for (int i = 0; i < count; i += kLanes)
-    find_blocks(stage(splats, tile, first + i, at + i, batch), i, reached);
+    find_blocks(stage(splats, tile, first + i, at + i, batch), spread, i, reached);
   if (count < kWord)
     for (int b = 0; b < kBlocks; b++) reached[b] &= (uint64_t{1} << count) - 1;
 }
@@ -128,12 +132,93 @@ struct TileCounts {
   int64_t drawn = 0, evaluated = 0;
 };
 
+// What some dialects want beyond the picture: more channels, samples beside the centres, scores.
+struct Extras {
+  const float* offsets;   // (H, W, 2); or NULL
+  const float* features;  // (N, feature_count)
+  int feature_count;
+  bool counts, scores;    // of each Gaussian
+
+  bool any() const { return offsets || feature_count || counts || scores; }
+};
+
+// Where the pixels of each block are sampled, from the tile's first pixel.
+struct Samples {
+  Lanes x[kBlocks], y[kBlocks];
+
+  Samples(const Tile& tile, int width, int height, const float* offsets) {
+    for (int b = 0; b < kBlocks; b++) {
+      x[b] = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
+      y[b] = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(b)));
+      for (int i = 0; offsets && i < kLanes; i++) {
+        const int column = tile.x + block_x(b) + i % kBlockWidth;
+        const int row = tile.y + block_y(b) + i / kBlockWidth;
+        if (column >= width || row >= height) continue;
+        const float* at = offsets + 2 * (static_cast<size_t>(row) * width + column);
+        x[b][i] += at[0], y[b][i] += at[1];
+      }
+    }
+  }
+};
+
+// Of each place of a tile's list: what its Gaussian drew there.
+struct EachDrawn {
+  std::vector<int32_t> fragments;
+  std::vector<float> weight;
+};
+
+// The extras' part of a block, and what it shares with its tile.
+struct ExtraPixels {
+  Lanes features[FRAGPRUNE_FEATURES_MAX];
+  Lanes most;       // weight
+  IntLanes winner;  // place in the list
+
+  void clear() {
+    for (Lanes& v : features) v = broadcast<Lanes>(0.f);
+    most = broadcast<Lanes>(0.f);
+    winner = broadcast_int(-1);
+  }
+
+  // One Gaussian, `row` its features, at a place of the list.
+  void blend(const Extras& extras, const float* row, int place, Lanes weight, Mask drawn,
+             EachDrawn& each) {
+    for (int k = 0; k < extras.feature_count; k++)
+      features[k] = fma(weight, broadcast<Lanes>(row[k]), features[k]);
+    if (extras.counts) each.fragments[place] += __builtin_popcount(bits(drawn));
+    if (extras.scores) {
+      winner = select(gt(weight, most), broadcast_int(place), winner);
+      most = max(weight, most);
+      each.weight[place] += sum(weight);
+    }
+  }
+};
+
+// A tile's extras while it is being blended.
+struct ExtraTile {
+  const Extras& extras;
+  const Samples samples;
+  ExtraPixels blocks[kBlocks];
+  EachDrawn each;
+
+  ExtraTile(const Extras& e, const Tile& tile, int width, int height)
+      : extras(e), samples(tile, width, height, e.offsets) {
+    for (ExtraPixels& block : blocks) block.clear();
+    if (extras.counts) each.fragments.resize(tile.length);
+    if (extras.scores) each.weight.resize(tile.length);
+  }
+  const float* row(const Splat* splats, const Tile& tile, int place) const {
+    if (!extras.feature_count) return nullptr;
+    return extras.features + size_t{splats[tile.list[place]].id} * extras.feature_count;
+  }
+};
+
 // Blends a batch, front to back, into one block: the Gaussians whose bit is set in words[0],
-// words[kBlocks], ... Returns how many it met. (Local copies of the pixels, one by one: a struct
-// would be copied in small pieces, which stalls the loads that follow.)
-template <bool kCountEach>
+// words[kBlocks], ... and each of them also by `also(j, weight, drawn)`. Returns how many it met.
+// (Local copies of the pixels, one by one: a struct would be copied in small pieces, which stalls
+// the loads that follow.)
+template <class Also>
 inline int blend_block(const Batch& batch, const uint64_t* words, int count, int first, Lanes px,
-                       Lanes py, BlockPixels& pixels, int32_t* drawn_each) {
+                       Lanes py, float alpha_max, BlockPixels& pixels, Also also) {
   const Lanes floor = broadcast<Lanes>(kTransmittanceMin);
   const Lanes tiny = broadcast<Lanes>(1e-30f);  // no denormal numbers: they are slow
   Lanes light = pixels.light, final_light = pixels.final_light;
@@ -147,7 +232,7 @@ inline int blend_block(const Batch& batch, const uint64_t* words, int count, int
       met++;
       const Lanes exponent = meet(b, px, py).exponent;
       const Mask inside = ge(exponent, broadcast<Lanes>(b.cut));
-      const Lanes alpha = where(inside, capped(exp2(exponent)));
+      const Lanes alpha = where(inside, capped(exp2(exponent), alpha_max));
       const Lanes after = fnma(light, alpha, light);
       const Mask alive = ge(after, floor);
       const Lanes weight = where(alive, alpha * light);
@@ -160,7 +245,7 @@ inline int blend_block(const Batch& batch, const uint64_t* words, int count, int
       g = fma(weight, broadcast<Lanes>(b.g), g);
       blue = fma(weight, broadcast<Lanes>(b.b), blue);
       inv_z = fma(weight, broadcast<Lanes>(b.inv_z), inv_z);
-      if (kCountEach) drawn_each[j] += __builtin_popcount(bits(drawn));
+      also(j, weight, drawn);
       if (!bits(alive)) {
         pixels.alive = false;
         break;
@@ -176,8 +261,9 @@ inline int blend_block(const Batch& batch, const uint64_t* words, int count, int
 struct Canvas {
   int width, height;
   float background[3];
-  float *image, *invdepth, *alpha;
-  int32_t* fragments;
+  float spread, alpha_max;
+  float *image, *invdepth, *alpha, *features;
+  int32_t *fragments, *winners;
 };
 
 // One number per pixel of a block, from block order to rows of the image.
@@ -212,6 +298,24 @@ inline void paint_block(const Canvas& c, int x0, int y0, const BlockPixels& p) {
   paint_plane(c.fragments, c.width, x0, y0, wide, high, drawn);
 }
 
+// `row_of` gives the row of the inputs for a place of the tile's list.
+template <class RowOf>
+inline void paint_extras(const Canvas& c, int x0, int y0, int features, const ExtraPixels& p,
+                         RowOf row_of) {
+  const int wide = std::min(kBlockWidth, c.width - x0);
+  const int high = std::min(kBlockHeight, c.height - y0);
+  for (int k = 0; c.features && k < features; k++) {
+    float values[kLanes];
+    store(values, p.features[k]);
+    float* plane = c.features + static_cast<size_t>(k) * c.width * c.height;
+    paint_plane(plane, c.width, x0, y0, wide, high, values);
+  }
+  int32_t winner[kLanes];
+  store(winner, p.winner);
+  for (int32_t& place : winner) place = place < 0 ? -1 : row_of(place);
+  paint_plane(c.winners, c.width, x0, y0, wide, high, winner);
+}
+
 // Lanes whose pixel lies in the image: all ones, the others 0.
 inline Lanes in_image(const Canvas& c, int x0, int y0) {
   float a[kLanes];
@@ -220,10 +324,10 @@ inline Lanes in_image(const Canvas& c, int x0, int y0) {
   return load(a);
 }
 
-// `reached` (kept for the backward pass) and `drawn_each` (per list entry) may be NULL.
-template <bool kCountEach>
+// `keep` and `reached`, for the backward pass, may be NULL; `extra` is, unless kExtra.
+template <bool kExtra>
 inline TileCounts blend_tile(const Splat* splats, const Tile& tile, const Canvas& canvas,
-                             TilePixels* keep, uint64_t* reached, int32_t* drawn_each) {
+                             TilePixels* keep, uint64_t* reached, ExtraTile* extra) {
   BlockPixels blocks[kBlocks];
   const Lanes zero = broadcast<Lanes>(0.f), lx = lane_x(), ly = lane_y();
   int alive = 0;
@@ -240,19 +344,34 @@ inline TileCounts blend_tile(const Splat* splats, const Tile& tile, const Canvas
     const int count = std::min(kBatch, tile.length - first);
     uint64_t* words = reached ? reached + static_cast<size_t>(first) / kWord * kBlocks : scratch;
     for (int base = 0; base < count; base += kWord)
-      stage_word(splats, tile, first + base, base, batch, words + base / kWord * kBlocks);
+      stage_word(splats, tile, canvas.spread, first + base, base, batch,
+                 words + base / kWord * kBlocks);
     for (int b = 0; b < kBlocks; b++) {
       if (!blocks[b].alive) continue;
-      const Lanes px = lx + broadcast<Lanes>(static_cast<float>(block_x(b)));
-      const Lanes py = ly + broadcast<Lanes>(static_cast<float>(block_y(b)));
-      counts.evaluated +=
-          kLanes * blend_block<kCountEach>(batch, words + b, count, first, px, py, blocks[b],
-                                           kCountEach ? drawn_each + first : nullptr);
+      int met;
+      if constexpr (kExtra) {
+        const auto also = [&, first](int j, Lanes weight, Mask drawn) {
+          const float* row = extra->row(splats, tile, first + j);
+          extra->blocks[b].blend(extra->extras, row, first + j, weight, drawn, extra->each);
+        };
+        met = blend_block(batch, words + b, count, first, extra->samples.x[b], extra->samples.y[b],
+                          canvas.alpha_max, blocks[b], also);
+      } else {
+        const Lanes px = lx + broadcast<Lanes>(static_cast<float>(block_x(b)));
+        const Lanes py = ly + broadcast<Lanes>(static_cast<float>(block_y(b)));
+        met = blend_block(batch, words + b, count, first, px, py, canvas.alpha_max, blocks[b],
+                          [](int, Lanes, Mask) {});
+      }
+      counts.evaluated += kLanes * met;
       alive -= !blocks[b].alive;
     }
   }
   for (int b = 0; b < kBlocks; b++) {
     paint_block(canvas, tile.x + block_x(b), tile.y + block_y(b), blocks[b]);
+    if (kExtra)
+      paint_extras(canvas, tile.x + block_x(b), tile.y + block_y(b), extra->extras.feature_count,
+                   extra->blocks[b],
+                   [&](int place) { return static_cast<int32_t>(splats[tile.list[place]].id); });
     int32_t drawn[kLanes];
     store(drawn, blocks[b].drawn);
     for (int i = 0; i < kLanes; i++) counts.drawn += drawn[i];
@@ -266,31 +385,52 @@ inline TileCounts blend_tile(const Splat* splats, const Tile& tile, const Canvas
 
 // ---- backward --------------------------------------------------------------------------------
 
-// What is wanted of the backward pass; each part that is not costs nothing.
-enum Want { kGeometry = 1, kColour = 2, kThreshold = 4, kDepth = 8 };
+// What is wanted of the backward pass; each part that is not costs nothing. kExtra, what some
+// dialects want, comes with all others but kThreshold.
+enum Want { kGeometry = 1, kColour = 2, kThreshold = 4, kDepth = 8, kExtra = 16 };
+constexpr int kWholeExtra = kExtra | kGeometry | kColour | kDepth;
 
-// Sums written per list entry, in this order, those that are wanted only.
+// Sums written per list entry, in this order, those that are wanted only; features come after them.
 constexpr int sums_of(int want) {
   return 1 + (want & kThreshold ? 1 : 0) + (want & kGeometry ? 5 : 0) + (want & kColour ? 3 : 0) +
-         (want & kDepth && want & kGeometry ? 1 : 0);
+         (want & kDepth && want & kGeometry ? 1 : 0) + (want & kExtra ? 1 : 0);
 }
+constexpr int kMostSums = sums_of(31) + FRAGPRUNE_FEATURES_MAX;
 
 struct LossPixels {  // block order
   alignas(64) float r[kPixels], g[kPixels], b[kPixels], inv_z[kPixels];
   alignas(64) float light[kPixels];   // transmittance behind the fragment in hand
   alignas(64) float behind[kPixels];  // gradient of all that lies behind it, weighted
+  alignas(64) float features[FRAGPRUNE_FEATURES_MAX][kPixels];
 };
 
-// What the backward pass needs to know of one Gaussian's rim.
+// What one backward pass is asked for beside the sums.
+struct Asked {
+  float per_fragment;   // dL/d(fragment)
+  float alpha_max;
+  bool cap_gradient;    // the gradient passes through the cap
+  Extras extras;
+  float width, height;  // of the image
+};
+
+// What the backward pass needs to know of one Gaussian's rim, and of all (here, that it need not be
+// read again and again).
 struct Rim {
   float list_cut, threshold, inv_opacity;
-  float per_fragment;  // dL/d(fragment)
+  float per_fragment, alpha_max;
+};
+
+// What kExtra needs of one Gaussian: its features, and factors on w u and w v for |gx| and |gy|.
+struct Beyond {
+  const float* features;
+  float along, across, down;
 };
 
 // One fragment of each lane, back to front. Skipped fragments leave light and behind untouched.
 template <int kWant>
-inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, int position, Lanes px,
-                          Lanes py, const int32_t* stops, int at, LossPixels& loss, Lanes* sums) {
+inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const Asked& asked,
+                          const Beyond& beyond, int position, Lanes px, Lanes py,
+                          const int32_t* stops, int at, LossPixels& loss, Lanes* sums) {
   const Meeting<Lanes> m = meet(brush, px, py);
   const Mask reached = both(ge(m.exponent, broadcast<Lanes>(rim.list_cut)),
                             gt(load(stops + at), broadcast_int(position)));
@@ -298,7 +438,7 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, int po
   const Mask drawn =
       kWant & kThreshold ? both(reached, ge(m.exponent, broadcast<Lanes>(brush.cut))) : reached;
   const Lanes one = broadcast<Lanes>(1.f);
-  const Lanes uncapped = exp2(m.exponent), full = capped(uncapped);
+  const Lanes uncapped = exp2(m.exponent), full = capped(uncapped, rim.alpha_max);
   const Lanes alpha = where(drawn, full);
   const Lanes inv = reciprocal(one - alpha);
   const Lanes light = load(loss.light + at) * inv;
@@ -311,11 +451,16 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, int po
     gz = load(loss.inv_z + at);
     shade = fma(gz, broadcast<Lanes>(brush.inv_z), shade);
   }
+  if (kWant & kExtra)
+    for (int k = 0; k < asked.extras.feature_count; k++)
+      shade = fma(load(loss.features[k] + at), broadcast<Lanes>(beyond.features[k]), shade);
   const Lanes weight = alpha * light;
   const Lanes by_alpha = fnma(behind, inv, light * shade);
   store(loss.light + at, light);
   store(loss.behind + at, fma(weight, shade, behind));
-  const Lanes w = where(drawn, uncapped * by_alpha);  // straight through the cap
+  Lanes w = where(drawn, uncapped * by_alpha);  // straight through the cap
+  if (kWant & kExtra && !asked.cap_gradient)
+    w = where(ge(broadcast<Lanes>(rim.alpha_max), uncapped), w);
   int k = 0;
   sums[k] = sums[k] + w, k++;
   if (kWant & kThreshold) {
@@ -342,6 +487,14 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, int po
     sums[k] = fma(weight, gb, sums[k]), k++;
   }
   if (kWant & kDepth && kWant & kGeometry) sums[k] = fma(weight, gz, sums[k]), k++;
+  if (kWant & kExtra) {
+    const Lanes wu = w * m.u, wv = w * m.v;
+    const Lanes gx = broadcast<Lanes>(beyond.along) * wu;
+    const Lanes gy = fma(broadcast<Lanes>(beyond.across), wu, broadcast<Lanes>(beyond.down) * wv);
+    sums[k] = sums[k] + abs(gx) + abs(gy), k++;
+    for (int f = 0; f < asked.extras.feature_count; f++, k++)
+      sums[k] = fma(weight, load(loss.features[f] + at), sums[k]);
+  }
 }
 
 // Turns one word of bits per block into one word of blocks per Gaussian, leaving out what lies
@@ -358,17 +511,23 @@ inline void transpose_bits(const uint64_t* reached, const int32_t* last_stop, in
   }
 }
 
-// Writes sums_of(kWant) numbers per entry of the list at `out + slot * sums_of(kWant)`.
+// Writes sums_of(kWant) numbers and the features' per entry of the list, at `out` + slot times their
+// number.
 template <int kWant>
 inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels& kept,
-                         const uint64_t* reached, const uint32_t* slots, float per_fragment,
+                         const uint64_t* reached, const uint32_t* slots, const Asked& asked,
                          LossPixels& loss, float* out) {
-  constexpr int n = sums_of(kWant);
+  constexpr int base = sums_of(kWant), most = kWant & kExtra ? kMostSums : base;
+  const int n = kWant & kExtra ? base + asked.extras.feature_count : base;
   Lanes xs[4], ys[kBlockRows];  // of each column and row of blocks
   for (int b = 0; b < 4; b++)
     xs[b] = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
   for (int b = 0; b < kBlockRows; b++)
     ys[b] = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(4 * b)));
+  std::optional<Samples> samples;
+  if (kWant & kExtra)
+    samples.emplace(tile, static_cast<int>(asked.width), static_cast<int>(asked.height),
+                    asked.extras.offsets);
   int32_t last_stop[kBlocks], end = 0;
   for (int b = 0; b < kBlocks; b++) {
     last_stop[b] = *std::max_element(kept.stop + b * kLanes, kept.stop + (b + 1) * kLanes);
@@ -390,16 +549,31 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
       const Splat& s = splats[tile.list[first + j]];
       const LocalBrush<float> brush =
           localize(s.brush, static_cast<float>(tile.x), static_cast<float>(tile.y));
-      const Rim at = {s.brush.list_cut, s.threshold, s.inv_opacity, per_fragment};
-      Lanes sums[n];
+      const Rim rim = {s.brush.list_cut, s.threshold, s.inv_opacity, asked.per_fragment,
+                       asked.alpha_max};
+      Beyond beyond = {};
+      if (kWant & kExtra) {  // dL/dx = w u times the first, and so on
+        const float x = asked.width / kLog2E, y = asked.height / kLog2E;
+        beyond = {asked.extras.features + size_t{s.id} * asked.extras.feature_count,
+                  x * brush.scale, y * brush.skew, y * brush.down};
+      }
+      Lanes sums[most];
       for (Lanes& v : sums) v = broadcast<Lanes>(0.f);
       for (; todo; todo &= todo - 1) {
         const int b = __builtin_ctzll(todo);
-        unblend_block<kWant>(brush, at, first + j, xs[b % 4], ys[b / 4], kept.stop, b * kLanes,
+        unblend_block<kWant>(brush, rim, asked, beyond, first + j,
+                             kWant & kExtra ? samples->x[b] : xs[b % 4],
+                             kWant & kExtra ? samples->y[b] : ys[b / 4], kept.stop, b * kLanes,
                              loss, sums);
       }
       float* to = place(first + j);
-      sum_each<n>(sums, to);
+      if (!(kWant & kExtra)) {
+        sum_each<base>(sums, to);
+      } else {
+        float all[most];
+        sum_each<most>(sums, all);
+        std::copy(all, all + n, to);
+      }
     }
   }
 }

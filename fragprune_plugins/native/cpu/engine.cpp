@@ -2,8 +2,10 @@
 
 #include <array>
 #include <chrono>
+#include <cmath>
 #include <cstdio>
 #include <new>
+#include <optional>
 #include <stdexcept>
 #include <utility>
 
@@ -18,6 +20,7 @@ struct fragprune_state {
   fp::Memory memory;
   fragprune_inputs in;
   fp::Camera<float> camera;
+  fp::Extras extras;
   fp::Scene scene;  // what backward needs of it
   fp::TileLists lists;
   fp::Buffer<size_t> words;           // per tile: where its bits begin
@@ -37,31 +40,80 @@ Tile tile_at(const Camera<float>& c, const TileLists& lists, size_t t) {
           lists.splat.data() + first, static_cast<int>(lists.first[t + 1] - first)};
 }
 
-void draw(Team& team, const Camera<float>& c, const fragprune_inputs& in,
-          const Buffer<Splat>& splats, const TileLists& lists, fragprune_outputs& out, fragprune_state* keep) {
+// Sums of weights, the same in any order: whole numbers, a pixel's whole light being `one`.
+class Weights {
+ public:
+  Weights(const Memory& memory, const fragprune_inputs& in)
+      : sums_(memory, static_cast<size_t>(in.count)),
+        one_(std::ldexp(1., 62 - std::ilogb(2. * in.width * in.height))) {
+    std::fill_n(sums_.data(), sums_.size(), 0);
+  }
+  void add(uint32_t row, float weight) {
+    const auto whole = static_cast<uint64_t>(weight * one_);
+    __atomic_fetch_add(&sums_[row], whole, __ATOMIC_RELAXED);
+  }
+  void write(float* to) const {
+    for (size_t i = 0; i < sums_.size(); i++)
+      to[i] = static_cast<float>(static_cast<double>(sums_[i]) / one_);
+  }
+
+ private:
+  Buffer<uint64_t> sums_;
+  double one_;
+};
+
+Extras extras_of(const fragprune_inputs& in, const fragprune_outputs& out) {
+  const bool scores = out.weights_per_gaussian || out.wins_per_gaussian || out.winners;
+  return {in.sample_offsets, in.features, out.features ? in.feature_count : 0,
+          out.fragments_per_gaussian != nullptr, scores};
+}
+
+// Adds what a tile found out about each Gaussian.
+void add_up(const ExtraTile& found, const Tile& tile, const Splat* splats,
+            const fragprune_outputs& out, Weights* weights) {
+  const auto add = [](int32_t* to, uint32_t row, int32_t n) {
+    __atomic_fetch_add(to + row, n, __ATOMIC_RELAXED);
+  };
+  for (int j = 0; j < tile.length; j++) {
+    const uint32_t row = splats[tile.list[j]].id;
+    if (found.extras.counts && found.each.fragments[j])
+      add(out.fragments_per_gaussian, row, found.each.fragments[j]);
+    if (weights && found.each.weight[j] > 0) weights->add(row, found.each.weight[j]);
+  }
+  for (int b = 0; out.wins_per_gaussian && b < kBlocks; b++)
+    for (int i = 0; i < kLanes; i++)
+      if (const int place = found.blocks[b].winner[i]; place >= 0)
+        add(out.wins_per_gaussian, splats[tile.list[place]].id, 1);
+}
+
+void draw(Team& team, const Memory& memory, const Camera<float>& c, const fragprune_inputs& in,
+          const Extras& extras, const Buffer<Splat>& splats, const TileLists& lists,
+          fragprune_outputs& out, fragprune_state* keep) {
   const float* back = in.background;
-  const Canvas canvas{in.width,  in.height,    {back[0], back[1], back[2]},
-                      out.image, out.invdepth, out.alpha, out.fragments};
-  const size_t tiles = lists.tiles();
+  const Canvas canvas{in.width,     in.height,    {back[0], back[1], back[2]},
+                      c.spread,     in.alpha_max, out.image,
+                      out.invdepth, out.alpha,    out.features,
+                      out.fragments, out.winners};
+  const size_t tiles = lists.tiles(), n = static_cast<size_t>(in.count);
+  std::optional<Weights> weights;
+  if (out.weights_per_gaussian) weights.emplace(memory, in);
+  for (int32_t* counts : {out.fragments_per_gaussian, out.wins_per_gaussian})
+    if (counts) std::fill_n(counts, n, 0);
   std::atomic<int64_t> drawn{0}, evaluated{0};
   team.each(tiles, 1, [&](size_t t, size_t) {
     const Tile tile = tile_at(c, lists, t);
     TilePixels* pixels = keep ? &keep->pixels[t] : nullptr;
     uint64_t* reached = keep ? keep->reached.data() + keep->words[t] : nullptr;
-    TileCounts counts;
-    if (out.fragments_per_gaussian) {
-      std::vector<int32_t> each(tile.length, 0);
-      counts = blend_tile<true>(splats.data(), tile, canvas, pixels, reached, each.data());
-      for (int j = 0; j < tile.length; j++)
-        if (each[j])
-          __atomic_fetch_add(out.fragments_per_gaussian + splats[tile.list[j]].id, each[j],
-                             __ATOMIC_RELAXED);
-    } else {
-      counts = blend_tile<false>(splats.data(), tile, canvas, pixels, reached, nullptr);
-    }
+    std::unique_ptr<ExtraTile> extra;
+    if (extras.any()) extra = std::make_unique<ExtraTile>(extras, tile, in.width, in.height);
+    const auto blend = extra ? blend_tile<true> : blend_tile<false>;
+    const TileCounts counts =
+        blend(splats.data(), tile, canvas, pixels, reached, extra.get());
+    if (extra) add_up(*extra, tile, splats.data(), out, weights ? &*weights : nullptr);
     drawn.fetch_add(counts.drawn, std::memory_order_relaxed);
     evaluated.fetch_add(counts.evaluated, std::memory_order_relaxed);
   });
+  if (weights) weights->write(out.weights_per_gaussian);
   out.drawn = drawn;
   out.evaluated = evaluated;
 }
@@ -93,11 +145,11 @@ void prepare(fragprune_state& keep, const TileLists& lists) {
   keep.pixels = Buffer<TilePixels>(keep.memory, tiles);
 }
 
-void forward(const fragprune_inputs& in, fragprune_outputs& out, const Memory& memory,
-             fragprune_state* keep) {
+void forward(const fragprune_inputs& in, float spread, fragprune_outputs& out,
+             const Memory& memory, fragprune_state* keep) {
   Clock clock;
   Team team(in.threads);
-  const Camera<float> camera = unpack_camera(in);
+  const Camera<float> camera = unpack_camera(in, spread);
   // A state holds on to its memory until the backward pass is done, which then wants more: what the
   // forward pass alone needed goes back to the system first, lest both lie idle in turns.
   Memory scratch = keep ? std::make_shared<Pool>() : memory;
@@ -108,13 +160,13 @@ void forward(const fragprune_inputs& in, fragprune_outputs& out, const Memory& m
   scene.drop_reach();
   scratch.reset();
   out.binning_ms = clock.lap();
-  if (out.fragments_per_gaussian)
-    std::fill_n(out.fragments_per_gaussian, static_cast<size_t>(in.count), 0);
   if (keep) prepare(*keep, lists);
-  draw(team, camera, in, scene.splats, lists, out, keep);
+  const Extras extras = extras_of(in, out);
+  draw(team, memory, camera, in, extras, scene.splats, lists, out, keep);
   if (keep) {
     keep->in = in;
     keep->camera = camera;
+    keep->extras = extras;
     keep->scene = std::move(scene);
     keep->lists = std::move(lists);
   }
@@ -149,7 +201,7 @@ void load_plane(const Camera<float>& c, const Tile& tile, const float* plane, fl
 }
 
 // Brings a tile's loss gradients into block order and starts the walk from the last fragment.
-void load_losses(const Camera<float>& c, const Losses& from, const Tile& tile,
+void load_losses(const Camera<float>& c, const Losses& from, int features, const Tile& tile,
                  const TilePixels& kept, LossPixels& to, double* by_background) {
   const float* image = from.grads.image;
   float alpha[kPixels];
@@ -158,6 +210,10 @@ void load_losses(const Camera<float>& c, const Losses& from, const Tile& tile,
   load_plane(c, tile, image ? image + 2 * from.plane : nullptr, to.b);
   load_plane(c, tile, from.grads.invdepth, to.inv_z);
   load_plane(c, tile, from.grads.alpha, alpha);
+  for (int k = 0; k < features; k++) {
+    const float* planes = from.grads.features;
+    load_plane(c, tile, planes ? planes + k * from.plane : nullptr, to.features[k]);
+  }
   Lanes sums[3] = {};
   for (int i = 0; i < kPixels; i += kLanes) {
     const Lanes light = load(kept.transmittance + i);
@@ -173,11 +229,17 @@ void load_losses(const Camera<float>& c, const Losses& from, const Tile& tile,
 }
 
 using UnblendTile = void (*)(const Splat*, const Tile&, const TilePixels&, const uint64_t*,
-                             const uint32_t*, float, LossPixels&, float*);
+                             const uint32_t*, const Asked&, LossPixels&, float*);
 
 template <size_t... kWants>
 constexpr std::array<UnblendTile, sizeof...(kWants)> unblenders(std::index_sequence<kWants...>) {
   return {unblend_tile<static_cast<int>(kWants)>...};
+}
+
+UnblendTile unblender(int want) {
+  static constexpr auto table = unblenders(std::make_index_sequence<16>());
+  if (!(want & kExtra)) return table[want];
+  return want & kThreshold ? unblend_tile<kWholeExtra | kThreshold> : unblend_tile<kWholeExtra>;
 }
 
 PixelSums<Lanes> unpack_sums(const Lanes* v, int want) {
@@ -187,6 +249,7 @@ PixelSums<Lanes> unpack_sums(const Lanes* v, int want) {
   if (want & kGeometry) s.u = *v++, s.v = *v++, s.uu = *v++, s.uv = *v++, s.vv = *v++;
   if (want & kColour) s.r = *v++, s.g = *v++, s.b = *v++;
   if (want & kDepth && want & kGeometry) s.inv_z = *v++;
+  if (want & kExtra) s.absolute = *v++;
   return s;
 }
 
@@ -205,6 +268,11 @@ struct Picked {
         to[static_cast<size_t>(ids[lane]) * kWidth + k] = values[k][lane];
   }
   void write(float* to, const Vec<Lanes>& v) const { write<3>(to, &v.x); }
+  void write(float* to, const Lanes* column, int width) const {
+    for (int k = 0; to && k < width; k++)
+      for (int lane = 0; lane < count; lane++)
+        to[static_cast<size_t>(ids[lane]) * width + k] = column[k][lane];
+  }
 };
 
 // From the sums over pixels to the inputs.
@@ -214,8 +282,9 @@ class Chain {
       : in_(state.in), to_(to), want_(want), c_(lift<Lanes>(state.camera)),
         means_(in_.means, in_.count), scales_(in_.scales, in_.count) {}
 
-  void run(const Picked& who, const PixelSums<Lanes>& sums) const {
+  void run(const Picked& who, const PixelSums<Lanes>& sums, const Lanes* features) const {
     who.write<1>(to_.thresholds, &sums.threshold);
+    who.write(to_.features, features, in_.feature_count);
     if (to_.opacities) {  // alpha is proportional to it
       Lanes opacity;
       for (int i = 0; i < kLanes; i++) opacity[i] = in_.opacities[who.ids[i]];
@@ -223,6 +292,7 @@ class Chain {
       who.write<1>(to_.opacities, &by_opacity);
     }
     who.write(to_.colors, {sums.r, sums.g, sums.b});
+    if (in_.means2d) return footprint(who, sums);
     const bool by_colour = in_.sh && want_ & kColour;
     if (!(want_ & kGeometry) && !by_colour) return;
     Given<Lanes> given;
@@ -233,6 +303,28 @@ class Chain {
   }
 
  private:
+  void hook(const Picked& who, Lanes x, Lanes y, const PixelSums<Lanes>& sums) const {
+    const Lanes absolute = in_.absolute_gradient ? sums.absolute : broadcast<Lanes>(0.f);
+    who.write(to_.hook, {x * 0.5f * c_.width, y * 0.5f * c_.height, absolute});
+  }
+
+  // All that is left of a Gaussian that was given on the image.
+  void footprint(const Picked& who, const PixelSums<Lanes>& sums) const {
+    if (!(want_ & kGeometry)) return;
+    Lanes conic[3], depth;
+    for (int i = 0; i < kLanes; i++) {
+      for (size_t k = 0; k < 3; k++) conic[k][i] = in_.conics[size_t{3} * who.ids[i] + k];
+      depth[i] = in_.depths[who.ids[i]];
+    }
+    const Square<Lanes> square = square_of(conic[0], conic[1], conic[2]);
+    const FootprintGradient<Lanes> g = footprint_gradient(square, sums);
+    hook(who, g.x, g.y, sums);
+    who.write<2>(to_.means2d, &g.x);
+    who.write<3>(to_.conics, &g.xx);
+    const Lanes by_depth = -sums.inv_z / (depth * depth);
+    who.write<1>(to_.depths, &by_depth);
+  }
+
   // Writes dL/dsh, returns dL/dmean through the direction.
   Vec<Lanes> colour(const Picked& who, const Vec<Lanes>& mean, const PixelSums<Lanes>& sums) const {
     const bool by_direction = to_.means && in_.sh_degree > 0;
@@ -290,8 +382,7 @@ class Chain {
     Projection<Lanes> p;
     project(c_, given, p);
     const ImageGradient<Lanes> g = image_gradient(c_, p, sums);
-    who.write(to_.means2d,
-              {g.x * 0.5f * c_.width, g.y * 0.5f * c_.height, broadcast<Lanes>(0.f)});
+    hook(who, g.x, g.y, sums);
     Mat3<Lanes> m;
     Vec<Lanes> view = shape_gradient(c_, p, shape_of(c_, given), g, m);
     view.z = view.z - sums.inv_z / (p.view.z * p.view.z);
@@ -325,7 +416,7 @@ class Chain {
 
 // A slot's sums, and what happens to lie behind them.
 typedef float Record __attribute__((vector_size(64)));
-static_assert(sums_of(15) <= 16, "fits a Record");
+static_assert(sums_of(15) <= 16 && kMostSums <= 32, "fits a Record, or two");
 
 Record load_record(const float* from) {
   Record r;
@@ -345,14 +436,24 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
   const TileLists& lists = state.lists;
   Team team(threads);
   int want = 0;
-  if (to.means || to.means2d || to.scales || to.rotations || to.cov3d) want |= kGeometry;
+  if (to.means || to.hook || to.scales || to.rotations || to.cov3d || to.means2d || to.conics ||
+      to.depths)
+    want |= kGeometry;
   if (to.sh || to.colors || (to.means && in.sh && in.sh_degree > 0)) want |= kColour;
   if (to.thresholds) want |= kThreshold;
   if (grads.invdepth) want |= kDepth;
+  Extras extras = state.extras;
+  extras.feature_count = grads.features || to.features ? in.feature_count : 0;
+  if (extras.feature_count || extras.offsets || !in.cap_gradient ||
+      (to.hook && in.absolute_gradient))
+    want |= kWholeExtra;
   const size_t n = static_cast<size_t>(in.count), sh_size = 3 * size_t(in.sh_coefficients);
   const GradientRows arrays[] = {
-      {to.means, 3}, {to.means2d, 3},  {to.opacities, 1}, {to.scales, 3},    {to.rotations, 4},
-      {to.cov3d, 6}, {to.sh, sh_size}, {to.colors, 3},    {to.thresholds, 1}};
+      {to.means, 3},      {to.hook, 3},       {to.opacities, 1},
+      {to.scales, 3},     {to.rotations, 4},  {to.cov3d, 6},
+      {to.sh, sh_size},   {to.colors, 3},     {to.features, size_t(in.feature_count)},
+      {to.thresholds, 1}, {to.means2d, 2},    {to.conics, 3},
+      {to.depths, 1}};
   bool per_gaussian = false;
   for (const GradientRows& rows : arrays) per_gaussian |= rows.data != nullptr;
   const auto clear = [&](size_t begin, size_t end) {  // of Gaussians that draw nothing
@@ -361,24 +462,26 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
         std::fill(rows.data + begin * rows.width, rows.data + end * rows.width, 0.f);
   };
 
-  static constexpr auto table = unblenders(std::make_index_sequence<16>());
-  const int size = sums_of(want);
+  const UnblendTile unblend = unblender(want);
+  const int size = sums_of(want) + extras.feature_count;
   const size_t tiles = lists.tiles();
   const Losses losses{grads,
                       {in.background[0], in.background[1], in.background[2]},
                       static_cast<size_t>(in.width) * in.height};
   const float pixels = static_cast<float>(losses.plane);
-  const float per_fragment = grads.fragments_per_pixel / pixels;
-  Buffer<float> sums(state.memory, per_gaussian ? lists.splat.size() * size + 16 : 0);
+  const Asked asked{grads.fragments_per_pixel / pixels, in.alpha_max,        in.cap_gradient != 0,
+                    extras,                             state.camera.width,  state.camera.height};
+  Buffer<float> sums(state.memory, per_gaussian ? lists.splat.size() * size + 32 : 0);
   Buffer<double> by_background(state.memory, 3 * tiles);
   team.each(tiles, 1, [&](size_t t, size_t) {
     const Tile tile = tile_at(state.camera, lists, t);
     LossPixels loss;
-    load_losses(state.camera, losses, tile, state.pixels[t], loss, &by_background[3 * t]);
+    load_losses(state.camera, losses, extras.feature_count, tile, state.pixels[t], loss,
+                &by_background[3 * t]);
     if (per_gaussian)
-      table[want](state.scene.splats.data(), tile, state.pixels[t],
-                  state.reached.data() + state.words[t], lists.slot.data() + lists.first[t],
-                  per_fragment, loss, sums.data());
+      unblend(state.scene.splats.data(), tile, state.pixels[t],
+              state.reached.data() + state.words[t], lists.slot.data() + lists.first[t], asked,
+              loss, sums.data());
   });
   if (to.background)
     for (int k = 0; k < 3; k++) {
@@ -394,10 +497,10 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
     size_t row = begin;  // the first whose gradients are not written yet
     Picked who;
     who.count = 0;
-    Lanes total[sums_of(15)] = {};
+    Lanes total[kMostSums] = {};
     const auto flush = [&] {
       for (int lane = who.count; lane < kLanes; lane++) who.ids[lane] = who.ids[who.count - 1];
-      chain.run(who, unpack_sums(total, want));
+      chain.run(who, unpack_sums(total, want), total + sums_of(want));
       who.count = 0;
     };
     for (size_t k = begin; k < end; k++) {
@@ -408,9 +511,12 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
       row = i + 1;
       const float* v = sums.data() + static_cast<size_t>(from) * size;
       const float* last = sums.data() + static_cast<size_t>(until) * size;
-      Record mine = {};
-      for (; v < last; v += size) mine = mine + load_record(v);
-      for (int s = 0; s < size; s++) total[s][who.count] = mine[s];
+      Record mine = {}, more = {};
+      for (; v < last; v += size) {
+        mine = mine + load_record(v);
+        if (size > 16) more = more + load_record(v + 16);
+      }
+      for (int s = 0; s < size; s++) total[s][who.count] = s < 16 ? mine[s] : more[s - 16];
       who.ids[who.count++] = static_cast<uint32_t>(i);
       if (who.count == kLanes) flush();
     }
@@ -426,24 +532,76 @@ int fail(fragprune_error* error, int status, const char* message) {
   return status;
 }
 
-const char* fault_of(const fragprune_inputs* in, const fragprune_outputs* out) {
-  if (!in || in->size != sizeof *in || !out || out->size != sizeof *out)
-    return "structs of another version of fragprune.h";
-  if (in->width < 1 || in->height < 1 || in->width > 1 << 16 || in->height > 1 << 16)
-    return "width and height must be 1 to 65536 pixels";
-  if (in->count < 0 || in->count > INT32_MAX) return "count must be 0 to 2^31 - 1";
-  if (!in->viewmatrix || !in->projmatrix || !in->campos || !in->background)
-    return "viewmatrix, projmatrix, campos and background are needed";
-  if (!out->image || (in->count && !out->radii)) return "image and radii are needed";
+constexpr int kMostThreads = 1024, kMostCoefficients = 1024;
+constexpr const char* kTooManyThreads = "threads must be at most 1024";
+
+const char* footprints_fault_of(const fragprune_inputs* in) {
+  if (in->means || in->scales || in->rotations || in->cov3d || in->sh)
+    return "with means2d, neither means, scales, rotations, cov3d nor sh may be given";
+  if (in->count == 0) return nullptr;
+  if (!in->conics || !in->depths || !in->tiles || !in->opacities || !in->colors)
+    return "with means2d, conics, depths, tiles, opacities and colors are needed";
+  if (!in->features != !in->feature_count) return "features and feature_count do not agree";
+  return nullptr;
+}
+
+const char* splats_fault_of(const fragprune_inputs* in) {
+  if (!in->viewmatrix || !in->projmatrix || !in->campos)
+    return "viewmatrix, projmatrix and campos are needed";
   if (in->count == 0) return nullptr;
   if (!in->means || !in->opacities) return "means and opacities are needed";
   if (!in->scales != !in->rotations || !in->scales == !in->cov3d)
     return "either scales and rotations or cov3d is needed";
   if (!in->sh == !in->colors) return "either sh or colors is needed";
   if (in->sh && (in->sh_degree < 0 || in->sh_degree > 3 ||
-                 in->sh_coefficients < (in->sh_degree + 1) * (in->sh_degree + 1)))
-    return "sh_degree must be 0 to 3, with (sh_degree + 1)^2 coefficients at least";
+                 in->sh_coefficients < (in->sh_degree + 1) * (in->sh_degree + 1) ||
+                 in->sh_coefficients > kMostCoefficients))
+    return "sh_degree must be 0 to 3, sh_coefficients (sh_degree + 1)^2 to 1024";
+  if (!in->features != !in->feature_count) return "features and feature_count do not agree";
   return nullptr;
+}
+
+const char* fault_of(const fragprune_inputs* in, const fragprune_outputs* out) {
+  if (!in || in->size != sizeof *in || !out || out->size != sizeof *out)
+    return "structs of another version of fragprune.h";
+  if (in->width < 1 || in->height < 1 || in->width > 1 << 16 || in->height > 1 << 16)
+    return "width and height must be 1 to 65536 pixels";
+  if (in->count < 0 || in->count > INT32_MAX) return "count must be 0 to 2^31 - 1";
+  if (in->threads > kMostThreads) return kTooManyThreads;
+  if (!in->background) return "background is needed";
+  if (!out->image || (in->count && !out->radii)) return "image and radii are needed";
+  if (!(in->near >= 0)) return "near must be 0 or more";
+  if (!(in->alpha_max >= static_cast<float>(FRAGPRUNE_ALPHA_MIN) && in->alpha_max <= 1))
+    return "alpha_max must be 1/255 to 1";
+  if (in->compensation < FRAGPRUNE_NO_COMPENSATION || in->compensation > FRAGPRUNE_MIP)
+    return "compensation must be one of enum fragprune_compensation";
+  if (in->feature_count < 0 || in->feature_count > FRAGPRUNE_FEATURES_MAX)
+    return "feature_count must be 0 to 8";
+  if (out->features && !in->feature_count) return "features are wanted, but feature_count is 0";
+  return in->means2d ? footprints_fault_of(in) : splats_fault_of(in);
+}
+
+bool wants_absent(const fragprune_inputs& in, const fragprune_input_grads& to) {
+  const std::pair<const void*, const void*> pairs[] = {
+      {to.means, in.means},   {to.scales, in.scales},     {to.rotations, in.rotations},
+      {to.cov3d, in.cov3d},   {to.sh, in.sh},             {to.colors, in.colors},
+      {to.means2d, in.means2d}, {to.conics, in.conics},   {to.depths, in.depths},
+      {to.features, in.features}, {to.opacities, in.opacities}};
+  for (const auto& [wanted, given] : pairs)
+    if (wanted && !given && in.count) return true;
+  return false;
+}
+
+// The largest of |sample_offsets|; NaN where one is none.
+float spread_of(const fragprune_inputs& in) {
+  float most = 0;
+  const size_t count = in.sample_offsets ? size_t{2} * in.width * in.height : 0;
+  for (size_t i = 0; i < count; i++) {
+    const float size = abs(in.sample_offsets[i]);
+    if (!(size <= 1e6f)) return std::nanf("");
+    most = max(most, size);
+  }
+  return most;
 }
 
 template <class Work>
@@ -471,12 +629,15 @@ int fragprune_forward(const fragprune_inputs* inputs, fragprune_outputs* outputs
   if (state) *state = nullptr;
   if (const char* fault = fp::fault_of(inputs, outputs))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fault);
+  const float spread = fp::spread_of(*inputs);
+  if (!(spread >= 0))
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, "sample_offsets must be at most 10^6 pixels");
   return fp::guarded(error, [&] {
     const fp::Memory memory =
         inputs->workspace ? inputs->workspace->memory : std::make_shared<fp::Pool>();
     std::unique_ptr<fragprune_state> keep(state ? new fragprune_state : nullptr);
     if (keep) keep->memory = memory;
-    fp::forward(*inputs, *outputs, memory, keep.get());
+    fp::forward(*inputs, spread, *outputs, memory, keep.get());
     if (state) *state = keep.release();
   });
 }
@@ -489,8 +650,9 @@ int fragprune_backward(const fragprune_state* state, const fragprune_output_grad
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, "structs of another version of fragprune.h");
   if (input_grads->thresholds && !(state->in.thresholds && state->in.widen))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, "the forward pass did not widen for thresholds");
-  if ((input_grads->sh && !state->in.sh) || (input_grads->cov3d && !state->in.cov3d) ||
-      ((input_grads->scales || input_grads->rotations) && !state->in.scales))
+  if (threads > fp::kMostThreads)
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kTooManyThreads);
+  if (fp::wants_absent(state->in, *input_grads))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, "a gradient of something that was not given");
   return fp::guarded(error, [&] { fp::backward(*state, *output_grads, *input_grads, threads); });
 }

@@ -10,7 +10,6 @@
 namespace fp {
 
 constexpr float kLog2E = 1.44269504088896341f;
-constexpr float kAlphaMax = static_cast<float>(FRAGPRUNE_ALPHA_MAX);
 constexpr float kTransmittanceMin = static_cast<float>(FRAGPRUNE_TRANSMITTANCE_MIN);
 
 // What blending reads of one Gaussian in one view, and nothing else.
@@ -64,8 +63,8 @@ FP_HD inline Meeting<V> meet(const LocalBrush<float>& b, V px, V py) {
 }
 
 template <class V>
-FP_HD inline V capped(V alpha) {
-  return min(alpha, broadcast<V>(kAlphaMax));
+FP_HD inline V capped(V alpha, float alpha_max) {
+  return min(alpha, broadcast<V>(alpha_max));
 }
 
 // Density of the logistic at the rim, s(1-s)/w with s = sigmoid(away/w), away = |falloff - tau|.

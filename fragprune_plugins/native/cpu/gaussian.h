@@ -69,14 +69,22 @@ struct Camera {
   V limit_x, limit_y;                 // where x/z and y/z stop in the Jacobian
   V width, height;                    // pixels
   V tiles_x, tiles_y;
-  V scale_modifier, dilation;
-  bool antialiasing;
+  V scale_modifier, dilation, near;
+  V spread;                           // how far from its centre a pixel is sampled at most
+  int32_t compensation;               // enum fragprune_compensation
 };
 
-FP_HD inline Camera<float> unpack_camera(const fragprune_inputs& in) {
+// `spread` is the largest of |sample_offsets|.
+FP_HD inline Camera<float> unpack_camera(const fragprune_inputs& in, float spread) {
   const float *v = in.viewmatrix, *p = in.projmatrix;
   const float margin = static_cast<float>(FRAGPRUNE_FRUSTUM_MARGIN);
-  Camera<float> c;
+  Camera<float> c = Camera<float>();
+  c.width = static_cast<float>(in.width);
+  c.height = static_cast<float>(in.height);
+  c.tiles_x = static_cast<float>((in.width + FRAGPRUNE_TILE - 1) / FRAGPRUNE_TILE);
+  c.tiles_y = static_cast<float>((in.height + FRAGPRUNE_TILE - 1) / FRAGPRUNE_TILE);
+  c.spread = spread;
+  if (in.means2d) return c;
   c.to_x = {v[0], v[4], v[8]};
   c.to_y = {v[1], v[5], v[9]};
   c.to_z = {v[2], v[6], v[10]};
@@ -86,17 +94,14 @@ FP_HD inline Camera<float> unpack_camera(const fragprune_inputs& in) {
   c.clip_w = {p[3], p[7], p[11]};
   c.clip_0 = {p[12], p[13], p[15]};
   c.centre = read3(in.campos);
-  c.width = static_cast<float>(in.width);
-  c.height = static_cast<float>(in.height);
   c.focal_x = c.width / (2 * in.tan_fov_x);
   c.focal_y = c.height / (2 * in.tan_fov_y);
   c.limit_x = margin * in.tan_fov_x;
   c.limit_y = margin * in.tan_fov_y;
-  c.tiles_x = static_cast<float>((in.width + FRAGPRUNE_TILE - 1) / FRAGPRUNE_TILE);
-  c.tiles_y = static_cast<float>((in.height + FRAGPRUNE_TILE - 1) / FRAGPRUNE_TILE);
   c.scale_modifier = in.scale_modifier;
   c.dilation = in.dilation;
-  c.antialiasing = in.antialiasing != 0;
+  c.near = in.near;
+  c.compensation = in.compensation;
   return c;
 }
 
@@ -107,7 +112,8 @@ FP_HD inline Camera<V> lift(const Camera<float>& c) {
           lift<V>(c.clip_x), lift<V>(c.clip_y), lift<V>(c.clip_w), lift<V>(c.clip_0),
           lift<V>(c.centre), up(c.focal_x),     up(c.focal_y),     up(c.limit_x),
           up(c.limit_y),     up(c.width),       up(c.height),      up(c.tiles_x),
-          up(c.tiles_y),     up(c.scale_modifier), up(c.dilation), c.antialiasing};
+          up(c.tiles_y),     up(c.scale_modifier), up(c.dilation), up(c.near),
+          up(c.spread),      c.compensation};
 }
 
 template <class V>
@@ -253,8 +259,7 @@ FP_HD inline MaskOf<V> host_extent(const Camera<V>& c, Projection<V>& p) {
 
 template <class V>
 FP_HD inline MaskOf<V> in_front(const Camera<V>& c, const Vec<V>& mean) {
-  constexpr float near = static_cast<float>(FRAGPRUNE_NEAR);
-  return gt(dot(c.to_z, mean) + c.shift.z, broadcast<V>(near));
+  return gt(dot(c.to_z, mean) + c.shift.z, c.near);
 }
 
 // False: the host culls it (or it is not finite). Comparisons are written so that NaN fails them.
@@ -275,12 +280,35 @@ FP_HD inline MaskOf<V> project(const Camera<V>& c, const Given<V>& g, Projection
   return both(both(in_front(c, g.mean), near_image), both(has_area, touches));
 }
 
-// sqrt of the ratio of determinants: what antialiasing takes from the opacity.
+// What dilation takes from the opacity: the root of a ratio of determinants, `square`, or 0.
+template <class V>
+struct Compensation {
+  V square;        // of the factor
+  V ratio, below;  // of the determinants, and what it was divided by
+  MaskOf<V> free;  // the determinants move the factor
+  V factor;
+};
+
+template <class V>
+FP_HD inline Compensation<V> compensation_of(const Camera<V>& c, const Projection<V>& p) {
+  constexpr float floor = static_cast<float>(FRAGPRUNE_ANTIALIASING_FLOOR);
+  constexpr float least = static_cast<float>(FRAGPRUNE_MIP_FLOOR);
+  const bool mip = c.compensation == FRAGPRUNE_MIP;
+  Compensation<V> o;
+  o.below = mip ? p.det + least : p.det;
+  o.ratio = p.det_before / o.below;
+  o.free = mip ? both(gt(p.det_before, broadcast<V>(least)), gt(p.det, broadcast<V>(least)))
+               : gt(o.ratio, broadcast<V>(floor));
+  o.square = mip ? o.ratio + least : max(o.ratio, broadcast<V>(floor));
+  const V root = sqrt(o.square);
+  o.factor = mip ? select(o.free, root, broadcast<V>(0.f)) : root;
+  return o;
+}
+
 template <class V>
 FP_HD inline V compensation(const Camera<V>& c, const Projection<V>& p) {
-  if (!c.antialiasing) return broadcast<V>(1.f);
-  constexpr float floor = static_cast<float>(FRAGPRUNE_ANTIALIASING_FLOOR);
-  return sqrt(max(p.det_before / p.det, broadcast<V>(floor)));
+  if (c.compensation == FRAGPRUNE_NO_COMPENSATION) return broadcast<V>(1.f);
+  return compensation_of(c, p).factor;
 }
 
 // The cutoff, once for everything: a fragment is drawn iff log2 of its alpha is at least this, that
@@ -297,6 +325,26 @@ FP_HD inline V rim_reach(V threshold) {
   constexpr float reach = static_cast<float>(FRAGPRUNE_RIM_REACH * FRAGPRUNE_RIM_WIDTH);
   constexpr float least = static_cast<float>(FRAGPRUNE_FALLOFF_MIN);
   return min(max(threshold - reach, broadcast<V>(least)), threshold);
+}
+
+// The completed square of a Gaussian that is given on the image; see Brush.
+template <class V>
+struct Square {
+  V scale, skew, down;
+  MaskOf<V> exists;  // the conic is positive definite
+};
+
+template <class V>
+FP_HD inline Square<V> square_of(V xx, V xy, V yy) {
+  const V unit = broadcast<V>(0.5f * kLog2E), none = broadcast<V>(0.f);
+  const V det = narrow(widen(xx) * widen(yy) - widen(xy) * widen(xy)), inv = 1.f / xx;
+  Square<V> s;
+  s.scale = sqrt(unit * xx);
+  s.skew = s.scale * xy * inv;
+  s.down = sqrt(unit * (det * inv));
+  const V far = broadcast<V>(1e30f);
+  s.exists = both(both(gt(xx, none), gt(det, none)), both(gt(far, xx), gt(far, det)));
+  return s;
 }
 
 // Spherical harmonics up to degree 3 in the field's order and signs: values, and when asked slopes.
@@ -392,6 +440,7 @@ struct PixelSums {
   V u, v, uu, uv, vv;       // sums of w u, w v, w u^2, w u v, w v^2
   V r, g, b;                // dL/dcolour
   V inv_z;                  // dL/d(1/z)
+  V absolute;               // sum over pixels of |gx| + |gy|, as in fragprune_input_grads
 };
 
 // dL/d of the image: its position and its dilated covariance.
@@ -419,16 +468,34 @@ FP_HD inline ImageGradient<V> image_gradient(const Camera<V>& c, const Projectio
   g.var_x = along;
   g.cov = by_slope * inv_down - 2.f * slope * along;
   g.var_y = down + slope * (slope * along - by_slope * inv_down);
-  if (c.antialiasing) {
-    constexpr float floor = static_cast<float>(FRAGPRUNE_ANTIALIASING_FLOOR);
-    const V ratio = p.det_before / p.det;
-    const V by_ratio = select(gt(ratio, broadcast<V>(floor)),
-                              0.5f * s.w / (ratio * p.det),  // alpha goes with its root
+  if (c.compensation != FRAGPRUNE_NO_COMPENSATION) {
+    const Compensation<V> o = compensation_of(c, p);
+    const V by_ratio = select(o.free, 0.5f * s.w / (o.square * o.below),  // alpha goes with its root
                               broadcast<V>(0.f));
-    g.var_x = g.var_x + by_ratio * (p.var_y - c.dilation - ratio * p.var_y);
-    g.var_y = g.var_y + by_ratio * (p.var_x - c.dilation - ratio * p.var_x);
-    g.cov = g.cov + by_ratio * 2.f * p.cov * (ratio - 1.f);
+    g.var_x = g.var_x + by_ratio * (p.var_y - c.dilation - o.ratio * p.var_y);
+    g.var_y = g.var_y + by_ratio * (p.var_x - c.dilation - o.ratio * p.var_x);
+    g.cov = g.cov + by_ratio * 2.f * p.cov * (o.ratio - 1.f);
   }
+  return g;
+}
+
+// dL/d of a Gaussian that is given on the image.
+template <class V>
+struct FootprintGradient {
+  V x, y;        // pixels
+  V xx, xy, yy;  // conic
+};
+
+template <class V>
+FP_HD inline FootprintGradient<V> footprint_gradient(const Square<V>& b, const PixelSums<V>& s) {
+  // u = scale dx + skew dy, v = down dy; dx = u along - v across, dy = v upright
+  const V along = 1.f / b.scale, upright = 1.f / b.down, across = b.skew * along * upright;
+  FootprintGradient<V> g;
+  g.x = (2.f / kLog2E) * b.scale * s.u;
+  g.y = (2.f / kLog2E) * fma(b.skew, s.u, b.down * s.v);
+  g.xx = -0.5f * (along * along * s.uu - across * (2.f * along * s.uv - across * s.vv));
+  g.xy = -upright * (along * s.uv - across * s.vv);
+  g.yy = -0.5f * upright * upright * s.vv;
   return g;
 }
 

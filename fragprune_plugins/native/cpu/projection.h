@@ -216,6 +216,7 @@ class Projector {
 
   // Everything but colour, for `count` Gaussians from row i.
   void shape(size_t i, size_t count, Place& to) const {
+    if (in_.means2d) return footprint(i, count, to);
     Tail tail;
     const Rows rows = rows_at(in_, i, count, tail);
     Given<Lanes> given;
@@ -232,12 +233,7 @@ class Projector {
     const Lanes opacity = load(rows.opacities) * compensation(c_, p);
     const Lanes threshold = rows.thresholds ? load(rows.thresholds) : none;
     Brush<Lanes> b;
-    b.log_opacity = log2(opacity);
-    b.cut = cut_of(b.log_opacity, threshold);
-    b.list_cut = in_.widen ? cut_of(b.log_opacity, rim_reach(threshold)) : b.cut;
-    const Mask draws = both(both(gt(opacity, none), gt(broadcast<Lanes>(1e30f), opacity)),
-                            both(ge(threshold, none), ge(b.log_opacity, b.list_cut)));
-    const uint32_t living = bits(both(seen, draws)) & ((uint64_t{1} << count) - 1);
+    const uint32_t living = bits(both(seen, cut(opacity, threshold, b))) & first_lanes(count);
     if (!living) return;
     b.x = p.x;
     b.y = p.y;
@@ -246,6 +242,54 @@ class Projector {
     b.down = sqrt(0.5f * kLog2E / p.var_y);
     const Bounds<Lanes> bounds = bounds_of(c_, p, b);
     pack(i, living, b, threshold, 1.f / opacity, p.view.z, bounds, to);
+  }
+
+  // The same for Gaussians that are given on the image.
+  void footprint(size_t i, size_t count, Place& to) const {
+    std::fill_n(radii_ + i, count, 0);
+    const auto column = [&](const float* rows, size_t width, size_t k) {
+      Lanes v = {};
+      for (size_t lane = 0; rows && lane < count; lane++) v[lane] = rows[(i + lane) * width + k];
+      return v;
+    };
+    const auto edge = [&](size_t k, Lanes most) {
+      Lanes v = {};
+      for (size_t lane = 0; lane < count; lane++)
+        v[lane] = static_cast<float>(in_.tiles[(i + lane) * 4 + k]);
+      return clamp(v, broadcast<Lanes>(0.f), most);
+    };
+    Projection<Lanes> p;
+    p.tile_x0 = edge(0, c_.tiles_x), p.tile_y0 = edge(1, c_.tiles_y);
+    p.tile_x1 = edge(2, c_.tiles_x), p.tile_y1 = edge(3, c_.tiles_y);
+    const Lanes z = column(in_.depths, 1, 0), opacity = column(in_.opacities, 1, 0);
+    const Lanes threshold = column(in_.thresholds, 1, 0);
+    const Square<Lanes> square = square_of(column(in_.conics, 3, 0), column(in_.conics, 3, 1),
+                                           column(in_.conics, 3, 2));
+    Brush<Lanes> b;
+    b.x = column(in_.means2d, 2, 0), b.y = column(in_.means2d, 2, 1);
+    b.scale = square.scale, b.skew = square.skew, b.down = square.down;
+    const Lanes far = broadcast<Lanes>(1e9f), deep = broadcast<Lanes>(1e30f);
+    const Mask near_image = both(ge(far, abs(b.x)), ge(far, abs(b.y)));
+    const Mask has_depth = both(gt(z, broadcast<Lanes>(1e-30f)), gt(deep, z));
+    const Mask has_tiles = both(gt(p.tile_x1, p.tile_x0), gt(p.tile_y1, p.tile_y0));
+    const Mask seen = both(both(near_image, square.exists), both(has_depth, has_tiles));
+    const uint32_t living = bits(both(seen, cut(opacity, threshold, b))) & first_lanes(count);
+    if (living)
+      pack(i, living, b, threshold, 1.f / opacity, z, bounds_of(c_, p, b), to);
+  }
+
+  static uint32_t first_lanes(size_t count) {
+    return static_cast<uint32_t>((uint64_t{1} << count) - 1);
+  }
+
+  // Fills in what decides on fragments; false: there are none.
+  Mask cut(Lanes opacity, Lanes threshold, Brush<Lanes>& b) const {
+    const Lanes none = broadcast<Lanes>(0.f);
+    b.log_opacity = log2(opacity);
+    b.cut = cut_of(b.log_opacity, threshold);
+    b.list_cut = in_.widen ? cut_of(b.log_opacity, rim_reach(threshold)) : b.cut;
+    return both(both(gt(opacity, none), gt(broadcast<Lanes>(1e30f), opacity)),
+                both(ge(threshold, none), ge(b.log_opacity, b.list_cut)));
   }
 
   void write_radii(Lanes radius, size_t i, size_t count) const {
@@ -326,7 +370,8 @@ class Projector {
     return one;
   }
 
-  // Colour and 1/z of a piece's splats; those of no finite colour reach no tile any more.
+  // Colour and 1/z of a piece's splats; those of no finite colour, or of features that are not,
+  // reach no tile any more.
   void colour(Place& to) const {
     for (uint32_t j = 0; j < to.count; j += kLanes) {
       const int count = static_cast<int>(std::min<uint32_t>(kLanes, to.count - j));
@@ -351,7 +396,8 @@ class Projector {
         colour = raw_colour(h, terms, coefficients);
       }
       const Lanes size = abs(colour.x) + abs(colour.y) + abs(colour.z);
-      const uint32_t broken = ~bits(gt(broadcast<Lanes>(1e30f), size));
+      uint32_t broken = ~bits(gt(broadcast<Lanes>(1e30f), size));
+      for (int lane = 0; in_.features && lane < count; lane++) broken |= has_wild(ids[lane]) << lane;
       if (!in_.colors)
         colour = {max(colour.x, none), max(colour.y, none), max(colour.z, none)};
       const Lanes columns[4] = {colour.x, colour.y, colour.z, 1.f / load(depth)};
@@ -362,6 +408,12 @@ class Projector {
         if (broken >> lane & 1) to.reach[j + lane].rows = 0, to.slot[j + lane] = 0;
       }
     }
+  }
+
+  // Whether a Gaussian's features are beyond all bounds.
+  uint32_t has_wild(uint32_t id) const {
+    const float* row = in_.features + size_t{id} * in_.feature_count;
+    return !std::all_of(row, row + in_.feature_count, [](float v) { return abs(v) < 1e30f; });
   }
 
   // Asks for what colour() will read of a splat: it comes while the piece's others are projected.

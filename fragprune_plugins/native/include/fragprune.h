@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 2
+#define FRAGPRUNE_API_VERSION 3
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
@@ -21,6 +21,8 @@
 #define FRAGPRUNE_DILATION 0.3
 #define FRAGPRUNE_FRUSTUM_MARGIN 1.3
 #define FRAGPRUNE_ANTIALIASING_FLOOR 2.5e-5
+#define FRAGPRUNE_MIP_FLOOR 1e-6
+#define FRAGPRUNE_FEATURES_MAX 8
 #define FRAGPRUNE_RIM_WIDTH 0.01
 #define FRAGPRUNE_RIM_REACH 4.6
 #define FRAGPRUNE_FALLOFF_MIN 1e-4
@@ -44,6 +46,13 @@ enum fragprune_status {
   FRAGPRUNE_FAILED = 4
 };
 
+/* Factor on opacity by the determinants d0, d1 of the 2D covariance before and after dilation. */
+enum fragprune_compensation {
+  FRAGPRUNE_NO_COMPENSATION = 0,
+  FRAGPRUNE_ANTIALIASING = 1, /* sqrt(max(2.5e-5, d0 / d1)) */
+  FRAGPRUNE_MIP = 2           /* sqrt(d0 / (d1 + 1e-6) + 1e-6); 0 where either is at most 1e-6 */
+};
+
 /* Bits of fragprune_cpu_features: what the machine runs, not what this build uses. */
 enum fragprune_cpu_feature { FRAGPRUNE_CPU_AVX2 = 1, FRAGPRUNE_CPU_AVX512 = 2 };
 
@@ -53,18 +62,27 @@ typedef struct fragprune_error {
 
 typedef struct fragprune_workspace fragprune_workspace;
 
+/* N Gaussians are given in the world (means, scales and rotations or cov3d, sh or colors) or, when
+ * means2d is not NULL, on the image (means2d, conics, depths, tiles, colors): then neither the camera
+ * nor what belongs to projection is read, and one draws nothing that has no tiles, a depth that is not
+ * positive or a conic that is not positive definite. */
 typedef struct fragprune_inputs {
   uint32_t size;           /* sizeof(fragprune_inputs) */
-  int32_t threads;         /* results do not depend on it */
+  int32_t threads;         /* at most 1024; results do not depend on it */
   int32_t width;           /* pixels */
   int32_t height;          /* pixels */
   float tan_fov_x;         /* tangent of half the field of view */
   float tan_fov_y;
   float scale_modifier;    /* factor on scales; does not apply to cov3d */
   float dilation;          /* pixels^2 added to the 2D covariance's diagonal */
-  int32_t antialiasing;    /* multiply opacity by sqrt(max(2.5e-5, det before / det after)) */
+  float near;              /* Gaussians at this view depth or less are culled; 0 or more */
+  float alpha_max;         /* alpha is capped here; 1/255 to 1 */
+  int32_t compensation;    /* enum fragprune_compensation */
+  int32_t cap_gradient;    /* the gradient passes through the cap; else it is 0 where capped */
+  int32_t absolute_gradient; /* fill the hook's third column, see fragprune_input_grads */
   int32_t sh_degree;       /* 0 to 3 */
-  int32_t sh_coefficients; /* K, the second dimension of sh */
+  int32_t sh_coefficients; /* K, the second dimension of sh; at most 1024 */
+  int32_t feature_count;   /* F, 0 to 8 */
   int32_t widen;           /* keep rim fragments: thresholds will want a gradient */
   int64_t count;           /* N */
   const float *viewmatrix; /* (4, 4) */
@@ -78,7 +96,13 @@ typedef struct fragprune_inputs {
   const float *cov3d;      /* (N, 6) xx xy xz yy yz zz; or NULL */
   const float *sh;         /* (N, K, 3); or NULL */
   const float *colors;     /* (N, 3); or NULL */
+  const float *features;   /* (N, F), blended as colour is; or NULL: F is 0 */
   const float *thresholds; /* (N) falloff in (0, 1); or NULL: no truncation */
+  const float *sample_offsets; /* (H, W, 2) x, y: where in its pixel each is sampled; or NULL */
+  const float *means2d;    /* (N, 2) pixels, (0, 0) the centre of the first; or NULL */
+  const float *conics;     /* (N, 3) inverse covariances xx xy yy, pixels^-2; or NULL */
+  const float *depths;     /* (N) drawn in this order; or NULL */
+  const int32_t *tiles;    /* (N, 4) x0 y0 x1 y1, half open, of tiles; or NULL */
   fragprune_workspace *workspace; /* memory to use again; or NULL */
 } fragprune_inputs;
 
@@ -89,8 +113,12 @@ typedef struct fragprune_outputs {
   float *invdepth;                 /* (H, W) sum of alpha T / z */
   float *alpha;                    /* (H, W) 1 - final transmittance */
   int32_t *radii;                  /* (N) the host's rule; thresholds never change it */
+  float *features;                 /* (F, H, W) sum of alpha T feature */
   int32_t *fragments;              /* (H, W) drawn fragments */
   int32_t *fragments_per_gaussian; /* (N) drawn fragments */
+  float *weights_per_gaussian;     /* (N) sum of alpha T over drawn fragments */
+  int32_t *wins_per_gaussian;      /* (N) pixels where its alpha T is the largest */
+  int32_t *winners;                /* (H, W) row of the largest, the first of equals; -1 for none */
   int64_t drawn;                   /* filled in: fragments drawn */
   int64_t evaluated;               /* filled in: lanes spent on (Gaussian, pixel) pairs */
   float projection_ms;             /* filled in: time of each stage */
@@ -105,20 +133,26 @@ typedef struct fragprune_output_grads {
   const float *image;        /* (3, H, W) */
   const float *invdepth;     /* (H, W) */
   const float *alpha;        /* (H, W) */
+  const float *features;     /* (F, H, W) */
 } fragprune_output_grads;
 
 /* Where to put gradients; NULL: not wanted, and not computed. Every element is written. */
 typedef struct fragprune_input_grads {
   uint32_t size;
   float *means;      /* (N, 3) */
-  float *means2d;    /* (N, 3) screen gradient times (W/2, H/2), then 0 */
+  float *hook;       /* (N, 3) gx, gy of the mean on the image, times (W/2, H/2), then 0 or, with
+                        absolute_gradient, the sum of |gx| + |gy| of single pixels */
   float *opacities;  /* (N) */
   float *scales;     /* (N, 3) */
   float *rotations;  /* (N, 4) */
   float *cov3d;      /* (N, 6) */
   float *sh;         /* (N, K, 3) */
   float *colors;     /* (N, 3) */
+  float *features;   /* (N, F) */
   float *thresholds; /* (N) */
+  float *means2d;    /* (N, 2) */
+  float *conics;     /* (N, 3) */
+  float *depths;     /* (N) */
   float *background; /* (3) */
 } fragprune_input_grads;
 

@@ -39,32 +39,55 @@ calls::Scene scene_of(calls::Source& from) {
   in.height = 1 + shape / 48 % 48;
   in.count = shape / (48 * 48) % 33;
   in.threads = static_cast<int>(options % 7) - 1;
-  in.antialiasing = options >> 3 & 1;
+  in.compensation = static_cast<int>((options >> 12 & 3) % 3);
+  in.cap_gradient = options >> 14 & 1;
+  in.absolute_gradient = options >> 15 & 1;
+  in.feature_count = static_cast<int>((options >> 16 & 15) % 9);
   in.widen = options >> 4 & 1;
   in.sh_degree = options >> 5 & 3;
   in.sh_coefficients = (in.sh_degree + 1) * (in.sh_degree + 1) + (options >> 7 & 3);
   const size_t n = s.count();
   calls::Floats numbers;
-  take(numbers, 4, from, raw);
+  take(numbers, 6, from, raw);
   in.tan_fov_x = numbers[0], in.tan_fov_y = numbers[1];
   in.scale_modifier = numbers[2], in.dilation = numbers[3];
+  in.near = numbers[4] >= 0 ? numbers[4] : 0.2f;
+  in.alpha_max = numbers[5] >= 0.01f && numbers[5] <= 1 ? numbers[5] : 0.99f;
   take(s.viewmatrix, 16, from, raw);
   take(s.projmatrix, 16, from, raw);
   take(s.campos, 3, from, raw);
   take(s.background, 3, from, raw);
-  take(s.means, 3 * n, from, raw);
   take(s.opacities, n, from, raw);
-  if (options >> 9 & 1) {
-    take(s.cov3d, 6 * n, from, raw);
-  } else {
-    take(s.scales, 3 * n, from, raw);
-    take(s.rotations, 4 * n, from, raw);
-  }
-  if (options >> 10 & 1)
+  if (options >> 20 & 1) {
+    take(s.means2d, 2 * n, from, raw);
+    take(s.conics, 3 * n, from, raw);
+    take(s.depths, n, from, raw);
     take(s.colors, 3 * n, from, raw);
-  else
-    take(s.sh, 3 * n * in.sh_coefficients, from, raw);
+    s.tiles.make(4 * n);
+    for (size_t i = 0; i < 4 * n; i++) {
+      const uint32_t word = from.next();
+      s.tiles[i] = raw & 1 ? static_cast<int32_t>(word) : static_cast<int32_t>(word % 7) - 1;
+    }
+  } else {
+    take(s.means, 3 * n, from, raw);
+    if (options >> 9 & 1) {
+      take(s.cov3d, 6 * n, from, raw);
+    } else {
+      take(s.scales, 3 * n, from, raw);
+      take(s.rotations, 4 * n, from, raw);
+    }
+    if (options >> 10 & 1)
+      take(s.colors, 3 * n, from, raw);
+    else
+      take(s.sh, 3 * n * in.sh_coefficients, from, raw);
+  }
   if (options >> 11 & 1) take(s.thresholds, n, from, raw);
+  if (in.feature_count) take(s.features, n * in.feature_count, from, raw);
+  if (options >> 21 & 1) {
+    take(s.offsets, 2 * s.pixels(), from, raw);
+    for (size_t i = 0; i < s.offsets.size(); i++)
+      if (!(std::fabs(s.offsets[i]) <= 1e6f)) s.offsets[i] = 0;  // the contract's
+  }
   s.point();
   return s;
 }

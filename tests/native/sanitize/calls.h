@@ -138,7 +138,9 @@ struct Limits {
 struct Scene {
   fragprune_inputs in{};
   Floats viewmatrix, projmatrix, campos, background;
-  Floats means, opacities, scales, rotations, cov3d, sh, colors, thresholds;
+  Floats means, opacities, scales, rotations, cov3d, sh, colors, features, thresholds, offsets;
+  Floats means2d, conics, depths;
+  Integers tiles;
   bool tame = true;  // nothing poisoned: results must be finite
 
   size_t count() const { return static_cast<size_t>(in.count); }
@@ -149,6 +151,9 @@ struct Scene {
     in.means = means.get(), in.opacities = opacities.get(), in.scales = scales.get();
     in.rotations = rotations.get(), in.cov3d = cov3d.get(), in.sh = sh.get();
     in.colors = colors.get(), in.thresholds = thresholds.get();
+    in.features = features.get(), in.sample_offsets = offsets.get();
+    in.means2d = means2d.get(), in.conics = conics.get();
+    in.depths = depths.get(), in.tiles = tiles.get();
   }
 };
 
@@ -231,30 +236,22 @@ inline float threshold(Source& from) {
   }
 }
 
-inline Scene make_scene(Source& from, Limits limits) {
-  Scene s;
-  fragprune_inputs& in = s.in;
-  in.size = sizeof in;
-  in.threads = from.one_in(8) ? from.below(20) - 2 : 1 + from.below(4);
-  in.width = from.one_in(5) ? 1 : 1 + from.below(limits.pixels);
-  in.height = from.one_in(5) ? 16 : 1 + from.below(limits.pixels);
-  const bool strip = from.one_in(80);  // as long as an image may be
-  if (strip) in.width = (1 << 16) - from.below(20), in.height = 1 + from.below(3);
-  if (strip && from.one_in(2)) std::swap(in.width, in.height);
-  in.scale_modifier = from.one_in(3) ? from.uniform(0.1f, 2) : 1;
-  in.dilation = from.one_in(4) ? from.uniform(0, 0.5f) : 0.3f;
-  in.antialiasing = from.below(2);
-  in.widen = from.below(2);
-  const int few = from.below(4);  // 0, 1, 2 or many
-  in.count = few < 3 && from.one_in(3) ? few : from.below(limits.gaussians + 1);
-  if (strip) in.count %= 8;
-  const size_t n = s.count();
+// A covariance of the sizes (n) along axes, as its upper triangle.
+inline void covariance(const float axes[3][3], const float* sizes, int n, float* entry) {
+  for (int a = 0; a < n; a++)
+    for (int b = a; b < n; b++) {
+      float sum = 0;
+      for (int k = 0; k < n; k++) sum += axes[a][k] * axes[b][k] * sizes[k] * sizes[k];
+      *entry++ = sum;
+    }
+}
 
+inline void make_gaussians(Scene& s, Source& from) {
+  fragprune_inputs& in = s.in;
+  const size_t n = s.count();
   float turn[3][3], shift[3];
   make_camera(s, from, turn, shift);
-  fill(s.background, 3, from, 0, 1);
   s.means.make(3 * n);
-  fill(s.opacities, n, from, 0.002f, 1);
   const bool by_covariance = from.one_in(3);
   if (by_covariance) s.cov3d.make(6 * n);
   if (!by_covariance) s.scales.make(3 * n), s.rotations.make(4 * n);
@@ -268,20 +265,71 @@ inline Scene make_scene(Source& from, Limits limits) {
       continue;
     }
     rotation_matrix(q, axes);
-    float* entry = &s.cov3d[6 * i];
-    for (int a = 0; a < 3; a++)
-      for (int b = a; b < 3; b++) {
-        float sum = 0;
-        for (int k = 0; k < 3; k++) sum += axes[a][k] * axes[b][k] * sizes[k] * sizes[k];
-        *entry++ = sum;
-      }
+    covariance(axes, sizes, 3, &s.cov3d[6 * i]);
   }
   in.sh_degree = from.below(4);
-  in.sh_coefficients = (in.sh_degree + 1) * (in.sh_degree + 1) + (from.one_in(2) ? 0 : from.below(4));
+  const int least = (in.sh_degree + 1) * (in.sh_degree + 1);
+  in.sh_coefficients = least + (from.one_in(2) ? 0 : from.below(4));
   if (from.one_in(3))
     fill(s.colors, 3 * n, from, -0.2f, 1.3f);
   else
     fill(s.sh, 3 * n * in.sh_coefficients, from, -1, 1);
+}
+
+// The same on the image: no camera, tiles in the grid, beside it, reversed.
+inline void make_footprints(Scene& s, Source& from) {
+  const size_t n = s.count();
+  s.means2d.make(2 * n), s.conics.make(3 * n), s.tiles.make(4 * n);
+  fill(s.depths, n, from, -0.3f, 8);
+  fill(s.colors, 3 * n, from, -0.2f, 1.3f);
+  for (size_t i = 0; i < n; i++) {
+    s.means2d[2 * i] = from.uniform(-0.2f, 1.2f) * s.in.width;
+    s.means2d[2 * i + 1] = from.uniform(-0.2f, 1.2f) * s.in.height;
+    const float angle = from.uniform(0, 3), size[2] = {1 / from.log_uniform(0.3f, 20),
+                                                       1 / from.log_uniform(0.3f, 20)};
+    const float axes[3][3] = {{std::cos(angle), -std::sin(angle)},
+                              {std::sin(angle), std::cos(angle)}};
+    covariance(axes, size, 2, &s.conics[3 * i]);
+    const int size_of_grid[2] = {s.in.width / FRAGPRUNE_TILE + 1, s.in.height / FRAGPRUNE_TILE + 1};
+    for (int k = 0; k < 2; k++) {
+      s.tiles[4 * i + k] = from.one_in(2) ? 0 : from.below(size_of_grid[k] + 2) - 1;
+      s.tiles[4 * i + 2 + k] = from.one_in(2) ? size_of_grid[k] : from.below(size_of_grid[k] + 2);
+    }
+  }
+}
+
+inline Scene make_scene(Source& from, Limits limits) {
+  Scene s;
+  fragprune_inputs& in = s.in;
+  in.size = sizeof in;
+  in.threads = from.one_in(8) ? from.below(20) - 2 : 1 + from.below(4);
+  in.width = from.one_in(5) ? 1 : 1 + from.below(limits.pixels);
+  in.height = from.one_in(5) ? 16 : 1 + from.below(limits.pixels);
+  const bool strip = from.one_in(80);  // as long as an image may be
+  if (strip) in.width = (1 << 16) - from.below(20), in.height = 1 + from.below(3);
+  if (strip && from.one_in(2)) std::swap(in.width, in.height);
+  in.scale_modifier = from.one_in(3) ? from.uniform(0.1f, 2) : 1;
+  in.dilation = from.one_in(4) ? from.uniform(0, 0.5f) : 0.3f;
+  in.compensation = from.below(3);
+  in.near = from.one_in(3) ? from.uniform(0, 2) : 0.2f;
+  in.alpha_max = from.one_in(3) ? from.uniform(0.1f, 1) : 0.99f;
+  in.cap_gradient = from.below(2);
+  in.absolute_gradient = from.below(2);
+  in.widen = from.below(2);
+  const int few = from.below(4);  // 0, 1, 2 or many
+  in.count = few < 3 && from.one_in(3) ? few : from.below(limits.gaussians + 1);
+  if (strip) in.count %= 8;
+  const size_t n = s.count();
+
+  fill(s.background, 3, from, 0, 1);
+  fill(s.opacities, n, from, 0.002f, 1);
+  if (from.one_in(4))
+    make_footprints(s, from);
+  else
+    make_gaussians(s, from);
+  in.feature_count = from.one_in(2) ? 0 : 1 + from.below(FRAGPRUNE_FEATURES_MAX);
+  if (in.feature_count) fill(s.features, n * in.feature_count, from, -1, 2);
+  if (from.one_in(3)) fill(s.offsets, 2 * s.pixels(), from, -0.5f, 0.5f);
   if (!from.one_in(3)) {
     s.thresholds.make(n);
     for (size_t i = 0; i < n; i++) s.thresholds[i] = threshold(from);
@@ -293,24 +341,27 @@ inline Scene make_scene(Source& from, Limits limits) {
 // Puts numbers that nobody should pass in here and there: into Gaussians, and rarely the camera.
 inline void poison(Scene& s, Source& from) {
   s.tame = false;
-  Floats* arrays[] = {&s.means, &s.opacities, &s.scales, &s.rotations, &s.cov3d,
-                      &s.sh,    &s.colors,    &s.thresholds};
+  Floats* arrays[] = {&s.means,  &s.opacities, &s.scales,     &s.rotations, &s.cov3d,  &s.sh,
+                      &s.colors, &s.features,  &s.thresholds, &s.means2d,   &s.conics, &s.depths};
   for (Floats* array : arrays)
     for (int k = from.below(4); array->size() && k > 0; k--)
       (*array)[from.next() % array->size()] = from.poison();
   if (!from.one_in(3)) return;
   Floats* camera[] = {&s.viewmatrix, &s.projmatrix, &s.campos, &s.background};
   Floats& array = *camera[from.below(4)];
-  array[from.next() % array.size()] = from.poison();
+  if (array.size()) array[from.next() % array.size()] = from.poison();
   float* options[] = {&s.in.tan_fov_x, &s.in.tan_fov_y, &s.in.scale_modifier, &s.in.dilation};
   if (from.one_in(2)) *options[from.below(4)] = from.poison();
 }
 
 struct Picture {
   fragprune_outputs out{};
-  Floats image, invdepth, alpha;
-  Integers radii, fragments, per_gaussian;
+  Floats image, invdepth, alpha, features, weights;
+  Integers radii, fragments, per_gaussian, wins, winners;
 };
+
+// Of kinds that Picture may lack, in bits.
+constexpr int kOptional = 1 << 8;
 
 // Outputs that are optional are there or not by the bits of `absent`.
 inline Picture make_picture(const Scene& s, int absent) {
@@ -321,6 +372,12 @@ inline Picture make_picture(const Scene& s, int absent) {
   if (!(absent & 2)) p.alpha.make(s.pixels());
   if (!(absent & 4)) p.fragments.make(s.pixels());
   if (!(absent & 8)) p.per_gaussian.make(s.count());
+  if (!(absent & 16) && s.in.feature_count) p.features.make(s.pixels() * s.in.feature_count);
+  if (!(absent & 32)) p.weights.make(s.count());
+  if (!(absent & 64)) p.wins.make(s.count());
+  if (!(absent & 128)) p.winners.make(s.pixels());
+  p.out.features = p.features.get(), p.out.weights_per_gaussian = p.weights.get();
+  p.out.wins_per_gaussian = p.wins.get(), p.out.winners = p.winners.get();
   p.out.image = p.image.get(), p.out.radii = p.radii.get();
   p.out.invdepth = p.invdepth.get(), p.out.alpha = p.alpha.get();
   p.out.fragments = p.fragments.get(), p.out.fragments_per_gaussian = p.per_gaussian.get();
@@ -330,6 +387,8 @@ inline Picture make_picture(const Scene& s, int absent) {
 inline void check(const Scene& s, const Picture& p) {
   CALLS_CHECK(p.image.written() && p.invdepth.written() && p.alpha.written());
   CALLS_CHECK(p.radii.written() && p.fragments.written() && p.per_gaussian.written());
+  CALLS_CHECK(p.features.written() && p.weights.written());
+  CALLS_CHECK(p.wins.written() && p.winners.written());
   CALLS_CHECK(p.out.drawn >= 0 && p.out.evaluated >= p.out.drawn);
   for (const Integers* counts : {&p.fragments, &p.per_gaussian})
     if (counts->get()) {
@@ -340,14 +399,22 @@ inline void check(const Scene& s, const Picture& p) {
   for (size_t i = 0; i < p.radii.size(); i++) CALLS_CHECK(p.radii[i] >= 0);
   // A broken Gaussian is left out: whatever is passed in, only the background can break a picture.
   if (s.background.finite()) CALLS_CHECK(p.image.finite());
-  CALLS_CHECK(p.invdepth.finite());
+  CALLS_CHECK(p.invdepth.finite() && p.features.finite() && p.weights.finite());
+  int64_t won = 0, wins = 0;
+  for (size_t i = 0; i < p.winners.size(); i++) {
+    CALLS_CHECK(p.winners[i] >= -1 && p.winners[i] < s.in.count);
+    won += p.winners[i] >= 0;
+  }
+  for (size_t i = 0; i < p.wins.size(); i++) wins += p.wins[i];
+  if (p.wins.get() && p.winners.get()) CALLS_CHECK(wins == won);
+  for (size_t i = 0; i < p.weights.size(); i++) CALLS_CHECK(p.weights[i] >= 0);
   for (size_t i = 0; i < p.alpha.size(); i++)
     CALLS_CHECK(p.alpha[i] >= 0 && p.alpha[i] <= 1 - 0.99f * (float)FRAGPRUNE_TRANSMITTANCE_MIN);
 }
 
 struct Loss {
   fragprune_output_grads grads{};
-  Floats image, invdepth, alpha;
+  Floats image, invdepth, alpha, features;
 };
 
 inline Loss make_loss(const Scene& s, Source& from, int absent) {
@@ -357,6 +424,8 @@ inline Loss make_loss(const Scene& s, Source& from, int absent) {
   if (!(absent & 1)) fill(loss.image, 3 * s.pixels(), from, -1, 1);
   if (!(absent & 2)) fill(loss.invdepth, s.pixels(), from, -1, 1);
   if (!(absent & 4)) fill(loss.alpha, s.pixels(), from, -1, 1);
+  if (!(absent & 8)) fill(loss.features, s.pixels() * s.in.feature_count, from, -1, 1);
+  loss.grads.features = loss.features.get();
   loss.grads.image = loss.image.get();
   loss.grads.invdepth = loss.invdepth.get();
   loss.grads.alpha = loss.alpha.get();
@@ -365,13 +434,15 @@ inline Loss make_loss(const Scene& s, Source& from, int absent) {
 
 struct Gradients {
   fragprune_input_grads to{};
-  Floats means, means2d, opacities, scales, rotations, cov3d, sh, colors, thresholds, background;
+  Floats means, hook, opacities, scales, rotations, cov3d, sh, colors, features, thresholds;
+  Floats means2d, conics, depths, background;
 
   std::vector<const Floats*> all() const {
-    return {&means, &means2d, &opacities, &scales,     &rotations,
-            &cov3d, &sh,      &colors,    &thresholds, &background};
+    return {&means,  &hook,     &opacities,  &scales,  &rotations, &cov3d,  &sh,
+            &colors, &features, &thresholds, &means2d, &conics,    &depths, &background};
   }
 };
+constexpr int kGradients = 14;
 
 inline Gradients make_gradients(const Scene& s, int absent) {
   Gradients g;
@@ -381,8 +452,8 @@ inline Gradients make_gradients(const Scene& s, int absent) {
     return array.get();
   };
   g.to.size = sizeof g.to;
-  g.to.means = want(0, true, g.means, 3 * n);
-  g.to.means2d = want(1, true, g.means2d, 3 * n);
+  g.to.means = want(0, s.means.get(), g.means, 3 * n);
+  g.to.hook = want(1, true, g.hook, 3 * n);
   g.to.opacities = want(2, true, g.opacities, n);
   g.to.scales = want(3, s.scales.get(), g.scales, 3 * n);
   g.to.rotations = want(4, s.rotations.get(), g.rotations, 4 * n);
@@ -391,6 +462,10 @@ inline Gradients make_gradients(const Scene& s, int absent) {
   g.to.colors = want(7, s.colors.get(), g.colors, 3 * n);
   g.to.thresholds = want(8, s.thresholds.get() && s.in.widen, g.thresholds, n);
   g.to.background = want(9, true, g.background, 3);
+  g.to.features = want(10, s.features.get(), g.features, n * s.in.feature_count);
+  g.to.means2d = want(11, s.means2d.get(), g.means2d, 2 * n);
+  g.to.conics = want(12, s.conics.get(), g.conics, 3 * n);
+  g.to.depths = want(13, s.depths.get(), g.depths, n);
   return g;
 }
 
@@ -433,17 +508,30 @@ struct Tally {
 inline void try_illegal(const Scene& s, Source& from, Tally& tally) {
   Picture p = make_picture(s, 0);
   fragprune_inputs in = s.in;
-  switch (from.below(10)) {
+  switch (from.below(20)) {
     case 0: in.size--; break;
     case 1: p.out.size = 0; break;
     case 2: in.width = -from.below(3); break;
     case 3: in.height = (1 << 16) + 1 + from.below(1 << 20); break;
     case 4: in.count = -1 - from.below(3); break;
     case 5: in.count = int64_t{INT32_MAX} + 1 + from.below(9); break;
-    case 6: in.viewmatrix = nullptr; break;
-    case 7: in.background = nullptr; break;
-    case 8: p.out.image = nullptr; break;
-    default: in.campos = nullptr;
+    case 6: in.background = nullptr; break;
+    case 7: p.out.image = nullptr; break;
+    case 8: in.near = -0.1f; break;
+    case 9: in.near = std::nanf(""); break;
+    case 10: in.alpha_max = 1.01f; break;
+    case 11: in.alpha_max = std::nanf(""); break;
+    case 12: in.alpha_max = 0; break;
+    case 13: in.compensation = from.one_in(2) ? 3 : -1; break;
+    case 14: in.feature_count = from.one_in(2) ? FRAGPRUNE_FEATURES_MAX + 1 : -1; break;
+    case 15: in.threads = 1025 + from.below(1 << 30); break;
+    default:
+      if (in.means2d)
+        in.means = in.means2d;
+      else if (from.one_in(2))
+        in.campos = nullptr;
+      else
+        in.viewmatrix = nullptr;
   }
   fragprune_error error;
   fragprune_state* state = nullptr;
@@ -452,13 +540,24 @@ inline void try_illegal(const Scene& s, Source& from, Tally& tally) {
   if (s.count()) {
     in = s.in;
     fragprune_outputs out = make_picture(s, 0).out;
-    switch (from.below(6)) {
-      case 0: in.means = nullptr; break;
-      case 1: in.opacities = nullptr; break;
-      case 2: in.scales = in.cov3d = nullptr; break;
-      case 3: in.sh = in.colors = nullptr; break;
-      case 4: in.scales = in.rotations = in.cov3d = in.means; break;
-      default: in.sh = in.colors = in.means;
+    float wild[2] = {0.f, from.one_in(2) ? 2e6f : std::nanf("")};
+    const int choice = from.below(8);
+    if (choice == 0) in.opacities = nullptr;
+    if (choice == 1) in.feature_count = 0, in.features = in.opacities;
+    if (choice == 2) in.feature_count = 1, in.features = nullptr, out.features = nullptr;
+    if (choice == 3) in.width = in.height = 1, in.sample_offsets = wild;
+    if (in.means2d) {
+      if (choice == 4) in.conics = nullptr;
+      if (choice == 5) in.depths = nullptr;
+      if (choice == 6) in.tiles = nullptr;
+      if (choice == 7) in.colors = nullptr;
+    } else {
+      if (choice == 4) in.means = nullptr;
+      if (choice == 5) in.scales = in.cov3d = nullptr;
+      if (choice == 6) in.scales = in.rotations = in.cov3d = in.means;
+      if (choice == 7 && from.one_in(2)) in.sh = in.colors = nullptr;
+      if (choice == 7 && !in.colors) in.sh = in.means, in.sh_coefficients = 1025;
+      if (choice == 7 && in.colors) in.sh = in.colors;
     }
     CALLS_CHECK(fragprune_forward(&in, &out, nullptr, nullptr) == FRAGPRUNE_BAD_INPUT);
   }
@@ -481,6 +580,8 @@ inline void try_illegal_backward(const Scene& s, const fragprune_state* state, T
   fragprune_error error;
   CALLS_CHECK(fragprune_backward(state, &loss.grads, &g.to, 1, &error) == FRAGPRUNE_BAD_INPUT);
   CALLS_CHECK(error.message[0]);
+  g = make_gradients(s, ~0);
+  CALLS_CHECK(fragprune_backward(state, &loss.grads, &g.to, 1025, &error) == FRAGPRUNE_BAD_INPUT);
   g.to.size++;
   CALLS_CHECK(fragprune_backward(state, &loss.grads, &g.to, 1, nullptr) == FRAGPRUNE_BAD_INPUT);
   tally.refused++;
@@ -506,7 +607,7 @@ inline void run(Scene s, Source& from, Tally& tally) {
   if (from.one_in(3)) own = new_workspace();
   s.in.workspace = own ? own.get() : from.one_in(2) ? shared_workspace() : nullptr;
   if (s.in.workspace && from.one_in(4)) borrow(s.in.workspace, from);
-  Picture p = make_picture(s, from.below(16));
+  Picture p = make_picture(s, from.one_in(3) ? from.below(kOptional) : from.one_in(2) ? 0 : 0xf8);
   fragprune_state* state = nullptr;
   fragprune_error error;
   const int status = fragprune_forward(&s.in, &p.out, keep ? &state : nullptr, &error);
@@ -515,17 +616,20 @@ inline void run(Scene s, Source& from, Tally& tally) {
   tally.drew += p.out.drawn > 0;
   if (from.one_in(3)) {  // the number of threads changes nothing, nor do outputs not asked for
     s.in.threads = 1 + s.in.threads % 3;
-    Picture again = make_picture(s, from.below(16));
+    Picture again = make_picture(s, from.below(kOptional));
     CALLS_CHECK(fragprune_forward(&s.in, &again.out, nullptr, nullptr) == FRAGPRUNE_OK);
     CALLS_CHECK(again.image.same_bits(p.image) && again.out.drawn == p.out.drawn);
+    if (again.weights.get() && p.weights.get()) CALLS_CHECK(again.weights.same_bits(p.weights));
+    if (again.winners.get() && p.winners.get()) CALLS_CHECK(again.winners.same_bits(p.winners));
+    if (again.features.get() && p.features.get()) CALLS_CHECK(again.features.same_bits(p.features));
   }
   s.in.workspace = nullptr;
   own.reset();
   if (!keep) return;
   const std::unique_ptr<fragprune_state, void (*)(fragprune_state*)> owner(state, fragprune_free);
   if (from.one_in(8) && s.count()) try_illegal_backward(s, state, tally);
-  const Loss loss = make_loss(s, from, from.below(8));
-  const int absent = from.one_in(2) ? 0 : from.below(1 << 10);
+  const Loss loss = make_loss(s, from, from.below(16));
+  const int absent = from.one_in(2) ? 0 : from.below(1 << kGradients);
   const Gradients g = differentiate(s, state, loss, absent, 1 + from.below(4));
   if (s.tame)
     for (const Floats* array : g.all()) CALLS_CHECK(array->finite());

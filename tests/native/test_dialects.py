@@ -1,0 +1,260 @@
+"""What some dialects ask for beyond the plain picture, alone and mixed, against the oracle.
+
+The rules of test_against_oracle.py apply: both engines see the same float32 numbers, and pixels
+whose fragment counts differ by rounding are few and left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import get_args
+
+import pytest
+import torch
+from footprints import footprints_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from native.test_against_oracle import check_gradients, check_images, draw_pair, gradients
+
+from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.testing import scenes
+from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs
+
+ALONE = {
+    "mip": {"compensation": "mip", "dilation": 0.1},
+    "near": {"near": 2.5},
+    "offsets": {"offsets": True},
+    "absolute gradient": {"absolute_gradient": True},
+    "low cap": {"alpha_max": 0.5},
+    "capped gradient": {"alpha_max": 0.6, "cap_gradient": False},
+    "no cap": {"alpha_max": 1.0, "cap_gradient": False},
+    "1 feature": {"features": 1},
+    "8 features": {"features": 8},
+    "features, colours, offsets": {"features": 3, "colors": True, "offsets": True},
+}
+
+
+def dialect(seed: int, n: int = 60, width: int = 41, height: int = 29, **kind) -> RasterInputs:
+    """A random scene; what is not one of its own options is set on the inputs."""
+    of_scene = {"features", "offsets", "compensation", "colors", "cov3d", "sh_degree"}
+    made = scenes.random_scene(
+        seed, n, width, height, **{k: v for k, v in kind.items() if k in of_scene}
+    )
+    return replace(made, **{k: v for k, v in kind.items() if k not in of_scene})
+
+
+def flat(inputs: RasterInputs) -> RasterInputs:
+    """The same as footprints of float32, projected in float64."""
+    return scenes.cast(footprints_of(scenes.cast(inputs, torch.float64)), torch.float32)
+
+
+@pytest.mark.parametrize("thresholded", [False, True], ids=["untruncated", "truncated"])
+@pytest.mark.parametrize("entry", ["splats", "footprints"])
+@pytest.mark.parametrize("kind", ALONE)
+def test_images_and_gradients_equal_the_oracle(
+    engine: CpuEngine, kind: str, entry: str, thresholded: bool
+) -> None:
+    inputs = dialect(5, **ALONE[kind])
+    if entry == "footprints":
+        inputs = flat(inputs)
+    thresholds = scenes.random_thresholds(5, 60) if thresholded else None
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    assert torch.equal(truth.radii, ours.radii)
+    check_images(truth, ours, same)
+    check_gradients(engine, inputs, thresholds, same)
+
+
+@st.composite
+def dialects(draw: st.DrawFn) -> tuple[RasterInputs, torch.Tensor | None]:
+    """Everything mixed."""
+    seed, n = draw(st.integers(0, 2**20)), draw(st.sampled_from([0, 1, 2, 9, 40]))
+    width, height = draw(st.sampled_from([(1, 1), (7, 33), (17, 15), (35, 21)]))
+    inputs = dialect(
+        seed,
+        n,
+        width,
+        height,
+        features=draw(st.sampled_from([0, 1, 2, 3, 8])),
+        offsets=draw(st.booleans()),
+        compensation=draw(st.sampled_from(get_args(Compensation))),
+        dilation=draw(st.sampled_from([0.05, 0.1, 0.3])),
+        near=draw(st.sampled_from([0.05, 0.2, 2.0])),
+        alpha_max=draw(st.sampled_from([0.7, 0.99, 0.999])),
+        cap_gradient=draw(st.booleans()),
+        absolute_gradient=draw(st.booleans()),
+        scores=draw(st.booleans()),
+        colors=draw(st.booleans()),
+        cov3d=draw(st.booleans()),
+    )
+    if draw(st.booleans()):
+        inputs = flat(inputs)
+    return inputs, scenes.random_thresholds(seed, n) if draw(st.booleans()) else None
+
+
+@settings(max_examples=60)
+@given(case=dialects())
+def test_all_mixed_equal_the_oracle(
+    engine: CpuEngine, case: tuple[RasterInputs, torch.Tensor | None]
+) -> None:
+    inputs, thresholds = case
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    if not torch.equal(truth.radii, ours.radii):
+        assert (truth.radii - ours.radii).abs().max() <= 1
+        return  # 3 sigma within rounding of an integer: a whole tile more or less, rightly
+    check_images(truth, ours, same)
+    # In images of a few pixels the terms of a gradient may cancel, with nothing to average over;
+    # a determinant of the third digit is the rounding of the fourth.
+    check_gradients(engine, inputs, thresholds, same, 1e-2)
+    if inputs.scores:
+        check_scores(truth, ours, same)
+
+
+def check_scores(truth: RasterOutputs, ours: RasterOutputs, same: torch.Tensor) -> None:
+    """Weights and winners where rounding does not decide."""
+    agree = truth.winners == ours.winners
+    assert (~agree & same).sum() <= 1 + same.numel() // 500
+    assert torch.equal(ours.winners >= 0, ours.fragments > 0)
+    wins = ours.winners[ours.winners >= 0].bincount(minlength=len(ours.radii))
+    assert torch.equal(wins.int(), ours.wins_per_gaussian)
+    away = (truth.weights_per_gaussian - ours.weights_per_gaussian).abs()
+    assert (away <= 1e-5 * truth.weights_per_gaussian + 1.0 * (~same).sum() + 1e-6).all()
+    light = ours.alpha.double().sum().item()
+    assert ours.weights_per_gaussian.double().sum().item() == pytest.approx(light, rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("size", [(1, 1), (50, 37), (129, 18)])
+def test_scores_equal_the_oracles(engine: CpuEngine, seed: int, size: tuple[int, int]) -> None:
+    inputs = replace(scenes.random_scene(seed, 300, *size), scores=True)
+    for thresholds in (None, scenes.random_thresholds(seed, 300)):
+        truth, ours, same = draw_pair(engine, inputs, thresholds)
+        check_images(truth, ours, same)
+        check_scores(truth, ours, same)
+
+
+def test_the_largest_weight_wins_wherever_it_lies(engine: CpuEngine) -> None:
+    scene = footprints_of(scenes.stack([0.5, 0.25, 0.125]))
+    scene.splats.means2d[:] = 8.0
+    scene.splats.depths[:] = torch.tensor([3.0, 2.0, 1.0])
+    scene.splats.opacities[:] = torch.tensor([0.5, 0.5, 0.5])  # a half, a quarter, an eighth
+    assert engine.rasterize(replace(scene, scores=True), None).winners[8, 8] == 2
+    scene.splats.opacities[:] = torch.tensor([0.5, 2 / 3, 0.25])  # a quarter, a half, an eighth
+    assert engine.rasterize(replace(scene, scores=True), None).winners[8, 8] == 1
+
+
+def test_scores_and_features_change_nothing_else(engine: CpuEngine) -> None:
+    inputs = scenes.random_scene(4, 200, 61, 43)
+    features = torch.rand(200, 5, generator=torch.Generator().manual_seed(0))
+    asked = replace(
+        inputs,
+        splats=replace(inputs.splats, features=features),
+        scores=True,
+        absolute_gradient=True,
+        sample_offsets=torch.zeros(43, 61, 2),
+    )
+    plain, more = engine.rasterize(inputs, None), engine.rasterize(asked, None)
+    for name in ("image", "invdepth", "alpha", "radii"):
+        assert torch.equal(getattr(plain, name), getattr(more, name)), name
+    same = torch.ones(43, 61, dtype=torch.bool)
+    asked = replace(asked, splats=inputs.splats)
+    first, second = (gradients(engine, case, None, same, 0.0) for case in (inputs, asked))
+    for name, grad in first.items():
+        columns = slice(0, 2) if name == "means2d_hook" else slice(None)
+        assert torch.equal(grad[..., columns], second[name][..., columns]), name
+
+
+def test_features_without_a_gradient_from_above_get_zeros(engine: CpuEngine) -> None:
+    made, leaves = scenes.leaves(scenes.random_scene(0, features=2))
+    engine.rasterize(made, None).image.sum().backward()
+    assert leaves["features"].grad is None or not leaves["features"].grad.any()
+    assert leaves["means"].grad.any()
+
+
+@pytest.mark.parametrize("kind", [{}, {"compensation": "mip"}, {"features": 2, "offsets": True}])
+def test_footprints_draw_and_learn_what_the_splats_do(engine: CpuEngine, kind: dict) -> None:
+    """Projected in torch, drawn by the engine, and back through both."""
+    inputs = replace(dialect(2, **kind), absolute_gradient=True)
+    thresholds = scenes.random_thresholds(2, 60)
+    whole = engine.rasterize(inputs.with_counts(), thresholds)
+    found = []
+    for case in (inputs, scenes.cast(inputs, torch.float64)):
+        made, leaves = scenes.leaves(case)
+        leaves["thresholds"] = tau = thresholds.to(case.view.background).clone().requires_grad_()
+        projected = made if case is inputs else footprints_of(made)
+        out = engine.rasterize(projected.with_counts(), tau)
+        same = whole.fragments == out.fragments
+        assert (~same).sum() <= 2
+        picture = torch.cat([out.image, out.invdepth, out.alpha])
+        weights = torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)) - 0.3
+        (picture * weights * same).sum().backward()
+        found.append({name: leaf.grad for name, leaf in leaves.items()})
+    for name, expected in found[0].items():
+        if expected is not None:
+            scale = expected.abs().max().item() + 1e-3
+            assert (found[1][name] - expected).abs().max().item() < 1e-3 * scale, name
+
+
+def test_footprints_that_cannot_be_drawn_are_culled(engine: CpuEngine) -> None:
+    scene = footprints_of(scenes.stack([0.5] * 9))
+    splats = scene.splats
+    splats.conics[0, 0] = -1.0
+    splats.conics[1, 1] = 9.0
+    splats.depths[2] = 0.0
+    splats.tiles[3] = torch.tensor([1, 1, 1, 2], dtype=torch.int32)
+    splats.means2d[4, 0] = math.nan
+    splats.depths[5] = math.inf
+    splats.opacities[6] = math.nan
+    splats.tiles[7] = torch.tensor([-(2**31), -5, 2**31 - 1, 2**31 - 1], dtype=torch.int32)
+    made, leaves = scenes.leaves(scene)
+    drawn = engine.rasterize(made.with_counts(), None)
+    assert (drawn.fragments_per_gaussian > 0).tolist() == [False] * 7 + [True] * 2
+    drawn.image.sum().backward()
+    for name in ("means2d", "conics", "opacities", "colors"):
+        assert not leaves[name].grad[:7].any(), name
+        assert leaves[name].grad.isfinite().all(), name
+
+
+def test_a_broken_feature_takes_only_its_gaussian_along(engine: CpuEngine) -> None:
+    inputs = scenes.random_scene(1, 40, features=2)
+    inputs.splats.features[7, 1] = math.nan
+    opacities = inputs.splats.opacities.clone()
+    opacities[7] = 0.0
+    absent = replace(
+        inputs,
+        splats=replace(
+            inputs.splats, opacities=opacities, features=inputs.splats.features.nan_to_num()
+        ),
+    )
+    found, expected = engine.rasterize(inputs, None), engine.rasterize(absent, None)
+    assert torch.equal(found.image, expected.image)
+    assert torch.equal(found.features, expected.features)
+
+
+def test_offsets_beyond_all_bounds_are_refused(engine: CpuEngine) -> None:
+    from fragprune_plugins.errors import EngineError
+
+    inputs = scenes.random_scene(0)
+    for wild in (math.nan, math.inf, 2e6):
+        offsets = torch.zeros(28, 40, 2)
+        offsets[3, 4, 1] = wild
+        with pytest.raises(EngineError, match="sample_offsets"):
+            engine.rasterize(replace(inputs, sample_offsets=offsets), None)
+
+
+@pytest.mark.parametrize("far", [3.0, 40.0])
+def test_offsets_may_reach_far(engine: CpuEngine, far: float) -> None:
+    inputs = scenes.random_scene(3, 60, 41, 29, offsets=True)
+    inputs = replace(inputs, sample_offsets=inputs.sample_offsets * 2 * far)
+    truth, ours, same = draw_pair(engine, inputs, None)
+    check_images(truth, ours, same)
+    check_gradients(engine, inputs, None, same)
+
+
+def test_the_oracle_and_the_engine_take_the_same_footprints(engine: CpuEngine) -> None:
+    scene = flat(scenes.random_scene(9, 80, 50, 41, features=1))
+    expected = ReferenceEngine().rasterize(scene.with_counts(), None)
+    found = engine.rasterize(scene.with_counts(), None)
+    assert (expected.fragments != found.fragments).sum() <= 4
+    assert (expected.fragments_per_gaussian - found.fragments_per_gaussian).abs().sum() <= 4
