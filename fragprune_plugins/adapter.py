@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from fragprune_plugins.detect import Finding, HostRepo, Match, check_seams
 from fragprune_plugins.seams import Seam
@@ -64,8 +64,10 @@ class HostCall:
         entry: str = "",
     ) -> HostCall:
         """Name every argument by the function's signature; what it takes as ``**more`` as given."""
-        bound = inspect.signature(function).bind(*args, **kwargs).arguments
-        return cls(settings, bound | bound.get("more", {}), entry)
+        bound = inspect.signature(function).bind(*args, **kwargs)
+        bound.apply_defaults()
+        named = bound.arguments
+        return cls(settings, named | named.get("more", {}), entry)
 
     def get(self, name: str) -> Tensor | None:
         """A tensor argument; None when it is absent, None or empty (hosts pass all three)."""
@@ -94,6 +96,9 @@ class RowTrace:
 class Dialect(ABC):
     """A host's rasterizer call contract, for one revision of the host."""
 
+    means: ClassVar[str] = "means3D"
+    """What the call names the (N, 3) means."""
+
     @abstractmethod
     def unpack(self, call: HostCall) -> RasterInputs:
         """The host's call as core values."""
@@ -103,14 +108,15 @@ class Dialect(ABC):
         """What the host expects back, arity and all."""
 
     def answer(
-        self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
     ) -> Any:
         """Draw and pack; a dialect may draw several times where one picture does not say it all.
 
         Args:
             call: the host's.
             inputs: what ``unpack`` made of it.
-            draw: rasterizes, with the thresholds that apply to this call.
+            draw: rasterizes inputs, with the thresholds that apply to this call; where one call
+                is of several cameras, a second argument numbers them from 0.
         """
         return self.pack(draw(inputs), call)
 
@@ -121,6 +127,10 @@ class Dialect(ABC):
         Args:
             draw: answers a host call without thresholds.
         """
+
+    def stands_in(self, call: HostCall) -> bool:
+        """Whether ours must answer a call because the host's own function could not."""
+        return False
 
     def present(self, package: str) -> bool:
         """Whether the host can import this compiled package of its own here."""
@@ -279,7 +289,10 @@ class HostAdapter(ABC):
 
     def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
         """The model that a seam's call is about: what the method was called on, unless a host has
-        trainers, or functions, that change models."""
+        trainers, or functions, that change models.
+
+        The tensor of its means will do where a call has no more; None where it is of no concern.
+        """
         return instance
 
     @abstractmethod
@@ -303,27 +316,46 @@ class HostAdapter(ABC):
         """Parameters moved by an optimizer that is out of our reach; frozen as the rest is."""
         return []
 
-    @abstractmethod
+    def _lacks(self, method: str, reason: str) -> NotImplementedError:
+        return NotImplementedError(f"{type(self).__name__}.{method}: needed for {reason}")
+
     def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
         """Rows that a densify method is about to copy, one per row it will append, in order."""
+        raise self._lacks("parents", "PARENTS seams")
 
-    @abstractmethod
     def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
         """Whether appended rows are copies of those parents; asked before they are appended."""
+        raise self._lacks("check_children", "PARENTS and COPY seams")
 
     def stand_still(self, wrapped: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
         """What a STILL seam returns in stage 2 in place of the host's call, which is not made."""
         return None
 
     @contextmanager
-    def tracing(self, model: Any, arguments: Mapping[str, Any]) -> Iterator[RowTrace]:
+    def tracing(
+        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
+    ) -> Iterator[RowTrace]:
         """Around the call of a REARRANGE seam: have the host's own code carry row numbers along.
+
+        Args:
+            model: whose rows change.
+            wrapped: the host's function.
+            arguments: of the call.
 
         Yields:
             The trace; it must be complete once the block is left.
         """
-        raise NotImplementedError(f"{self.name} has a REARRANGE seam and no tracing()")
+        raise self._lacks("tracing", "a REARRANGE seam")
         yield
+
+    def file_at(self, method: str, path: Path) -> Path:
+        """The file that a SAVE or LOAD seam's path stands for: some hosts leave endings out.
+
+        Args:
+            method: the seam's function, without its class.
+            path: as the host passed it.
+        """
+        return path
 
     def packed(self, arguments: Mapping[str, Any], result: Any) -> tuple[Path, Tensor] | None:
         """The file that a PACK seam's call has written or an UNPACK seam's has read.
@@ -338,13 +370,13 @@ class HostAdapter(ABC):
         """
         return None
 
-    @abstractmethod
     def checkpoint_state(self, capture: Any) -> dict[str, Any]:
         """The dict inside the host's checkpoint tuple that tolerates a key of ours."""
+        raise self._lacks("checkpoint_state", "CAPTURE and RESTORE seams")
 
-    @abstractmethod
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
         """Write a checkpoint the host can resume from, made from its PLY."""
+        raise self._lacks("checkpoint_from_ply", "checkpoints")
 
     def before_restore(self, model: Any, capture: Any) -> Any:
         """A chance to complete a checkpoint that lacks something; returns it."""
@@ -364,10 +396,10 @@ class HostAdapter(ABC):
         model.save_ply(str(path))
         return path
 
-    @abstractmethod
     def model_file(self, output: Path, iteration: int) -> Path:
         """Where the host saves its model at an iteration."""
+        raise self._lacks("model_file", "a training script")
 
-    @abstractmethod
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
         """Resumable files in an output folder, (iteration, checkpoint or PLY), oldest first."""
+        raise self._lacks("saved_iterations", "a training script")

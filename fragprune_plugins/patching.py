@@ -79,6 +79,7 @@ class PatchLedger:
             module, seam, handle = self._wrapped.pop()
             try:
                 wrapt.unwrap_object(module, seam.attribute, handle)
+                _rebind(seam.attribute, handle, module)
             except (wrapt.WrapperNotOutermostError, wrapt.WrapperNotFoundError) as error:
                 findings.append(
                     Finding(
@@ -147,3 +148,10 @@ class PatchLedger:
                 "activation before the host's imports",
                 "Start the host with fragprune run, or call activate() above those imports.",
             )
+
+
+def _rebind(name: str, ours: Any, module: ModuleType) -> None:
+    """Copies that others made by ``from module import name`` become what the module has again."""
+    for other in list(sys.modules.values()):
+        if getattr(other, "__dict__", {}).get(name) is ours:
+            setattr(other, name, getattr(module, name))

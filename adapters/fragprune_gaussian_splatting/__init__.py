@@ -185,7 +185,9 @@ class GaussianSplatting(GraphdecoAdapter):
         return None
 
     @contextmanager
-    def tracing(self, model: Any, arguments: Mapping[str, Any]) -> Iterator[RowTrace]:
+    def tracing(
+        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
+    ) -> Iterator[RowTrace]:
         """Row numbers ride along as one more coefficient of the colour, which densifiers only copy.
 
         The bits of an integer, not its value: every row number is exact.
