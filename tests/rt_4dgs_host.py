@@ -254,7 +254,8 @@ class Added:
     def add_densification_stats(self, viewspace_point_tensor, update_filter, avg_t_grad=None):
         moved = torch.norm(viewspace_point_tensor.grad[update_filter, :2], dim=-1, keepdim=True)
         self.xyz_gradient_accum[update_filter] += moved
-        self.t_gradient_accum[update_filter] += avg_t_grad[update_filter]
+        if self.gaussian_dim == 4:
+            self.t_gradient_accum[update_filter] += avg_t_grad[update_filter]
         self.denom[update_filter] += 1
 
 
