@@ -213,6 +213,14 @@ def _read_vertices(path: Path) -> np.ndarray[Any, Any]:
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
         raise ModelFileError(str(path), found, "a trained splat (.ply)", _REMEDY)
+    if path.suffix == ".pth":
+        raise ModelFileError(
+            str(path),
+            "a training codebase's checkpoint, which only that codebase can draw",
+            "a trained splat (.ply)",
+            "Pass its PLY; a host without one (4D models among them) is fine-tuned and drawn "
+            "through its own script, with fragprune run.",
+        )
     try:
         file = PlyData.read(str(path))
         return np.asarray(file["vertex"].data)

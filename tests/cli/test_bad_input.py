@@ -48,6 +48,7 @@ def untouched(out):
     [
         ("model missing", "model-file", "no such file"),
         ("model cut off", "model-file", "not readable as PLY"),
+        ("a checkpoint", "model-file", "4D models among them"),
         ("data missing", "dataset", "no such folder"),
         ("image missing", "dataset", "no such image"),
         ("stale sidecar", "sidecar", "thresholds of another model"),
@@ -61,6 +62,8 @@ def test_refused(scene, tmp_path, how, code, words, command):
         path.unlink()
     elif how == "model cut off":
         path.write_bytes(path.read_bytes()[:-50])
+    elif how == "a checkpoint":
+        path = path.rename(path.with_name("chkpnt30.pth"))
     elif how == "data missing":
         data = tmp_path / "nowhere"
     elif how == "image missing":
