@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import torch
+from miniature import rewrite
 
 from fragprune_plugins import demo
 from fragprune_plugins.testing import Chance, Host
@@ -20,6 +21,7 @@ RELOCATION_MODULE = '''"""The rasterizer package's relocation, with its table ma
 import math
 
 import torch
+from miniature import rewrite
 from diff_gaussian_rasterization import compute_relocation
 
 N_max = 51
@@ -201,15 +203,8 @@ CHANGES = {
 def make(root: Path) -> Path:
     """Write the host into a folder; returns it."""
     shutil.copytree(Path(demo.__file__).with_name("host"), root, dirs_exist_ok=True)
-    for name, changes in CHANGES.items():
-        text = (root / name).read_text()
-        for old, new in changes:
-            assert text.count(old) == 1, (name, old)
-            text = text.replace(old, new)
-        (root / name).write_text(text)
+    rewrite(root, CHANGES, Added)
     (root / "utils" / "reloc_utils.py").write_text(RELOCATION_MODULE)
-    with (root / "scene" / "gaussian_model.py").open("a") as file:
-        file.write("\n" + "".join(inspect.getsourcelines(Added)[0][2:]))
     added = "\n\n".join(inspect.getsource(f) for f in (regularisers, move_in, wander))
     text = (root / "train.py").read_text()
     (root / "train.py").write_text(text.replace("if __name__", added + "\n\nif __name__"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from importlib import import_module
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from miniature import rewrite
 from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.testing.host import Host
@@ -258,14 +258,7 @@ class MipHost(Host):
     def write(self, root: Path) -> None:
         """The demo's host, changed where Mip-Splatting is otherwise."""
         super().write(root)
-        for name, changes in CHANGES.items():
-            text = (root / name).read_text()
-            for old, new in changes:
-                assert text.count(old) == 1, (name, old)
-                text = text.replace(old, new)
-            (root / name).write_text(text)
-        model = root / "scene" / "gaussian_model.py"
-        model.write_text(model.read_text() + "\n" + "".join(inspect.getsourcelines(Added)[0][2:]))
+        rewrite(root, CHANGES, Added)
         (root / "create_fused_ply.py").write_text(FUSE)
 
     def refresh(self, model: Any) -> None:

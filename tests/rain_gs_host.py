@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from miniature import rewrite
 
 from fragprune_plugins.testing.host import Host, densify_and_prune
 
@@ -196,14 +197,7 @@ class RainHost(Host):
     def write(self, root: Path) -> None:
         """The demo's host, changed where RAIN-GS is otherwise; nothing compiles here."""
         super().write(root)
-        for name, changes in CHANGES.items():
-            text = (root / name).read_text()
-            for old, new in changes:
-                assert text.count(old) == 1, (name, old)
-                text = text.replace(old, new)
-            (root / name).write_text(text)
-        model = root / "scene" / "gaussian_model.py"
-        model.write_text(model.read_text() + "\n" + "".join(inspect.getsourcelines(Added)[0][2:]))
+        rewrite(root, CHANGES, Added)
         package = root / PACKAGE / "diff_gaussian_rasterization"
         package.mkdir(parents=True)
         (package / "__init__.py").write_text(BINDING)
