@@ -32,11 +32,11 @@ PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 OWN = ("low_pass", "divide_ratio", "abe_split", "args_dict")
 """A setting of the rasterizer and parameters of the model, of its split and of the scene."""
 
-
 SCENES = (
     *("bicycle", "flowers", "garden", "stump", "treehill"),
     *("room", "counter", "kitchen", "bonsai"),
 )
+"""Scenes of Mip-NeRF 360: where the path holds one's name, the host reads smaller pictures."""
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,7 @@ class RainGS(GraphdecoAdapter):
         return script, rest
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
-        """As vanilla's; views are always held out.
-
-        The host takes smaller pictures where the path holds the name of a scene of Mip-NeRF 360.
-        """
+        """As vanilla's; views are always held out."""
         parser = ArgumentParser(add_help=False)
         parser.add_argument("-s", "--source_path", default="")
         flags, _ = parser.parse_known_args(arguments)
