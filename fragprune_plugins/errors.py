@@ -102,6 +102,12 @@ class PluginError(FragpruneError):
     code = "plugin"
 
 
+class RecordError(FragpruneError):
+    """No figures to report, or a file of them that cannot be read."""
+
+    code = "record"
+
+
 class UsageError(FragpruneError):
     """Options that contradict each other; exit code 2."""
 

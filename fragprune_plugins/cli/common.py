@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
+from fragprune_plugins.records import strict
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -87,7 +88,7 @@ class Command(click.Command):
         except KeyboardInterrupt:
             click.echo("Interrupted.", err=True)
             ctx.exit(130)
-        click.echo(json.dumps(_strict(report.data)) if as_json else report.text)
+        click.echo(json.dumps(strict(report.data)) if as_json else report.text)
         ctx.exit(report.exit_code)
 
 
@@ -291,14 +292,3 @@ _ROWS = (
     ("frame, ms", "frame_ms", 2),
     ("Gaussians", "gaussians", 0),
 )
-
-
-def _strict(value: Any) -> Any:
-    """JSON knows neither NaN nor infinity: null."""
-    if isinstance(value, dict):
-        return {key: _strict(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_strict(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -50,6 +50,7 @@ def command(
     Example:
       fragprune compare point_cloud.ply small.ply --data scene --out pictures
     """
+    from fragprune_plugins import records
     from fragprune_plugins.cli.profile import draw_panels
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.files import writable_folder
@@ -82,5 +83,6 @@ def command(
     if out is not None:
         files = draw_panels(out, columns, shots, rasterizer)
         report["files"] = [str(file) for file in files]
+        records.leave(out / "compare", "compare", report)
         lines.append(f"Wrote {len(files)} pictures to {out}.")
     return Report(report, "\n".join(lines))

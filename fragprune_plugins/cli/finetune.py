@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -21,6 +22,9 @@ from fragprune_plugins.cli.common import (
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.schedule import Settings
+
+if TYPE_CHECKING:
+    from fragprune_plugins.finetuning.loop import Record
 
 
 @click.command("finetune", cls=Command)
@@ -61,7 +65,7 @@ def command(
     if out.resolve() == model.resolve():
         raise UsageError("--out", f"{out}, the model itself", "another file", "Name a new file.")
 
-    from fragprune_plugins import sidecar
+    from fragprune_plugins import records, sidecar
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.errors import OutputError
     from fragprune_plugins.files import writable_folder
@@ -101,23 +105,43 @@ def command(
     if result.interrupted:
         lines.append(f"Interrupted at {result.iterations} of {settings.iterations} iterations.")
     lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.")
-    return Report(
-        {
-            "model": str(model),
-            "out": str(out),
-            "before": before,
-            "after": after,
-            "speedup": result.speedup,
-            "target_reached": result.target_reached,
-            "interrupted": result.interrupted,
-            "iterations": result.iterations,
-            "train_seconds": result.train_seconds,
-            "engine": result.engine,
-            "device": after["device"],
-            "adapter": None,
-            "seed": seed,
-            "settings": settings.as_dict(),
+    report = {
+        "model": str(model),
+        "out": str(out),
+        "before": before,
+        "after": after,
+        "speedup": result.speedup,
+        "target_reached": result.target_reached,
+        "interrupted": result.interrupted,
+        "iterations": result.iterations,
+        "train_seconds": result.train_seconds,
+        "engine": result.engine,
+        "device": after["device"],
+        "adapter": None,
+        "seed": seed,
+        "settings": settings.as_dict(),
+    }
+    more = {
+        "curves": [_row(record) for record in result.records],
+        "photographs": {
+            "folder": str(data.resolve()),
+            "resolution": resolution,
+            "white_background": white_background,
+            "models": [str(model.resolve()), str(out.resolve())],
+            "filtered": False,
+            "drawing": {},
         },
-        "\n".join(lines),
-        exit_code=130 if result.interrupted else 0,
-    )
+    }
+    records.leave(out, "finetune", report | more)
+    return Report(report, "\n".join(lines), exit_code=130 if result.interrupted else 0)
+
+
+def _row(record: Record) -> dict[str, float]:
+    """A point of the curves as a host's run records it."""
+    return {
+        "step": record.step,
+        "loss": record.loss,
+        "fragments_per_pixel": record.fragments_per_pixel,
+        "pressure": record.pressure,
+        "threshold_median": record.thresholds[len(record.thresholds) // 2],
+    }

@@ -59,6 +59,7 @@ def command(
     """
     import torch
 
+    from fragprune_plugins import records
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.files import writable_folder
     from fragprune_plugins.measure import Candidate, measure
@@ -90,6 +91,7 @@ def command(
     if out is not None:
         files = draw_panels(out, columns, shots, rasterizer)
         report["files"] = [str(file) for file in files]
+        records.leave(out / "profile", "profile", report)
         lines.append(f"Wrote {len(files)} pictures to {out}.")
     return Report(report, "\n".join(lines))
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from fragprune_plugins import records
 from fragprune_plugins.cli.common import JSON, Command, Report, describe
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import FragpruneError, UsageError
@@ -103,7 +104,8 @@ def command(
     to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None
     with to_stderr or contextlib.nullcontext():
         summary = run(list(host_command), options)
-        measured = _measure(list(host_command), summary) if evaluate else None
+        photographs = _photographs(list(host_command), summary)
+        measured = _measure(photographs) if evaluate and photographs else None
     data = {
         "adapter": summary.adapter,
         "engine": summary.engine,
@@ -124,6 +126,9 @@ def command(
         "seed": settings.seed,
         "settings": summary.settings,
     }
+    if summary.iterations and summary.model_after:
+        more = {"curves": summary.curves, "photographs": photographs if measured else None}
+        records.leave(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, measured))
 
 
@@ -131,28 +136,40 @@ def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def _measure(host_command: list[str], summary: Any) -> list[dict[str, Any]] | None:
-    """Before and after on held-out views, where our own readers draw what the host would."""
+def _photographs(host_command: list[str], summary: Any) -> dict[str, Any] | None:
+    """What our own readers need to draw what the host would; None where they cannot."""
     source = _flag(host_command, "-s", "--source_path")
     if not (summary.model_before and summary.model_after and source) or summary.drawing is None:
         return None
+    resolution = _flag(host_command, "-r", "--resolution") or "1"
+    return {
+        "folder": str(Path(source).resolve()),
+        "resolution": int(resolution) if resolution in ("1", "2", "4", "8") else 1,
+        "white_background": bool({"-w", "--white_background"} & set(host_command)),
+        "models": [str(summary.model_before.resolve()), str(summary.model_after.resolve())],
+        "filtered": True,
+        "drawing": summary.drawing,
+    }
+
+
+def _measure(photographs: dict[str, Any]) -> list[dict[str, Any]] | None:
+    """Before and after on held-out views."""
     from fragprune_plugins.cli.common import load_model
     from fragprune_plugins.finetuning import load_dataset
     from fragprune_plugins.measure import Candidate, measure
 
-    resolution = _flag(host_command, "-r", "--resolution") or "1"
     try:
         dataset = load_dataset(
-            Path(source),
-            resolution=int(resolution) if resolution in ("1", "2", "4", "8") else 1,
-            white_background=bool({"-w", "--white_background"} & set(host_command)),
+            Path(photographs["folder"]),
+            resolution=photographs["resolution"],
+            white_background=photographs["white_background"],
         )
-        paths = (summary.model_before, summary.model_after)
-        models = [load_model(path, filtered=True) for path in paths]
+        models = [load_model(Path(path), filtered=True) for path in photographs["models"]]
     except FragpruneError as error:
         logging.getLogger("fragprune").warning("not compared on held-out views: %s", error)
         return None
-    return measure([Candidate(*model, summary.drawing) for model in models], dataset.test)
+    candidates = [Candidate(*model, photographs["drawing"]) for model in models]
+    return measure(candidates, dataset.test)
 
 
 def _flag(words: list[str], *names: str) -> str | None:

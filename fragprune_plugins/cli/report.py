@@ -1,0 +1,205 @@
+"""``fragprune report``: what a folder's runs gained, as one page."""
+
+from __future__ import annotations
+
+import base64
+import math
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fragprune_plugins.cli.common import (
+    FILE,
+    Command,
+    Report,
+    describe,
+    engine_options,
+    gain,
+    load_model,
+    set_threads,
+)
+
+if TYPE_CHECKING:
+    from fragprune_plugins.records import Record
+
+PAGE = "report.html"
+
+_SLIDERS = """Views that were held out. Drag the sliders: left of the handle before, right of it
+after; beside it the photograph; below, the fragments that each pixel draws."""
+
+
+@click.command("report", cls=Command)
+@click.argument("folder", metavar="DIR", type=FILE)
+@click.option("--out", type=FILE, help=f"The page; DIR/{PAGE} when left out.")
+@click.option("--data", type=FILE, help="Scene folder, where the one that was used has moved.")
+@engine_options
+def command(
+    folder: Path, out: Path | None, data: Path | None, engine: str, threads: int | None
+) -> Report:
+    """Make one page of what was gained in DIR: a sentence, tables, sliders over views, curves.
+
+    DIR is where run or finetune wrote their models, or compare and profile their pictures (--out).
+    The page is a single file without references to others: it can be mailed. The newest run or
+    fine-tuning comes first; where its photographs are still there, some held-out views are drawn.
+
+    \b
+    Example:
+      fragprune report out
+    """
+    from fragprune_plugins.files import replacing
+    from fragprune_plugins.measure import page
+    from fragprune_plugins.records import find
+
+    set_threads(threads)
+    records = find(folder)
+    main = next((r for r in reversed(records) if r.command in ("run", "finetune")), records[-1])
+    others = [record for record in records if record is not main]
+    line = _sentence(main)
+    with TemporaryDirectory() as name:
+        pictures = Path(name)
+        views, learning, missing = _draw(main, pictures, data, engine)
+        more = [*learning, *_files(records, pictures)]
+        text = page.compose(
+            title=f"fragprune report: {folder.resolve().name}",
+            quote=line,
+            text=[
+                page.preformatted(_table(main)),
+                page.paragraph(missing or (_SLIDERS if views else "")),
+                *(block for record in others for block in _block(record)),
+            ],
+            views=views,
+            pictures=more,
+            source=lambda file: _embedded(pictures / file),
+            ending=["<h2>Settings</h2>", page.preformatted(_facts(main))],
+        )
+    target = out or folder / PAGE
+    with replacing(target) as path:
+        path.write_text(text, encoding="utf-8")
+    report = {
+        "page": str(target),
+        "result": line,
+        "command": main.command,
+        "record": str(main.path),
+        "views": views,
+        "pictures": len(views) * 4 + len(more),
+    }
+    report |= {key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")}
+    return Report(report, "\n".join([line, *([missing] if missing else []), f"Wrote {target}."]))
+
+
+def _columns(record: Record) -> dict[str, dict[str, Any]]:
+    """What a record measured on held-out views, by name."""
+    data = record.data
+    if record.command == "compare":
+        return {"A": data["a"], "B": data["b"]}
+    if record.command == "profile":
+        columns: dict[str, dict[str, Any]] = data["columns"]
+        return columns
+    return {name: data[name] for name in ("before", "after") if data.get(name)}
+
+
+def _table(record: Record) -> str:
+    """The measurements, else what was seen on training views."""
+    columns = _columns(record)
+    if columns:
+        return describe(columns)
+    seen = record.data["training_views"]
+    return "\n".join(f"{key:<30}{_number(value)}" for key, value in seen.items())
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f}"
+
+
+def _sentence(record: Record) -> str:
+    """The outcome in a line one can quote."""
+    columns = list(_columns(record).values())
+    name = record.data.get("adapter") or ""
+    of = f" ({name}, {record.data['iterations']:,} iterations)" if name else ""
+    if len(columns) > 1:
+        return f"{gain(columns[0], columns[-1])}{of}."
+    if columns:
+        return f"{columns[0]['fragments_per_pixel']:.1f} fragments per pixel drawn{of}."
+    seen = record.data["training_views"]
+    before, after = seen["fragments_per_pixel_before"], seen["fragments_per_pixel_after"]
+    if not before or not after:
+        return f"Nothing was learned{of}."
+    return f"{before / after:.2f}x fewer fragments on training views{of}."
+
+
+def _block(record: Record) -> list[str]:
+    """Another record under its heading."""
+    from html import escape
+
+    from fragprune_plugins.measure import page
+
+    where = escape(f"{record.command}: {record.path.name}")
+    return [
+        f"<h2>{where}</h2>",
+        page.paragraph(_sentence(record)),
+        page.preformatted(_table(record)),
+    ]
+
+
+def _facts(record: Record) -> str:
+    """Settings and provenance."""
+    keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
+    facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
+    facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
+    return "\n".join(f"{key:<16}{value}" for key, value in facts.items() if value is not None)
+
+
+def _draw(
+    record: Record, folder: Path, data: Path | None, engine: str
+) -> tuple[list[str], list[tuple[str, str]], str]:
+    """Held-out views and learning curves, drawn into the folder.
+
+    Returns:
+        Names of the views, headed pictures besides, and what is missing and why.
+    """
+    from fragprune_plugins.engines import create_engine
+    from fragprune_plugins.errors import DatasetError, ModelFileError, SidecarError
+    from fragprune_plugins.finetuning.dataset import load_dataset
+    from fragprune_plugins.measure import Candidate, page
+
+    drawn, curves = record.data.get("photographs"), record.data.get("curves")
+    if drawn is None:
+        return [], [], ""
+    learning: list[tuple[str, str]] = []
+    try:
+        models = [load_model(Path(path), filtered=drawn["filtered"]) for path in drawn["models"]]
+        before, after = (Candidate(*model, drawn["drawing"]) for model in models)
+        if curves and after.thresholds is not None:
+            rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
+            page.save_learning(folder / page.LEARNING, rows, after.thresholds)
+            learning = [("How it learned", page.LEARNING)]
+        dataset = load_dataset(
+            data or Path(drawn["folder"]),
+            resolution=drawn["resolution"],
+            white_background=drawn["white_background"],
+        )
+    except (DatasetError, ModelFileError, SidecarError) as error:
+        if data is not None:  # they were asked for
+            raise
+        return [], learning, f"No views are shown: {error}"
+    views = page.draw_views(folder, before, after, dataset.test, create_engine(engine))
+    return list(views), learning, ""
+
+
+def _files(records: list[Record], folder: Path) -> list[tuple[str, str]]:
+    """Pictures that compare and profile have drawn, copied into the folder."""
+    found = []
+    for record in records:
+        for number, name in enumerate(record.data.get("files", ())):
+            file = record.path.parent / Path(name).name
+            if file.is_file():
+                copy = f"{record.path.stem}_{number}.png"
+                (folder / copy).write_bytes(file.read_bytes())
+                found.append((f"{record.command}: {file.stem}", copy))
+    return found
+
+
+def _embedded(file: Path) -> str:
+    return f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"

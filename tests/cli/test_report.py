@@ -1,0 +1,115 @@
+"""``fragprune report``: one page from what commands leave beside their results."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins import records
+
+
+@pytest.fixture(scope="module")
+def finetuned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    data, model, _ = tiny.scene(folder)
+    out = folder / "out"
+    words = ("--data", data, "--iters", 4)
+    figures = run_json("finetune", model, "--out", out / "small.ply", *words)
+    return out, data, figures
+
+
+@pytest.fixture
+def folder(finetuned, tmp_path):
+    out, data, figures = finetuned
+    return shutil.copytree(out, tmp_path / "out"), data, figures
+
+
+def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
+    out, _, figures = folder
+    report = run_json("report", out)
+    page = (out / "report.html").read_text()
+    assert report["page"] == str(out / "report.html")
+    assert report["before"] == figures["before"]
+    assert report["after"] == figures["after"]
+    assert report["command"] == "finetune"
+    fewer = figures["before"]["fragments_per_pixel"] / figures["after"]["fragments_per_pixel"]
+    assert f"{fewer:.2f}x fewer fragments" in report["result"]
+    assert report["result"].replace(">", "&gt;") in page
+    assert len(report["views"]) > 0
+    # every picture is in the page itself: four a view and the curves
+    assert page.count('src="data:image/png;base64,') == report["pictures"]
+    assert report["pictures"] == 4 * len(report["views"]) + 1
+    assert page.count("src=") == report["pictures"]
+    assert "http" not in page
+
+
+def test_as_text_the_result_comes_first(folder):
+    out, _, _ = folder
+    result = run("report", out, "--out", out / "page.html")
+    assert result.exit_code == 0
+    assert "x fewer fragments" in result.stdout.splitlines()[0]
+    assert (out / "page.html").exists()
+    assert not (out / "report.html").exists()
+
+
+def test_comparisons_come_along_with_their_pictures(folder):
+    out, data, _ = folder
+    small = out / "small.ply"
+    run_json("compare", small, small, "--data", data, "--out", out / "pictures")
+    run_json("profile", small, "--data", data, "--out", out / "more")
+    report = run_json("report", out)
+    assert report["command"] == "finetune"
+    page = (out / "report.html").read_text()
+    assert "compare: compare.fragprune.json" in page
+    assert "profile: profile.fragprune.json" in page
+    panels = [*(out / "pictures").glob("*.png"), *(out / "more").glob("*.png")]
+    assert page.count("<h2>compare: ") + page.count("<h2>profile: ") == len(panels) + 2
+    alone = run_json("report", out / "pictures")
+    assert (alone["command"], alone["views"]) == ("compare", [])
+
+
+def test_without_the_photographs_there_are_curves_and_the_reason(folder, tmp_path):
+    out, data, _ = folder
+    (record,) = records.find(out)
+    record.data["photographs"]["folder"] = str(tmp_path / "moved")
+    records.leave(out / "small", "finetune", record.data)
+    result = run("report", out)
+    assert result.exit_code == 0
+    assert "No views are shown: [dataset]" in result.stdout
+    assert run_json("report", out)["pictures"] == 1
+    assert len(run_json("report", out, "--data", data)["views"]) > 0
+    refused = run("report", out, "--data", tmp_path / "nowhere", "--json")
+    assert refused.exit_code == 1
+    assert json.loads(refused.stdout)["error"]["code"] == "dataset"
+
+
+def test_a_run_that_was_not_measured_reports_its_training_views(tmp_path):
+    seen = {"fragments_per_pixel_before": 30.0, "fragments_per_pixel_after": 12.0}
+    data = {"adapter": "my-host", "iterations": 5, "training_views": seen, "photographs": None}
+    records.leave(tmp_path / "point_cloud.ply", "run", data)
+    report = run_json("report", tmp_path)
+    assert report["result"] == ("2.50x fewer fragments on training views (my-host, 5 iterations).")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"format": "another"}'])
+def test_a_record_that_is_none_is_refused(tmp_path, text):
+    (tmp_path / "a.fragprune.json").write_text(text)
+    result = run("report", tmp_path)
+    assert result.exit_code == 1
+    assert result.stderr.startswith("[record] ")
+
+
+def test_a_folder_without_records_says_what_to_run(tmp_path):
+    result = run("report", tmp_path)
+    assert result.exit_code == 1
+    assert "fragprune run, finetune" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_figures_that_are_not_numbers_are_null(tmp_path):
+    path = records.leave(tmp_path / "a.ply", "run", {"loss": float("nan")})
+    assert json.loads(path.read_text())["data"] == {"loss": None}
