@@ -1,0 +1,187 @@
+"""nerfstudio-project/gsplat: a library. The training loop, and so the command line, is the user's.
+
+A model is a ``ParameterDict`` with an optimizer per key. One function, ``rasterization``, projects
+and draws; strategies change rows through a handful of functions that treat every key alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.adapter import CommandLine, Dialect, HostAdapter, HostInfo, RowTrace
+from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.errors import SessionError, UsageError
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.seams import Role, Seam
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+PACKAGE = "gsplat"
+RENDERING, OPERATIONS = f"{PACKAGE}.rendering", f"{PACKAGE}.strategy.ops"
+DEFAULT, MCMC = f"{PACKAGE}.strategy.default", f"{PACKAGE}.strategy.mcmc"
+ROWS = "fragprune_rows"
+"""Key under which row numbers ride along while a strategy changes rows."""
+GROUPS = {
+    "means": "xyz",
+    "sh0": "f_dc",
+    "shN": "f_rest",
+    "opacities": "opacity",
+    "scales": "scaling",
+    "quats": "rotation",
+}
+"""gsplat's keys and what the rest of the field calls them."""
+
+
+def _operation(name: str, *needs: str) -> Seam:
+    return Seam(Role.REARRANGE, OPERATIONS, name, ("params", "optimizers", *needs))
+
+
+class Gsplat(HostAdapter):
+    """gsplat, the library."""
+
+    name = "gsplat"
+    info = HostInfo("gsplat", repo="nerfstudio-project/gsplat", states="1.5, 1.6 (pinhole cameras)")
+    installed = (PACKAGE,)
+    steps_by_rendering = True
+    seams = (
+        Seam(Role.RASTERIZE, RENDERING, "rasterization", ("means", "opacities", "viewmats", "Ks")),
+        Seam(Role.VIEW, RENDERING, "rasterization", ("viewmats",)),
+        Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
+        Seam(
+            Role.ATTACH,
+            f"{PACKAGE}.strategy.base",
+            "Strategy.check_sanity",
+            ("params", "optimizers"),
+        ),
+        _operation("duplicate", "mask"),
+        _operation("split", "mask"),
+        _operation("remove", "mask"),
+        _operation("relocate", "mask"),
+        _operation("sample_add", "n"),
+        Seam(Role.STILL, OPERATIONS, "reset_opa", ("params",)),
+        Seam(Role.STILL, OPERATIONS, "inject_noise_to_position", ("params",)),
+        Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_pre_backward", ("params",)),
+        Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_post_backward", ("params",)),
+        Seam(Role.STILL, MCMC, "MCMCStrategy.step_post_backward", ("params",)),
+        Seam(Role.SAVE, f"{PACKAGE}.exporter", "export_splats", ("save_to", "means", "format")),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """The installed package."""
+        if repo.package == PACKAGE:
+            return [Finding("info", "revision", PACKAGE, repo.commit)]
+        return [
+            Finding(
+                "error",
+                "other-host",
+                str(repo.root),
+                "a folder",
+                "the installed package gsplat, or a script that imports it",
+                "Use the adapter of that host.",
+            )
+        ]
+
+    def dialect(self, repo: HostRepo) -> Dialect:
+        """Until 1.5 alpha is capped at 0.999 and the antialiasing factor has no floor."""
+        from fragprune_gsplat.dialect import GsplatDialect
+
+        if "1.6" in repo.commit or repo.path(f"{PACKAGE}.cuda._constants"):
+            return GsplatDialect(alpha_max=0.99, floor=0.005)
+        return GsplatDialect(alpha_max=0.999, floor=0.0)
+
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """There is none: a library is trained by whatever script its user wrote."""
+        raise UsageError(
+            "fragprune run",
+            "gsplat, a library without a training command",
+            'fragprune_plugins.activate("gsplat") in your own script',
+            "See the how-to page of gsplat.",
+        )
+
+    def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
+        """The dict a strategy changes; the means where a call has only them."""
+        import torch
+
+        params = arguments.get("params", arguments.get("means"))
+        if isinstance(params, dict):
+            raise SessionError(
+                "params",
+                "a dict, of which nothing can be remembered",
+                "torch.nn.ParameterDict",
+                "Make one of it: params = torch.nn.ParameterDict(params).",
+            )
+        if arguments.get("format", "ply") != "ply":
+            return None  # other formats sort their rows
+        return params if isinstance(params, torch.nn.ParameterDict | torch.Tensor) else None
+
+    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
+        """One for each key."""
+        return list(arguments["optimizers"].values())
+
+    def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
+        """By the parameter: users name their groups as they like, or not at all."""
+        (parameter,) = group["params"]
+        return next((GROUPS.get(key, key) for key, own in model.items() if own is parameter), None)
+
+    def trained_groups(self, train: str) -> frozenset[str] | None:
+        """opacity, or with both SH groups; None for all."""
+        return {
+            "opacity": frozenset({"opacity"}),
+            "appearance": frozenset({"opacity", "f_dc", "f_rest", "colors"}),
+            "all": None,
+        }[train]
+
+    def rows(self, model: Any) -> int:
+        """From the means."""
+        return len(model["means"])
+
+    def means(self, model: Any) -> Tensor:
+        """The parameter itself."""
+        means: Tensor = model["means"]
+        return means
+
+    def opacities(self, model: Any) -> Tensor:
+        """(N,) after the sigmoid."""
+        opacities: Tensor = model["opacities"]
+        return opacities.detach().sigmoid().reshape(-1)
+
+    def view(self, camera: Any) -> int:
+        """By the numbers: loaders make a new tensor for every step."""
+        return hash(camera.detach().cpu().numpy().tobytes())
+
+    @contextmanager
+    def tracing(
+        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
+    ) -> Iterator[RowTrace]:
+        """Row numbers ride along as one more key; without an optimizer gsplat takes it for frozen.
+
+        float64 holds every row number exactly.
+        """
+        import torch
+
+        rows, trace = len(model["means"]), RowTrace()
+        numbers = torch.arange(rows, dtype=torch.float64, device=model["means"].device)
+        model[ROWS] = torch.nn.Parameter(numbers, requires_grad=False)
+        try:
+            yield trace
+        finally:
+            origins = model.pop(ROWS).detach().long()
+        places = torch.arange(len(origins), device=origins.device)
+        fresh = torch.zeros_like(places, dtype=torch.bool)
+        name = wrapped.__name__
+        if name == "duplicate":
+            fresh = places >= rows
+        elif name == "split":
+            fresh = places >= len(places) - 2 * int(arguments["mask"].sum())
+        elif name in ("relocate", "sample_add"):  # parents are made over too
+            fresh = torch.bincount(origins, minlength=rows)[origins] > 1
+        trace.origins, trace.fresh = origins, fresh
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Offer gsplat."""
+    register(Gsplat())

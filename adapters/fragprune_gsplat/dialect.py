@@ -1,0 +1,284 @@
+"""The call contract of gsplat's ``rasterization``: one function, any number of cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from types import ModuleType, SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from fragprune_gsplat.projection import TILE, Projection, Rules, covariances, project
+from fragprune_plugins.adapter import Dialect, HostCall
+from fragprune_plugins.errors import InputError
+from fragprune_plugins.lineage.harmonics import basis
+from fragprune_plugins.types import Footprints, RasterInputs, View
+
+if TYPE_CHECKING:
+    from fragprune_plugins.types import RasterOutputs
+
+BACKEND = "gsplat.cuda._backend"
+MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+ONLY: dict[str, tuple[Any, ...]] = {
+    "camera_model": ("pinhole",),
+    "render_mode": MODES,
+    "tile_size": (None, TILE),
+    "distributed": (False,),
+    "with_ut": (False,),
+    "with_eval3d": (False,),
+    "return_normals": (False,),
+    "global_z_order": (True,),
+    **dict.fromkeys(
+        (
+            *("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs"),
+            *("lidar_coeffs", "external_distortion_coeffs", "rays", "viewmats_rs"),
+            *("ut_params", "extra_signals", "renderer_config"),
+        ),
+        (None,),
+    ),
+}
+"""What we draw; the argument's other values are refused by name."""
+MAX_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class Cameras(RasterInputs):
+    """The first camera's inputs, and with them those of the others and what all were made of.
+
+    Attributes:
+        others: of the further cameras.
+        projections: of every camera.
+        shown: (C, N, 2) the means that the blending starts from, or (nnz, 2) in packed calls; what
+            strategies take gradients of.
+    """
+
+    others: tuple[RasterInputs, ...] = ()
+    projections: tuple[Projection, ...] = ()
+    shown: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class GsplatDialect(Dialect):
+    """``rasterization`` of one version.
+
+    Attributes:
+        alpha_max: its cap on alpha; gradients are zero where it holds.
+        floor: least antialiasing factor.
+    """
+
+    means = "means"
+    alpha_max: float
+    floor: float
+
+    def unpack(self, call: HostCall) -> Cameras:
+        """Project for every camera; the engine only blends."""
+        given = call.arguments
+        self._refuse(call)
+        means, count = given["means"], len(given["viewmats"])
+        rules = Rules(
+            eps2d=given["eps2d"],
+            near=given["near_plane"],
+            far=given["far_plane"],
+            radius_clip=given["radius_clip"],
+            antialiased=given["rasterize_mode"] == "antialiased",
+            floor=self.floor,
+        )
+        covars = given["covars"]
+        covars = covariances(given["quats"], given["scales"]) if covars is None else covars
+        size = given["width"], given["height"]
+        projections = tuple(
+            project(means, covars, given["opacities"], viewmat, K, *size, rules)
+            for viewmat, K in zip(given["viewmats"], given["Ks"], strict=True)
+        )
+        means2d = torch.stack([each.means2d for each in projections])
+        shown = means2d
+        if given["packed"]:  # strategies take the gradients of visible rows alone
+            where = torch.stack([each.visible for each in projections]).nonzero(as_tuple=True)
+            shown = means2d[where]
+            means2d = torch.zeros_like(means2d).index_put(where, shown)
+        drawn = [self._inputs(call, k, projections[k], means2d[k]) for k in range(count)]
+        first = {field.name: getattr(drawn[0], field.name) for field in fields(RasterInputs)}
+        return Cameras(**first, others=tuple(drawn[1:]), projections=projections, shown=shown)
+
+    def _inputs(
+        self, call: HostCall, k: int, projection: Projection, means2d: Tensor
+    ) -> RasterInputs:
+        given = call.arguments
+        background = given["backgrounds"]
+        depth = "D" in given["render_mode"]
+        viewmat, K = given["viewmats"][k].detach(), given["Ks"][k].detach()
+        return RasterInputs(
+            view=View.pinhole(
+                viewmat[:3, :3],
+                viewmat[:3, 3],
+                width=given["width"],
+                height=given["height"],
+                **{name: float(K[at]) for name, at in _INTRINSICS.items()},
+                background=None
+                if background is None or not self._coloured(call)
+                else background[k],
+            ),
+            splats=Footprints(
+                means2d=means2d - 0.5,
+                conics=projection.conics,
+                depths=projection.depths,
+                opacities=projection.opacities,
+                colors=self._colors(call, k),
+                tiles=projection.tiles,
+                features=projection.depths[:, None] if depth else None,
+            ),
+            alpha_max=self.alpha_max,
+            cap_gradient=False,
+        )
+
+    @staticmethod
+    def _coloured(call: HostCall) -> bool:
+        return "RGB" in str(call.arguments["render_mode"])
+
+    def _colors(self, call: HostCall, k: int) -> Tensor:
+        """(N, 3) of one camera; SH are evaluated as gsplat does, half a unit added, not below 0."""
+        given = call.arguments
+        means, degree = given["means"], given["sh_degree"]
+        colors: Tensor = given["colors"]
+        if not self._coloured(call):
+            return torch.zeros_like(means)
+        if colors.ndim == (3 if degree is None else 4):
+            colors = colors[k]
+        if degree is None:
+            return colors
+        campos = torch.linalg.inv(given["viewmats"][k])[:3, 3]
+        directions = torch.nn.functional.normalize(means - campos, dim=-1)
+        harmonics = basis(directions, degree)
+        used = colors[:, : harmonics.shape[1]]
+        return (torch.einsum("nk,nkc->nc", harmonics, used) + 0.5).clamp_min(0)
+
+    @staticmethod
+    def _refuse(call: HostCall) -> None:
+        """Name what we do not draw."""
+        given = call.arguments
+        for name, known in ONLY.items():
+            value = given.get(name, known[0])
+            if not any(value is each or value == each for each in known):
+                raise InputError(
+                    f"gsplat.rasterization({name}=)",
+                    repr(value)[:60],
+                    " or ".join(map(repr, known)),
+                    "Draw this without thresholds: with fragprune_plugins.paused(): ...",
+                )
+        degree, colors = given["sh_degree"], given["colors"]
+        checks = (
+            ("means", given["means"].ndim == 2, "(N, 3), no batches in front"),
+            ("colors", colors is None or colors.shape[-1] == 3, "three channels"),
+            ("sh_degree", degree is None or degree <= MAX_DEGREE, f"at most {MAX_DEGREE}"),
+            (
+                "absgrad",
+                not (given["absgrad"] and torch.is_grad_enabled() and given["means"].requires_grad),
+                "False where positions train: our engines sum it over both axes",
+            ),
+        )
+        for name, holds, expected in checks:
+            if not holds:
+                raise InputError(
+                    f"gsplat.rasterization({name}=)", "another", expected, "Change the call."
+                )
+
+    def answer(
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
+    ) -> Any:
+        """Draw camera after camera."""
+        assert isinstance(inputs, Cameras)
+        drawn = [draw(each, part) for part, each in enumerate((inputs, *inputs.others))]
+        return self._pack(drawn, inputs, call)
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
+        """One camera's (colors, alphas, meta)."""
+        inputs = self.unpack(call)
+        return self._pack([outputs], inputs, call)
+
+    def _pack(self, drawn: list[RasterOutputs], inputs: Cameras, call: HostCall) -> Any:
+        """(colors (C, H, W, X), alphas (C, H, W, 1), meta); X by ``render_mode``."""
+        given = call.arguments
+        mode = given["render_mode"]
+        alphas = torch.stack([each.alpha for each in drawn]).permute(0, 2, 3, 1)
+        channels = [torch.stack([each.image for each in drawn])] if self._coloured(call) else []
+        if "D" in mode:
+            depths = torch.stack([d for each in drawn if (d := each.features) is not None])
+            expected = mode.endswith("ED")
+            weight = alphas.permute(0, 3, 1, 2).clamp_min(1e-10) if expected else 1.0
+            channels.append(depths / weight)
+        colors = torch.cat(channels, dim=1).permute(0, 2, 3, 1)
+        return colors, alphas, self._meta(inputs, call)
+
+    @staticmethod
+    def _meta(inputs: Cameras, call: HostCall) -> dict[str, Any]:
+        """What strategies read; the lists of intersections of the host's kernels are not there."""
+        given = call.arguments
+        stacked = {
+            name: torch.stack([getattr(each, name) for each in inputs.projections])
+            for name in ("radii", "depths", "conics", "opacities")
+        }
+        ids: tuple[Tensor | None, Tensor | None] = (None, None)
+        if given["packed"]:
+            visible = torch.stack([each.visible for each in inputs.projections])
+            camera, row = visible.nonzero(as_tuple=True)
+            ids = camera, row
+            stacked = {name: values[camera, row] for name, values in stacked.items()}
+        return {
+            "batch_ids": None if ids[0] is None else torch.zeros_like(ids[0]),
+            "camera_ids": ids[0],
+            "gaussian_ids": ids[1],
+            "means2d": inputs.shown,
+            **stacked,
+            "width": given["width"],
+            "height": given["height"],
+            "tile_size": TILE,
+            "tile_width": math.ceil(given["width"] / TILE),
+            "tile_height": math.ceil(given["height"] / TILE),
+            "n_batches": 1,
+            "n_cameras": len(inputs.projections),
+        }
+
+    def stands_in(self, call: HostCall) -> bool:
+        """gsplat has kernels for CUDA alone."""
+        return not call.arguments["means"].is_cuda
+
+    def present(self, package: str) -> bool:
+        """Its kernels are compiled where they are first used, which needs a GPU."""
+        return torch.cuda.is_available()
+
+    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
+        """The two kernels that its strategies call beside ``rasterization``."""
+        from fragprune_plugins.lineage.stand_ins import compute_relocation
+
+        backend = ModuleType(BACKEND, "Stand-in of fragprune for compiled kernels.")
+
+        def relocation(
+            opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, n_max: int
+        ) -> tuple[Tensor, Tensor]:
+            opacity, scale = compute_relocation(
+                opacities.reshape(-1), scales, ratios.clamp_max(n_max - 1), binoms, n_max
+            )
+            return opacity.view_as(opacities), scale.view_as(scales)
+
+        def quat_scale_to_covar_preci_fwd(
+            quats: Tensor, scales: Tensor, covar: bool, preci: bool, triu: bool
+        ) -> tuple[Tensor, None]:
+            if preci or triu or not covar:
+                raise InputError(
+                    "gsplat.quat_scale_to_covar_preci",
+                    "precisions or triangles asked for",
+                    "covariances (N, 3, 3), as MCMCStrategy does",
+                    "Compute these on a machine with a GPU.",
+                )
+            return covariances(quats, scales), None
+
+        vars(backend)["_C"] = SimpleNamespace(
+            relocation=relocation, quat_scale_to_covar_preci_fwd=quat_scale_to_covar_preci_fwd
+        )
+        return {BACKEND: backend}
+
+
+_INTRINSICS = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}

@@ -1,0 +1,146 @@
+"""gsplat's projection of Gaussians, in torch: what reaches the blending, for one camera.
+
+Its own rules: the Jacobian is clamped to the image's real bounds, the principal point included;
+extents are per axis, and end where alpha falls below 1/255 or at 3.33 sigma.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.constants import ALPHA_MIN
+
+TILE = 16
+EXTENT = 3.33
+"""In sigma, the furthest that gsplat looks."""
+MARGIN = 0.3
+"""Of the tangent of the half field of view: how far beyond the image the Jacobian is evaluated."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a call, or the installed version, decides about the projection.
+
+    Attributes:
+        eps2d: pixels^2 added to the 2D covariance's diagonal.
+        near: view depth below which a Gaussian is culled.
+        far: view depth above which it is.
+        radius_clip: pixels; radii up to it are culled.
+        antialiased: opacity is multiplied by sqrt(det before / det after eps2d).
+        floor: least value of that factor.
+    """
+
+    eps2d: float
+    near: float
+    far: float
+    radius_clip: float
+    antialiased: bool
+    floor: float
+
+
+@dataclass(frozen=True)
+class Projection:
+    """N Gaussians as one camera sees them; rows that are culled have radii 0.
+
+    Attributes:
+        radii: (N, 2) int32 pixels, per axis.
+        means2d: (N, 2) pixels; the first pixel's centre is (0.5, 0.5).
+        depths: (N,) view depth.
+        conics: (N, 3) inverse covariances xx, xy, yy.
+        opacities: (N,) compensated where the call asks for it.
+        tiles: (N, 4) int32 half-open rectangle of tiles.
+    """
+
+    radii: Tensor
+    means2d: Tensor
+    depths: Tensor
+    conics: Tensor
+    opacities: Tensor
+    tiles: Tensor
+
+    @property
+    def visible(self) -> Tensor:
+        """(N,) bool."""
+        return (self.radii > 0).all(dim=-1)
+
+
+def covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    """(N, 3, 3) from quaternions (N, 4) w, x, y, z of any length and activated scales (N, 3)."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=-1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=-1),
+    )
+    root = torch.stack(rows, dim=-2) * scales[:, None]
+    return root @ root.transpose(-1, -2)
+
+
+def project(
+    means: Tensor,
+    covars: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    rules: Rules,
+) -> Projection:
+    """Project N Gaussians; differentiable in means, covars, opacities and viewmat.
+
+    Args:
+        means: (N, 3) world.
+        covars: (N, 3, 3) world.
+        opacities: (N,) activated.
+        viewmat: (4, 4) world to camera, acting on column vectors.
+        K: (3, 3) intrinsics.
+        width: pixels.
+        height: pixels.
+        rules: the call's.
+    """
+    rotation = viewmat[:3, :3]
+    seen = means @ rotation.T + viewmat[:3, 3]
+    depths = seen[:, 2]
+    inside = (depths >= rules.near) & (depths <= rules.far)
+    seen = torch.where(inside[:, None], seen, seen.new_tensor([0.0, 0.0, 1.0]))
+    size, focal, centre = K.new_tensor([width, height]), K[[0, 1], [0, 1]], K[:2, 2]
+    z, slope = seen[:, 2:], seen[:, :2] / seen[:, 2:]
+    means2d = focal * slope + centre
+    margin = MARGIN * 0.5 * size / focal
+    bounded = torch.clamp(slope, -centre / focal - margin, (size - centre) / focal + margin)
+    zero = torch.zeros_like(z[:, 0])
+    jacobian = torch.stack(
+        [
+            torch.stack([focal[0] / z[:, 0], zero, -focal[0] * bounded[:, 0] / z[:, 0]], dim=-1),
+            torch.stack([zero, focal[1] / z[:, 0], -focal[1] * bounded[:, 1] / z[:, 0]], dim=-1),
+        ],
+        dim=-2,
+    )
+    flat = jacobian @ rotation
+    cov = flat @ covars @ flat.transpose(-1, -2)
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    before = a * c - b * b
+    a, c = a + rules.eps2d, c + rules.eps2d
+    det = a * c - b * b
+    inside = inside & (det > 0)
+    det = torch.where(inside, det, 1.0)
+    if rules.antialiased:
+        least = max(rules.floor**2, 1e-12)  # a root's slope at 0 is not to be had
+        opacities = opacities * (before / det).clamp_min(least).sqrt()
+    with torch.no_grad():
+        drawn = inside & (opacities >= ALPHA_MIN)
+        reach = (2 * torch.log(opacities.clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
+        sigma = torch.stack([a, c], dim=-1).clamp_min(0).sqrt()
+        radii = torch.ceil(reach.clamp_max(EXTENT)[:, None] * sigma)
+        drawn &= (radii > rules.radius_clip).any(dim=-1)
+        drawn &= ((means2d + radii > 0) & (means2d - radii < size)).all(dim=-1)
+        radii = torch.where(drawn[:, None], radii, 0.0)
+        grid = torch.ceil(size / TILE)
+        first = torch.floor((means2d - radii) / TILE).clamp_min(0).minimum(grid)
+        last = torch.ceil((means2d + radii) / TILE).clamp_min(0).minimum(grid)
+        tiles = torch.where(drawn[:, None], torch.cat([first, last], dim=-1), 0.0).int()
+    conics = torch.stack([c / det, -b / det, a / det], dim=-1)
+    return Projection(radii.int(), means2d, depths, conics, opacities, tiles)

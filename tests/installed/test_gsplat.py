@@ -1,0 +1,287 @@
+"""The real gsplat on the CPU, where only our kernels answer."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+from types import FunctionType
+
+import pytest
+import torch
+
+from fragprune_gsplat import Gsplat
+from fragprune_plugins import sidecar
+from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.errors import InputError, SessionError, UsageError
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.schedule import Settings
+
+WIDTH, HEIGHT = 48, 32
+LOOP = Path(__file__).parents[2] / "docs" / "how-to" / "gsplat_loop.py"
+
+
+def model(count: int = 40, *, seed: int = 0):
+    """(params, optimizers), as users of gsplat make them."""
+    torch.manual_seed(seed)
+    tensors = {
+        "means": torch.rand(count, 3) * 2 - 1,
+        "scales": torch.rand(count, 3) * 0.5 - 2,
+        "quats": torch.randn(count, 4),
+        "opacities": torch.randn(count),
+        "sh0": torch.rand(count, 1, 3),
+        "shN": torch.randn(count, 3, 3) * 0.1,
+    }
+    params = torch.nn.ParameterDict({k: torch.nn.Parameter(v) for k, v in tensors.items()})
+    optimizers = {k: torch.optim.Adam([p], lr=1e-2) for k, p in params.items()}
+    return params, optimizers
+
+
+def cameras(count: int = 1):
+    viewmats = torch.eye(4).repeat(count, 1, 1)
+    viewmats[:, 0, 3] = torch.arange(count) * 0.3
+    viewmats[:, 2, 3] = 4.0
+    K = torch.tensor([[40.0, 0, 23], [0, 42.0, 17], [0, 0, 1]])
+    return viewmats, K.repeat(count, 1, 1)
+
+
+def draw(params, count: int = 1, **options):
+    import gsplat
+
+    given = {
+        "means": params["means"],
+        "quats": params["quats"],
+        "scales": params["scales"].exp(),
+        "opacities": params["opacities"].sigmoid(),
+        "colors": torch.cat([params["sh0"], params["shN"]], dim=1),
+        "sh_degree": 1,
+        "packed": False,
+    }
+    viewmats, Ks = cameras(count)
+    return gsplat.rasterization(
+        viewmats=viewmats, Ks=Ks, width=WIDTH, height=HEIGHT, **{**given, **options}
+    )
+
+
+def brute(params, K, viewmat, *, antialiased: bool = False):
+    """Picture, alpha and depth by gsplat's own pure-torch projection and a loop over Gaussians.
+
+    gsplat ships these formulas beside its kernels; the blending loop is written from its contract.
+    """
+    from gsplat.cuda import _torch_impl as theirs
+
+    with torch.no_grad():
+        covars, _ = theirs._quat_scale_to_covar_preci(params["quats"], params["scales"].exp())
+        _, means2d, depths, conics, factor = theirs._fully_fused_projection(
+            params["means"],
+            covars,
+            viewmat[None],
+            K[None],
+            WIDTH,
+            HEIGHT,
+            calc_compensations=antialiased,
+        )
+        campos = torch.linalg.inv(viewmat)[:3, 3]
+        shs = torch.cat([params["sh0"], params["shN"]], dim=1)
+        directions = torch.nn.functional.normalize(params["means"] - campos, dim=-1)
+        colors = (theirs._spherical_harmonics(1, directions, shs) + 0.5).clamp_min(0)
+        opacities = params["opacities"].sigmoid() * (factor[0] if antialiased else 1.0)
+        y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+        light = torch.ones(HEIGHT, WIDTH)
+        picture, depth = torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH)
+        for i in depths[0].argsort().tolist():
+            if depths[0, i] < 0.01:
+                continue
+            dx, dy = x - means2d[0, i, 0], y - means2d[0, i, 1]
+            a, b, c = conics[0, i]
+            alpha = opacities[i] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+            alpha = torch.where(alpha < 1 / 255, 0.0, alpha.clamp_max(0.999))
+            picture += (light * alpha)[..., None] * colors[i]
+            depth += light * alpha * depths[0, i]
+            light = light * (1 - alpha)
+        assert light.min() > 1e-3  # no pixel ends early: the loop need not know that rule
+        return picture, 1 - light, depth
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("packed", [True, False])
+def test_our_picture_is_the_one_of_gsplats_own_formulas(session_on, packed, mode):
+    with session_on(Gsplat()):
+        params, _ = model()
+        viewmats, Ks = cameras(2)
+        colors, alphas, info = draw(
+            params, 2, packed=packed, render_mode="RGB+ED", rasterize_mode=mode
+        )
+        assert colors.shape == (2, HEIGHT, WIDTH, 4)
+        assert alphas.shape == (2, HEIGHT, WIDTH, 1)
+        for k in range(2):
+            picture, alpha, depth = brute(params, Ks[k], viewmats[k], antialiased=mode != "classic")
+            torch.testing.assert_close(colors[k, ..., :3].detach(), picture, rtol=0, atol=2e-5)
+            torch.testing.assert_close(alphas[k, ..., 0].detach(), alpha, rtol=0, atol=2e-5)
+            expected = depth / alpha.clamp_min(1e-10)
+            seen = alpha > 0.01  # a quotient of small numbers says little
+            torch.testing.assert_close(
+                colors[k, ..., 3].detach()[seen], expected[seen], rtol=1e-3, atol=1e-3
+            )
+        rows = info["gaussian_ids"] if packed else torch.arange(40).repeat(2)
+        assert info["radii"].reshape(-1, 2).shape[0] == len(rows)
+
+
+@pytest.mark.parametrize(
+    ("mode", "channels"), [("RGB", 3), ("D", 1), ("ED", 1), ("RGB+D", 4), ("RGB+ED", 4)]
+)
+def test_every_render_mode_gives_its_channels(session_on, mode, channels):
+    with session_on(Gsplat()):
+        params, _ = model()
+        backgrounds = torch.ones(1, 3)
+        colors, alphas, _ = draw(params, render_mode=mode, backgrounds=backgrounds)
+        assert colors.shape == (1, HEIGHT, WIDTH, channels)
+        if mode.startswith("RGB"):
+            plain = draw(params)[0]
+            over = plain + (1 - alphas)
+            torch.testing.assert_close(colors[..., :3], over, rtol=0, atol=1e-6)
+
+
+def test_strategies_find_the_gradients_on_the_screen_packed_or_not(session_on):
+    with session_on(Gsplat()):
+        params, _ = model()
+        weights, grads = torch.rand(1, HEIGHT, WIDTH, 3), {}
+        for packed in (True, False):
+            colors, _, info = draw(params, packed=packed)
+            info["means2d"].retain_grad()
+            (colors * weights).sum().backward()
+            grads[packed] = info["means2d"].grad
+            if packed:
+                rows = info["gaussian_ids"]
+        assert 0 < len(rows) <= 40
+        assert grads[True].abs().sum() > 0
+        torch.testing.assert_close(grads[True], grads[False][0, rows], rtol=1e-5, atol=1e-6)
+        for name, parameter in params.items():
+            assert torch.isfinite(parameter.grad).all(), name
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"camera_model": "fisheye"},
+        {"with_ut": True},
+        {"tile_size": 8},
+        {"absgrad": True},
+        {"sh_degree": 4},
+        {"distributed": True},
+    ],
+    ids=str,
+)
+def test_what_we_do_not_draw_is_refused_by_name(session_on, options):
+    with session_on(Gsplat()):
+        params, _ = model()
+        with pytest.raises(InputError, match=next(iter(options))):
+            draw(params, **options)
+
+
+def test_a_plain_dict_is_refused_and_there_is_no_command_to_run():
+    with pytest.raises(SessionError, match="ParameterDict"):
+        Gsplat().model_of(None, {"params": {}})
+    with pytest.raises(UsageError, match="activate"):
+        Gsplat().command_line(HostRepo.installed("gsplat"))
+    assert Gsplat().match(HostRepo.installed("gsplat")).fits
+    assert not Gsplat().match(HostRepo.installed("numpy")).fits
+
+
+def operate(name: str, params, optimizers, generator) -> None:
+    from gsplat.strategy import ops
+
+    count = len(params["means"])
+    mask = torch.rand(count, generator=generator) < 0.3
+    mask[0], mask[1] = True, False
+    binoms = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)]).float()
+    extra = {"n": 7, "binoms": binoms} if name == "sample_add" else {"mask": mask}
+    if name == "relocate":
+        extra["binoms"] = binoms
+    getattr(ops, name)(params=params, optimizers=optimizers, state={}, **extra)
+
+
+@pytest.mark.parametrize("name", ["duplicate", "split", "remove", "relocate", "sample_add"])
+def test_rows_keep_their_thresholds_through_every_operation(unmoved, name):
+    with unmoved(Gsplat()) as session:
+        from gsplat import DefaultStrategy
+
+        params, optimizers = model()
+        DefaultStrategy().check_sanity(params, optimizers)
+        for parameter in params.values():  # moments, for the operations to carry along
+            parameter.grad = torch.ones_like(parameter)
+        optimizers["sh0"].step()
+        store, numbers = session.store(params), torch.arange(40.0)
+        with torch.no_grad():
+            params["sh0"][:, 0, 0] = numbers  # copied by every operation
+        store.logits = (-20 + numbers / 100).requires_grad_(True)
+        store._set_moments(numbers + 1, numbers + 1, torch.tensor(1.0))
+        generator = torch.Generator().manual_seed(3)
+        for _ in range(3):
+            operate(name, params, optimizers, generator)
+            assert "fragprune_rows" not in params
+            assert len(store) == len(params["means"])
+            now = params["sh0"].detach()[:, 0, 0]
+            torch.testing.assert_close(store.logits.detach(), -20 + now / 100, rtol=0, atol=0)
+            moments = store.optimizer.state[store.logits]["exp_avg"]
+            assert torch.all((moments == now + 1) | (moments == 0))
+            assert len(moments[moments > 0].unique()) == (moments > 0).sum()  # nobody's twice
+        assert len(numbers) != len(now) or not torch.equal(now, numbers)
+
+
+@pytest.mark.parametrize("kind", ["DefaultStrategy", "MCMCStrategy"])
+def test_stage_2_moves_opacities_and_thresholds_alone(session_on, kind):
+    with session_on(Gsplat(), settings=Settings(iterations=8, threshold_lr=0.3)) as session:
+        import gsplat
+
+        options = {"refine_start_iter": 0, "refine_every": 1, "refine_stop_iter": 100}
+        strategy = getattr(gsplat, kind)(**options)
+        params, optimizers = model()
+        strategy.check_sanity(params, optimizers)
+        before = {name: p.detach().clone() for name, p in params.items()}
+        state, target = strategy.initialize_state(), torch.rand(1, HEIGHT, WIDTH, 3)
+        for step in range(8):
+            colors, _, info = draw(params)
+            strategy.step_pre_backward(params, optimizers, state, step, info)
+            (colors - target).abs().mean().backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            more = {"lr": 1.0} if kind == "MCMCStrategy" else {}
+            strategy.step_post_backward(params, optimizers, state, step, info, **more)
+        assert {n for n, p in params.items() if not torch.equal(p, before[n])} == {"opacities"}
+        session.expect_drawn()
+        summary = session.finish()
+        assert (summary.steps, summary.gaussians) == (8, 40)
+        assert summary.fragments_after < summary.fragments_before
+
+
+def test_originals_are_back_wherever_they_were_imported_to(session_on):
+    with session_on(Gsplat()) as session:
+        import gsplat
+        from gsplat import rendering
+        from gsplat.strategy import default, ops
+
+        assert type(gsplat.rasterization) is not FunctionType
+        assert session.deactivate() == []
+        assert gsplat.rasterization is rendering.rasterization
+        assert default.split is ops.split
+        assert type(rendering.rasterization) is type(ops.split) is FunctionType
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_the_documented_loop_runs_and_exports_its_thresholds(photographs, tmp_path, strategy):
+    words = [LOOP, photographs, tmp_path, "--strategy", strategy, "--steps", 6, "--stage2", 6]
+    done = subprocess.run(
+        [sys.executable, *map(str, words)], capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "fragments per pixel" in done.stdout
+    before, after = (read_ply(tmp_path / f"{name}.ply") for name in ("trained", "finetuned"))
+    names = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+    moved = [n for n in names if not torch.equal(getattr(before, n), getattr(after, n))]
+    assert moved == ["opacity"]
+    store, info = sidecar.load(tmp_path / "finetuned.ply")
+    assert (len(store), info.adapter) == (len(after.xyz), "gsplat")
+    assert not sidecar.path_beside(tmp_path / "trained.ply").exists()
