@@ -119,6 +119,14 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
     rows = _read_vertices(path)
     names = rows.dtype.names or ()
     missing = [name for name in (*_XYZ, *_DC, "opacity", *_SCALES, *_ROTATION) if name not in names]
+    if missing == list(_DC):
+        raise ModelFileError(
+            str(path),
+            "Gaussians without colours, as Compact-3DGS saves them: activated, and the colours in a "
+            "network beside the PLY",
+            "a splat that holds its colours, before activation",
+            "Fine-tune with fragprune run inside that host.",
+        )
     if missing:
         raise ModelFileError(
             str(path),

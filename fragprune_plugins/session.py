@@ -800,8 +800,11 @@ class Session:
         result = wrapped(*args, **kwargs)
         path = _named(wrapped, args, kwargs)[seam.needs[0]]
         if model in self._models and path is not None:
-            self.save(model, Path(path))
+            self.save(model, self._file_at(seam, path))
         return result
+
+    def _file_at(self, seam: Seam, path: Any) -> Path:
+        return self.adapter.file_at(seam.attribute.split(".")[-1], Path(path))
 
     def save(self, model: Any, path: Path) -> None:
         """Write a model's thresholds beside the file ``path`` that holds the model; none if neutral.
@@ -832,7 +835,7 @@ class Session:
 
     def _on_load(self, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
         result = wrapped(*args, **kwargs)
-        path = Path(signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]])
+        path = self._file_at(seam, _named(wrapped, args, kwargs)[seam.needs[0]])
         if sidecar.path_beside(path).exists():
             self.load(model, path)
         else:

@@ -146,6 +146,8 @@ def spoil(path: Path, how: str) -> None:
         path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
     elif how == "points":
         without(path, "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_3")
+    elif how == "compact":
+        without(path, "f_dc_0", "f_dc_1", "f_dc_2")
     elif how == "odd sh":
         without(path, "f_rest_8")
     elif how == "mip":
@@ -176,6 +178,7 @@ MESSAGES = {
     "nothing": "not readable as PLY",
     "a picture": "not readable as PLY",
     "points": "without f_dc_0, f_dc_1, f_dc_2, opacity, rot_3",
+    "compact": "as Compact-3DGS saves them: activated",
     "odd sh": "8 f_rest columns",
     "mip": "Mip-Splatting model",
     "faces only": "without a vertex element",

@@ -1,0 +1,129 @@
+"""maincold2/Compact-3DGS: a learned mask, colours from a hash grid, shapes from codebooks.
+
+Its checkpoints lack the mask and the colour network, so nothing can resume them: stage 2 is the
+later part of one run (``--from-iter``). What it saves is activated already, and in part beside the
+PLY: our own readers refuse it, and the host's own draws it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.adapter import HostAdapter, HostInfo
+from fragprune_plugins.detect import Finding, HostRepo
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.lineage import GraphdecoAdapter
+from fragprune_plugins.seams import Role, Seam
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+MODEL = "scene.gaussian_model"
+NETWORK = "network"
+"""Our name for the param group of the hash grid and the colour network, which has none."""
+ENDINGS = {"save_npz": (".npz",), "save_npz_pp": ("_pp.npz",), "load_model": ("_pp.npz", ".npz")}
+
+
+class Compact3DGS(GraphdecoAdapter):
+    """Compact-3DGS."""
+
+    name = "compact-3dgs"
+    info = HostInfo(
+        "Compact 3D Gaussian Representation",
+        repo="maincold2/Compact-3DGS",
+        states="September 2024",
+        limits=(
+            "Its checkpoints cannot be resumed: stage 2 is --stage finetune --from-iter N, one run.",
+            "It needs tinycudann, and that a GPU; nothing of ours stands in for it.",
+            "fragprune finetune, render and compare refuse its files: values are activated and the "
+            "colours are not in them.",
+        ),
+    )
+    seams = (
+        *(s for s in GraphdecoAdapter.seams if s.attribute != "GaussianModel.load_ply"),
+        Seam(Role.LOAD, MODEL, "GaussianModel.load_model", ("path",)),
+        Seam(Role.SAVE, MODEL, "GaussianModel.save_npz", ("path",)),
+        Seam(Role.SAVE, MODEL, "GaussianModel.save_npz_pp", ("path",)),
+        Seam(Role.STILL, MODEL, "GaussianModel.mask_prune"),
+        Seam(Role.STILL, MODEL, "GaussianModel.sort_morton"),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Codebooks and a hash grid in the model."""
+        findings = super().fingerprint(repo)
+        names = {"vq_scale", "recolor", "mlp_head"}
+        if missing := names - repo.mentions([MODEL], names).keys():
+            findings.insert(
+                0,
+                Finding(
+                    "error",
+                    "other-host",
+                    repo.place(MODEL, "GaussianModel"),
+                    f"no {', no '.join(sorted(missing))} in the model",
+                    "codebooks and a hash grid, as Compact-3DGS has them",
+                    "Use the adapter of that host.",
+                ),
+            )
+        return findings
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """Nothing can.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(
+            "stage 2 of Compact-3DGS",
+            "checkpoints without its mask and its colour network: the host cannot resume them",
+            "--stage finetune --from-iter N and --iterations N + 5000 of one run",
+            "Add --from-iter with the iteration that training should end at.",
+        )
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+        """Not by us: its colours are a network's."""
+        return None
+
+    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
+        """The Gaussians', then the hash grid's and the colour network's."""
+        return [model.optimizer, model.optimizer_net]
+
+    def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
+        """The network's group has no name of the host's."""
+        return str(group.get("name", NETWORK))
+
+    def trained_groups(self, train: str) -> frozenset[str] | None:
+        """opacity, or with the colours' network; None for all."""
+        groups = {"opacity": {"opacity"}, "appearance": {"opacity", NETWORK}}.get(train)
+        return frozenset(groups) if groups else None
+
+    def prepare_stage2(self, model: Any, output: Path | None) -> None:
+        """Codebooks that are in use learn in the forward pass; they stop, as at the host's end."""
+        for codebooks in (model.vq_scale, model.vq_rot):
+            for layer in codebooks.layers:
+                if bool(layer._codebook.initted):
+                    layer.training = False
+
+    def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
+        """Clones and split children carry their parent's rotation and opacity bit for bit."""
+        import torch
+
+        return torch.equal(tensors["rotation"], model._rotation[parents]) and torch.equal(
+            tensors["opacity"], model._opacity[parents]
+        )
+
+    def file_at(self, method: str, path: Path) -> Path:
+        """The host leaves endings out; it loads the most compressed file there is."""
+        named = [path.with_name(path.name + ending) for ending in ENDINGS.get(method, ())]
+        if method == "load_model":
+            ply = path.with_name(f"{path.name}.ply")
+            return next((file for file in named if file.is_file()), ply)
+        return named[0] if named else path
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Offer Compact-3DGS."""
+    register(Compact3DGS())
