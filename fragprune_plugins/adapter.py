@@ -244,6 +244,14 @@ class HostAdapter(ABC):
     def command_line(self, repo: HostRepo) -> CommandLine:
         """How to drive the host's training script."""
 
+    def use(self, repo: HostRepo) -> str:
+        """What a user of this host types, for people to read."""
+        script = self.command_line(repo).scripts[0]
+        if not repo.package:
+            return f"fragprune run -- python {repo.root / script} ..."
+        module = script.removesuffix(".py").replace("/", ".")
+        return f"fragprune run -- python -m {module} ..."
+
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command that can resume what a training script left; the same one by default."""
         return script, arguments

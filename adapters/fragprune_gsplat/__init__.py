@@ -92,12 +92,16 @@ class Gsplat(HostAdapter):
             return GsplatDialect(alpha_max=0.99, floor=0.005)
         return GsplatDialect(alpha_max=0.999, floor=0.0)
 
+    def use(self, repo: HostRepo) -> str:
+        """One line in the user's own script."""
+        return 'fragprune_plugins.activate("gsplat") above the import of gsplat in your own script'
+
     def command_line(self, repo: HostRepo) -> CommandLine:
         """There is none: a library is trained by whatever script its user wrote."""
         raise UsageError(
             "fragprune run",
             "gsplat, a library without a training command",
-            'fragprune_plugins.activate("gsplat") in your own script',
+            self.use(repo),
             "See the how-to page of gsplat.",
         )
 

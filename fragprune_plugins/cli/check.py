@@ -29,13 +29,18 @@ def command(host: Path, adapter: str | None) -> Report:
     Examples:
       fragprune check ~/code/gaussian-splatting
       fragprune check ~/code/my-fork --adapter vanilla-3dgs     (why does it not fit?)
+      fragprune check gsplat                                    (an installed package)
     """
+    from fragprune_plugins.detect import HostRepo
     from fragprune_plugins.errors import UnknownHostError
     from fragprune_plugins.plugins import load_plugins
 
-    if not host.is_dir():
+    if not host.is_dir() and HostRepo.installed(str(host)) is None:
         raise UnknownHostError(
-            str(host), "no such folder", "a host's checkout", "Name the folder of train.py."
+            str(host),
+            "neither a folder nor an installed package",
+            "a host's checkout, or the import name of a host that is installed",
+            "Name the folder of train.py.",
         )
     adapters = load_plugins().adapters
     if adapter is not None:
@@ -147,10 +152,13 @@ class _Checked:
 
 
 def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:
-    """The checkout that the folder is or lies in; the folder itself where none is."""
+    """The checkout that the folder is or lies in, or the package; else the folder itself."""
     from fragprune_plugins.detect import HostRepo, locate
     from fragprune_plugins.errors import UnknownHostError
 
+    package = None if host.is_dir() else HostRepo.installed(str(host))
+    if package is not None:
+        return package
     try:
         return locate(host, adapters, name)[0]
     except UnknownHostError:
@@ -165,8 +173,7 @@ def _check(adapter: HostAdapter, repo: HostRepo) -> _Checked:
 
 def _conclusion(repo: HostRepo, fitting: list[_Checked]) -> str:
     if len(fitting) == 1:
-        script = Path(fitting[0].adapter.command_line(repo).scripts[0])
-        return f"Use: fragprune run -- python {script if repo.package else repo.root / script} ..."
+        return f"Use: {fitting[0].adapter.use(repo)}"
     if fitting:
         names = ", ".join(each.adapter.name for each in fitting)
         return f"Several adapters fit: {names}. Name one with fragprune run --adapter."

@@ -157,7 +157,7 @@ def test_an_adapter_can_be_asked_for(host):
 
 def test_unknown_folders_and_adapters_are_stated_failures(host, tmp_path):
     for words, found in (
-        ((tmp_path / "nowhere",), "no such folder"),
+        ((tmp_path / "nowhere",), "neither a folder nor"),
         ((host, "--adapter", "my-host"), "'my-host'"),
     ):
         result = run("check", *words, "--json")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import subprocess
 import sys
@@ -10,9 +11,11 @@ from types import FunctionType
 
 import pytest
 import torch
+from click.testing import CliRunner
 
 from fragprune_gsplat import Gsplat
 from fragprune_plugins import sidecar
+from fragprune_plugins.cli import cli
 from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.errors import InputError, SessionError, UsageError
 from fragprune_plugins.ply import read_ply
@@ -187,6 +190,16 @@ def test_a_plain_dict_is_refused_and_there_is_no_command_to_run():
         Gsplat().command_line(HostRepo.installed("gsplat"))
     assert Gsplat().match(HostRepo.installed("gsplat")).fits
     assert not Gsplat().match(HostRepo.installed("numpy")).fits
+
+
+def test_check_takes_the_name_of_an_installed_host():
+    done = CliRunner().invoke(cli, ["check", "--json", "gsplat"])
+    report = json.loads(done.stdout)
+    assert (done.exit_code, report["fits"]) == (0, "gsplat")
+    seams = next(a for a in report["adapters"] if a["adapter"] == "gsplat")["seams"]
+    assert {state["status"] for state in seams} == {"found", "at import"}
+    unknown = CliRunner().invoke(cli, ["check", "--json", "no_host_of_this_name"])
+    assert unknown.exit_code == 1
 
 
 def operate(name: str, params, optimizers, generator) -> None:
