@@ -1,0 +1,135 @@
+"""The real RT-4DGS, unmodified, where ``FRAGPRUNE_HOSTS`` points at a folder with it."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from hosts.test_checkouts import each_of
+from PIL import Image
+
+from fragprune_plugins.detect import HostRepo
+from fragprune_rt_4dgs import RT4DGS
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+every_rt = each_of(RT4DGS())
+
+NEEDS = ("omegaconf", "imagesize", "kornia", "torchmetrics", "torchvision")
+
+
+@every_rt
+def test_every_seam_is_found_and_vanilla_refuses_it(host):
+    adapter, repo = RT4DGS(), HostRepo(host)
+    assert adapter.match(repo).fits
+    assert len(adapter.dialect(repo).settings) == 18
+    assert adapter.command_line(repo).default_iterations == 30_000
+    errors = [f for f in Vanilla3DGS().match(repo).findings if f.level == "error"]
+    assert any("RT-4DGS" in str(error) for error in errors)
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A disc that moves, seen from eight places at eight times; two views are held out."""
+    folder = tmp_path / "data"
+    y, x = np.mgrid[:48, :48]
+    for part, times in (("train", np.arange(8) / 8), ("test", (0.3, 0.7))):
+        (folder / part).mkdir(parents=True)
+        frames = []
+        for number, time in enumerate(times):
+            disc = ((x - 16 - 16 * time) ** 2 + (y - 24) ** 2 < 100) * 255
+            picture = np.stack([disc, disc // 2, 255 - disc, 55 + disc * 200 // 255], axis=2)
+            Image.fromarray(picture.astype(np.uint8)).save(folder / part / f"{number}.png")
+            angle = 2 * np.pi * number / 10
+            turn = np.array(
+                [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+            )
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = turn, turn @ [0, 0, 3.5]
+            frames.append(
+                {"file_path": f"./{part}/{number}", "time": time, "transform_matrix": pose.tolist()}
+            )
+        contents = {"camera_angle_x": 0.8, "frames": frames}
+        (folder / f"transforms_{part}.json").write_text(json.dumps(contents, default=float))
+    return folder
+
+
+YAML = """
+gaussian_dim: 4
+time_duration: [0.0, 1.0]
+num_pts: 300
+batch_size: 2
+rot_4d: {rot}
+test_iterations: [-1]
+ModelParams:
+  source_path: "{data}"
+  model_path: "{out}"
+  sh_degree: 3
+  eval: True
+PipelineParams:
+  eval_shfs_4d: True
+  compute_cov3D_python: {python}
+  env_map_res: 0
+OptimizationParams:
+  iterations: 30
+  densify_from_iter: 5
+  densification_interval: 10
+  densify_until_iter: 25
+  densify_grad_threshold: 0.002
+  sh_increase_interval: 5
+  lambda_opa_mask: 0.05
+  lambda_rigid: {rigid}
+  lambda_motion: {rigid}
+"""
+
+RUN = """
+import contextlib, json, sys
+import torch
+torch.set_num_threads(1)
+from fragprune_plugins.launch import RunOptions, run
+from fragprune_plugins.schedule import Settings
+host, config = sys.argv[1:]
+names = ("degree", "xyz", "dc", "rest", "scaling", "rotation", "opacity")
+with contextlib.redirect_stdout(sys.stderr):
+    options = RunOptions(device="cpu", settings=Settings(iterations=10, threshold_lr=0.3))
+    summary = run([f"{host}/train.py", "--config", config], options)
+    before, after = (
+        torch.load(path, weights_only=False)[0]
+        for path in (summary.model_before, summary.model_after)
+    )
+    same = lambda a, b: torch.equal(a, b) if torch.is_tensor(a) else a == b
+    kept = [i for i in (*range(7), 13, 14, 15, 18) if same(before[i], after[i])]
+    learned = after[11]["fragprune"]
+    report = {
+        "moved": [names[i] if i < 7 else i for i in (*range(7), 13, 14, 15, 18) if i not in kept],
+        "rows": [len(before[1]), len(after[1]), len(learned["logits"])],
+        "steps": [summary.iterations, learned["steps"]],
+        "fragments": [summary.fragments_before, summary.fragments_after],
+    }
+print(json.dumps(report))
+"""
+
+
+@every_rt
+@pytest.mark.skipif(
+    any(find_spec(name) is None for name in NEEDS), reason=f"the host imports {', '.join(NEEDS)}"
+)
+@pytest.mark.parametrize(
+    ("rot", "python_slices"),
+    [(True, False), (False, False), (True, True)],
+    ids=["4D rotation", "without", "sliced in Python"],
+)
+def test_training_then_fine_tuning(host, recording, tmp_path, python, rot, python_slices):
+    config = tmp_path / "a.yaml"
+    values = {"rot": rot, "python": python_slices, "data": recording, "out": tmp_path / "out"}
+    rigid = 0.5 if rot else 0.0  # the host's losses on velocities need 4D rotation
+    config.write_text(YAML.format(**values, rigid=rigid))
+    report = python(RUN, host, config)
+    assert report["moved"] == ["opacity"]
+    assert len(set(report["rows"])) == 1
+    assert report["steps"] == [10, 9]  # the host takes no step in its last iteration
+    before, after = report["fragments"]
+    assert after < before
