@@ -14,6 +14,7 @@ from torch.optim.lr_scheduler import ExponentialLR
 
 from fragprune_plugins import demo
 from fragprune_plugins.testing import Chance, Host
+from fragprune_plugins.testing.rewriting import changed
 
 args = SimpleNamespace()  # the host's scripts hold their options under this name
 
@@ -184,14 +185,6 @@ START = (
     "    args.must_start = True\n"
 )
 PARSE = "    args = parser.parse_args()\n"
-
-
-def changed(text: str, changes: list[tuple[str, str]]) -> str:
-    """The text with each passage, which must be there once, replaced."""
-    for old, new in changes:
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
-    return text
 
 
 def make(root: Path) -> Path:

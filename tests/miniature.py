@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from fragprune_plugins.schedule import Settings
 from fragprune_plugins.testing import host as kit
 from fragprune_plugins.testing.host import MINIATURE as HOST
 from fragprune_plugins.testing.host import Running, imported
+from fragprune_plugins.testing.rewriting import rewrite
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 __all__ = [
@@ -43,18 +43,6 @@ TINY = [
     *("--test_iterations", "-1"),
 ]
 """Flags with which a run of a few dozen iterations densifies and prunes."""
-
-
-def rewrite(root: Path, changes: dict[str, list[tuple[str, str]]], added: type) -> None:
-    """Change passages of a written host, each there once, and give its model more methods."""
-    for name, passages in changes.items():
-        text = (root / name).read_text()
-        for old, new in passages:
-            assert text.count(old) == 1, (name, old)
-            text = text.replace(old, new)
-        (root / name).write_text(text)
-    with (root / "scene" / "gaussian_model.py").open("a") as file:
-        file.write("\n" + "".join(inspect.getsourcelines(added)[0][2:]))
 
 
 def running(

@@ -1,0 +1,54 @@
+"""Makes a miniature of one host from another's source: passages replaced, methods added."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+Changes = Sequence[tuple[str, str]]
+"""Passages and what replaces them; each must be there once."""
+
+
+def changed(text: str, changes: Changes) -> str:
+    """The text with each passage replaced.
+
+    Raises:
+        ValueError: a passage is not there, or not once.
+    """
+    for old, new in changes:
+        if (count := text.count(old)) != 1:
+            raise ValueError(f"{count} times in the text, expected once: {old!r}")
+        text = text.replace(old, new)
+    return text
+
+
+def rewrite(root: Path, changes: Mapping[str, Changes], added: type | None = None) -> None:
+    """Change files of a host, and give its model the methods of a class.
+
+    Args:
+        root: the host's folder.
+        changes: by file, relative to the folder.
+        added: its methods, as they are written, become GaussianModel's, and replace those of the
+            same names.
+    """
+    for name, passages in changes.items():
+        file = root / name
+        file.write_text(changed(file.read_text(encoding="utf-8"), passages), encoding="utf-8")
+    if added is not None:
+        model = root / "scene" / "gaussian_model.py"
+        text = model.read_text(encoding="utf-8")
+        model.write_text(f"{text}\n{_body(added)}", encoding="utf-8")
+
+
+def _body(kind: type) -> str:
+    """A class's methods as they are written, its docstring left out."""
+    source = textwrap.dedent(inspect.getsource(kind))
+    (definition,) = ast.parse(source).body
+    assert isinstance(definition, ast.ClassDef)
+    methods = [node for node in definition.body if isinstance(node, ast.FunctionDef)]
+    decorators = [node.lineno for node in methods[0].decorator_list]
+    first = min([methods[0].lineno, *decorators])
+    return "".join(source.splitlines(keepends=True)[first - 1 :])
