@@ -10,9 +10,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import torch
-from light_gaussian_host import changed
 
 from fragprune_plugins.testing.host import Chance, Host
+from fragprune_plugins.testing.rewriting import changed, rewrite
 
 ATTRIBUTES = {
     "xyz": "_xyz",
@@ -507,10 +507,9 @@ class RT4DGSHost(Host):
         own = {name for name in vars(Added) if callable(getattr(Added, name))}
         own |= {"save_ply", "load_ply", "construct_list_of_attributes"}
         begin = "\n\nclass GaussianModel:\n"
-        model = root / "scene" / "gaussian_model.py"
         names = [(begin, f"\n\nATTRIBUTES = {ATTRIBUTES}\n{begin}")]
-        methods = "".join(inspect.getsourcelines(Added)[0][2:])
-        model.write_text(changed(without(model.read_text(), own), names) + methods)
+        change(root / "scene" / "gaussian_model.py", names, *own)
+        rewrite(root, {}, Added)
         change(root / "scene" / "__init__.py", SCENE, "save")
         change(root / "arguments" / "__init__.py", OPTIONS)
         train = change(root / "train.py", IMPORTS, "training")
