@@ -80,7 +80,9 @@ class RT4DGS(GraphdecoAdapter):
         parser.add_argument("--config", type=Path)
         parser.add_argument("--gaussian_dim", type=int, default=3)
         flags, _ = parser.parse_known_args(arguments)
-        values = vars(flags) | (YAMLFile("").read(flags.config) if flags.config else {})
+        if flags.config is None:  # the host cannot do without, and says so
+            return script, arguments
+        values = vars(flags) | YAMLFile("--config").read(flags.config)
         if values["gaussian_dim"] != 4:
             raise UsageError(
                 "gaussian_dim",
@@ -131,15 +133,15 @@ class RT4DGS(GraphdecoAdapter):
 
     def before_restore(self, model: Any, capture: Any) -> Any:
         """Keep the environment map: the training loop replaces it by a new one."""
-        model.restored_env_map = capture[17] if model.gaussian_dim == 4 else None
+        model.restored_env_map = capture[17] if len(capture) > 17 else None
         return capture
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:
-        """Bring the environment map back."""
+        """Bring the environment map back, where a new one, all black, has taken its place."""
         import torch
 
         saved = getattr(model, "restored_env_map", None)
-        if saved is not None and model.env_map is not None:
+        if saved is not None and model.env_map is not None and not model.env_map.any():
             with torch.no_grad():
                 model.env_map.copy_(saved)
 
