@@ -398,8 +398,8 @@ class Session:
         return max(0, state.steps - self.from_step) if self.learn else 0
 
     def _standing_still(self, model: Any) -> bool:
-        """Whether the model is frozen now: stage 2 has begun. Without one: the last's."""
-        state = self._models.get(model) if model is not None else self._last_state
+        """Whether the model is frozen now: stage 2 has begun."""
+        state = self._models.get(model)
         return bool(
             self.learn and self.freeze and state is not None and state.steps > self.from_step
         ) or (self.learn and self.freeze and self.from_step == 0)

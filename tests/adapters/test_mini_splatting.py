@@ -82,7 +82,7 @@ def test_a_missing_script_is_named(tmp_path):
 # -- scores --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ["reference"])
+@pytest.mark.parametrize("engine", ["reference", "cpu"])
 def test_scores_are_those_of_the_truncated_picture(mini, engine):
     """Weights add up to the picture of white Gaussians; each drawn pixel is won once."""
     scores = {}

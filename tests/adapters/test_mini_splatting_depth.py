@@ -138,7 +138,7 @@ def expected(inputs, thresholds):
     return out, behind
 
 
-@pytest.mark.parametrize("engine", ["reference"])
+@pytest.mark.parametrize("engine", ["reference", "cpu"])
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("threshold", [1e-6, 0.2])
 def test_points_lie_where_the_heaviest_gaussian_is_met(near, threshold, engine):

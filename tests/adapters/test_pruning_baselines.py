@@ -1,0 +1,204 @@
+"""Speedy-Splat, LP-3DGS and Compact-3DGS: what runs, and what is refused by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from baseline_hosts import LPHost, SpeedyHost
+from miniature import TINY, joint
+from skeleton import skeleton
+
+from fragprune_compact_3dgs import Compact3DGS
+from fragprune_lp_3dgs import LP3DGS
+from fragprune_plugins import sidecar
+from fragprune_plugins.detect import HostRepo, choose
+from fragprune_plugins.errors import EngineError, UnknownHostError, UsageError
+from fragprune_plugins.launch import RunOptions, run
+from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.ply import read_ply
+from fragprune_plugins.schedule import Settings
+from fragprune_speedy_splat import SpeedySplat
+
+OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=6, threshold_lr=0.3))
+
+
+@pytest.fixture(scope="module")
+def speedy(tmp_path_factory):
+    root = tmp_path_factory.mktemp("speedy")
+    SpeedyHost().write(root)
+    return root
+
+
+@pytest.fixture(scope="module")
+def lp(tmp_path_factory):
+    root = tmp_path_factory.mktemp("lp")
+    LPHost().write(root)
+    return root
+
+
+def command(root, scene, out, iterations, *more):
+    words = [root / "train.py", "-s", scene, "-m", out, "--iterations", iterations, *TINY, *more]
+    return [str(word) for word in words]
+
+
+def expect_fine_tuned(summary):
+    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
+    for name in ("xyz", "f_dc", "f_rest", "scaling", "rotation"):
+        assert torch.equal(getattr(before, name), getattr(after, name))
+    store, _ = sidecar.load(summary.model_after)
+    assert len(store) == len(after.xyz)
+    assert not store.neutral
+    assert summary.fragments_after < summary.fragments_before
+
+
+def test_each_is_told_from_the_others(speedy, lp, tmp_path):
+    adapters = load_plugins().adapters
+    assert choose(HostRepo(speedy), adapters).name == "speedy-splat"
+    assert choose(HostRepo(lp), adapters).name == "lp-3dgs"
+    assert choose(compact(tmp_path), adapters).name == "compact-3dgs"
+    with pytest.raises(UnknownHostError, match="kernel_times"):
+        choose(HostRepo(speedy), adapters, "vanilla-3dgs")
+
+
+# -- Speedy-Splat --------------------------------------------------------------------------------
+
+
+def test_speedys_third_output_is_a_time_that_can_be_divided_by(speedy):
+    with joint(path=speedy, adapter=SpeedySplat()) as host:
+        times = host.render(host.camera(), host.model(20))["kernel_times"]
+    assert times.shape == (1,)
+    assert times[-1].item() > 0
+
+
+def test_speedys_pruning_is_refused_and_never_gets_zeros(speedy, photographs, tmp_path):
+    """Zeros for scores would prune every Gaussian."""
+    with pytest.raises(EngineError, match="--prune_until_iter 0"):
+        run(
+            command(speedy, photographs, tmp_path, 12, "--prune_interval", 9),
+            replace(OPTIONS, stage="off"),
+        )
+
+
+def test_stage_two_of_speedy_prunes_nothing(speedy, photographs, tmp_path):
+    more = ["--prune_interval", 14, "--checkpoint_iterations", 12]  # due in stage 2, at 14
+    summary = run(command(speedy, photographs, tmp_path, 12, *more), OPTIONS)
+    expect_fine_tuned(summary)
+
+
+# -- LP-3DGS -------------------------------------------------------------------------------------
+
+
+def test_lp_ends_in_its_own_error_and_stage_two_begins_from_what_it_saved(
+    lp, photographs, tmp_path
+):
+    words = command(lp, photographs, tmp_path, 11, "--checkpoint_iterations", 11)
+    with pytest.raises(KeyError, match="ours_30000"):
+        run(words, replace(OPTIONS, stage="off"))
+    expect_fine_tuned(run(words, replace(OPTIONS, stage="finetune")))
+
+
+def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
+    """bw_score at iteration 12: 70 % stay; in stage 2, which passes it again, all do."""
+    words = command(lp, photographs, tmp_path, 10, "--prune_method", "mini_splatting")
+    with pytest.raises(KeyError, match="ours_30000"):
+        run([*words, "--iterations", "14"], replace(OPTIONS, stage="off"))
+    (pruned,) = tmp_path.glob("point_cloud/iteration_14/point_cloud.ply")
+    again = tmp_path / "again"
+    words[words.index("-m") + 1] = str(again)
+    with pytest.raises(KeyError, match="ours_30000"):
+        run(
+            [*words, "--iterations", "11", "--checkpoint_iterations", "11"],
+            replace(OPTIONS, stage="off"),
+        )
+    summary = run(words, replace(OPTIONS, stage="finetune"))
+    expect_fine_tuned(summary)
+    rows = len(read_ply(summary.model_before).xyz)
+    assert len(read_ply(pruned).xyz) == rows - int(0.3 * (rows - 1)) - 1
+
+
+def test_lps_weights_add_up_to_the_picture_of_white_gaussians(lp):
+    with joint(path=lp, adapter=LP3DGS()) as host, torch.no_grad():
+        model, camera = host.model(20), host.camera()
+        from gaussian_renderer import render
+
+        black = torch.zeros(3)
+        package = render(
+            camera,
+            model,
+            host.driver.pipe(),
+            black,
+            override_color=torch.ones(20, 3),
+            bw_score=True,
+        )
+        plain = render(camera, model, host.driver.pipe(), black)
+    torch.testing.assert_close(package["important_score"].sum(), package["render"][0].sum())
+    assert package["gaussians_count"] is None
+    assert plain["important_score"] is None
+
+
+def test_scores_that_no_engine_computes_are_refused(lp, photographs, tmp_path):
+    words = command(lp, photographs, tmp_path, 14, "--prune_method", "rad_splat")
+    with pytest.raises(EngineError, match="mw_score"):
+        run(words, replace(OPTIONS, stage="off"))
+
+
+def test_the_model_with_a_mask_is_refused_before_stage_one(lp, photographs, tmp_path):
+    with pytest.raises(UsageError, match="compact_3dgs"):
+        run(command(lp, photographs, tmp_path, 9, "--prune_method", "compact_3dgs"), OPTIONS)
+    assert not list(tmp_path.glob("point_cloud/*"))
+
+
+# -- Compact-3DGS --------------------------------------------------------------------------------
+
+
+def compact(root, **methods) -> HostRepo:
+    """As far as its source goes: what it needs, no machine without a GPU has."""
+    own = dict.fromkeys(("vq_scale", "recolor", "mlp_head", "mask_prune", "sort_morton"), "")
+    files = dict.fromkeys(("save_npz", "save_npz_pp", "load_model"), "path")
+    return skeleton(root, **(own | files | methods))
+
+
+def test_compact_is_known_by_its_codebooks_and_hash_grid(tmp_path):
+    assert Compact3DGS().match(compact(tmp_path / "whole")).fits
+    findings = Compact3DGS().match(compact(tmp_path / "other", recolor=None)).findings
+    assert "no recolor" in str(findings[0])
+
+
+def test_compact_is_not_resumed():
+    with pytest.raises(UsageError, match="--from-iter N"):
+        Compact3DGS().resumed_by(Path("train.py"), [])
+
+
+@pytest.mark.parametrize(
+    ("there", "method", "file"),
+    [
+        (["point_cloud.ply"], "load_model", "point_cloud.ply"),
+        (["point_cloud.ply", "point_cloud.npz"], "load_model", "point_cloud.npz"),
+        (["point_cloud.npz", "point_cloud_pp.npz"], "load_model", "point_cloud_pp.npz"),
+        ([], "save_npz", "point_cloud.npz"),
+        ([], "save_npz_pp", "point_cloud_pp.npz"),
+    ],
+)
+def test_compacts_files_are_found_as_the_host_finds_them(tmp_path, there, method, file):
+    for name in there:
+        (tmp_path / name).touch()
+    assert Compact3DGS().file_at(method, tmp_path / "point_cloud") == tmp_path / file
+    assert Compact3DGS().file_at("save_ply", tmp_path / "a.ply") == tmp_path / "a.ply"
+
+
+def test_compacts_codebooks_stop_where_they_are_in_use():
+    def layer(used):
+        codebook = SimpleNamespace(initted=torch.tensor([used]))
+        return SimpleNamespace(training=True, _codebook=codebook)
+
+    model = SimpleNamespace(
+        vq_scale=SimpleNamespace(layers=[layer(True)]),
+        vq_rot=SimpleNamespace(layers=[layer(False)]),
+    )
+    Compact3DGS().prepare_stage2(model, None)
+    assert not model.vq_scale.layers[0].training
+    assert model.vq_rot.layers[0].training  # it is still to be made from the data

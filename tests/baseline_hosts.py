@@ -1,0 +1,196 @@
+"""Miniatures of two pruning methods: the demo's host with what each adds, from its interface."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+from mini_splatting_host import LPIPS
+from miniature import rewrite
+
+from fragprune_plugins.testing.host import Chance, Host
+
+args = SimpleNamespace()  # the hosts' scripts hold their options under this name
+
+RENDERER, TRAIN = "gaussian_renderer/__init__.py", "train.py"
+DRAW = "    image, radii = GaussianRasterizer(raster_settings=settings)(\n"
+STEP = "            if iteration < opt.iterations:\n"
+PARSE = "    args = parser.parse_args()\n"
+
+
+class Pruning:
+    """What both models have besides."""
+
+    def prune_gaussians(self, percent, import_score):
+        lowest = import_score.sort(dim=0).values[int(percent * (len(import_score) - 1))]
+        self.prune_points((import_score <= lowest).squeeze())
+
+    def get_opacity_and_scales_for_train(self):
+        return self.get_opacity, self.get_scaling
+
+
+# -- Speedy-Splat --------------------------------------------------------------------------------
+
+
+def prune(iteration, gaussians, scene, pipe, background):
+    """Now and then, the Gaussians whose squared gradients are least go."""
+    if iteration >= args.prune_until_iter or iteration % args.prune_interval:
+        return
+    scores = torch.zeros_like(gaussians.get_opacity)
+    with torch.enable_grad():
+        for view in scene.getTrainCameras():
+            each = torch.zeros_like(scores).requires_grad_()
+            render(view, gaussians, pipe, background, scores=each)["render"].sum().backward()  # noqa: F821
+            scores += each.grad
+    gaussians.prune_gaussians(0.3, scores)
+
+
+SPEEDY = {
+    RENDERER: [
+        ("    bg_color: torch.Tensor,\n", "    bg_color: torch.Tensor,\n    scores=None,\n"),
+        (
+            DRAW,
+            "    scores = torch.zeros_like(pc.get_opacity) if scores is None else scores\n"
+            + DRAW.replace("radii", "radii, kernel_times"),
+        ),
+        ("opacities=pc.get_opacity,", "opacities=pc.get_opacity, scores=scores,"),
+        ('"radii": radii,\n', '"radii": radii,\n        "kernel_times": kernel_times,\n'),
+    ],
+    TRAIN: [
+        (STEP, "            prune(iteration, gaussians, scene, pipe, background)\n" + STEP),
+        (
+            PARSE,
+            '    parser.add_argument("--prune_until_iter", type=int, default=30_000)\n'
+            '    parser.add_argument("--prune_interval", type=int, default=3_000)\n' + PARSE,
+        ),
+        (
+            'image = renderFunc(camera, scene.gaussians, *renderArgs)["render"].clamp(0, 1)\n',
+            "package = renderFunc(camera, scene.gaussians, *renderArgs)\n"
+            '        1000 / package["kernel_times"][-1].item()\n'
+            '        image = package["render"].clamp(0, 1)\n',
+        ),
+        ('if __name__ == "__main__"', inspect.getsource(prune) + '\n\nif __name__ == "__main__"'),
+    ],
+}
+
+
+class SpeedyHost(Host):
+    """Pruning by a score."""
+
+    routine = ("prune by score", "densify and prune", "reset opacity", "another band")
+
+    def write(self, root: Path) -> None:
+        super().write(root)
+        rewrite(root, SPEEDY, Pruning)
+        (root / "lpipsPyTorch").mkdir()
+        (root / "lpipsPyTorch/__init__.py").write_text(LPIPS)
+
+    def actions(self):
+        return {**super().actions(), "prune by score": prune_by_score}
+
+
+def prune_by_score(model, arguments, chance: Chance):
+    model.prune_gaussians(chance.share, chance.uniform(len(model.get_xyz)))
+
+
+# -- LP-3DGS -------------------------------------------------------------------------------------
+
+SCORES = ("f_count", "bw_score", "mw_score")
+LP = {
+    RENDERER: [
+        (
+            "    override_color=None,\n",
+            "    override_color=None,\n    test=False,\n    top_K_dT=None,\n"
+            + "".join(f"    {name}=False,\n" for name in SCORES),
+        ),
+        (
+            "debug=pipe.debug,\n",
+            "debug=pipe.debug,\n"
+            + "".join(f"        {name}={name},\n" for name in (*SCORES, "top_K_dT")),
+        ),
+        (
+            DRAW,
+            "    opacity, _ = pc.get_opacity_and_scales_for_train()\n"
+            "    result = GaussianRasterizer(raster_settings=settings)(\n",
+        ),
+        ("opacities=pc.get_opacity,", "opacities=opacity,"),
+        (
+            "    return {\n",
+            "    image, radii, count, score = result\n    return {\n"
+            '        "gaussians_count": count,\n        "important_score": score,\n',
+        ),
+    ],
+    "scene/__init__.py": [
+        (
+            "from scene.gaussian_model import GaussianModel\n",
+            "from scene.gaussian_model import GaussianModel\n"
+            "from scene.gaussian_model_mini_splatting import MiniSplatting\n"
+            "from scene.gaussian_model_rad_splat import RadSplat\n",
+        ),
+        (
+            "class Scene:\n",
+            'ModelPool = {"3dgs": GaussianModel, "mini_splatting": MiniSplatting, '
+            '"rad_splat": RadSplat}\n\n\nclass Scene:\n',
+        ),
+    ],
+    TRAIN: [
+        ("import torch\n", "import torch\nimport wandb\n"),
+        ("from scene import GaussianModel, Scene\n", "from scene import ModelPool, Scene\n"),
+        ("GaussianModel(dataset", "ModelPool[args.prune_method](dataset"),
+        (STEP, "            gaussians.prune_after_render(iteration, scene, pipe, render)\n" + STEP),
+        (
+            PARSE,
+            '    parser.add_argument("--prune_method", default="3dgs")\n'
+            + PARSE
+            + '    wandb.init(config=None, project="test").sweep_id\n',
+        ),
+        (
+            "        args.debug_from,\n    )\n",
+            "        args.debug_from,\n    )\n"
+            "    from metrics import evaluate\n    from render import render_sets\n\n"
+            '    render_sets(lp.extract(args), -1, pp.extract(args), False, False)["train"]\n'
+            '    score = evaluate([args.model_path])[args.model_path]["ours_30000"]["PSNR"]\n'
+            '    wandb.log({"psnr": score})\n',
+        ),
+    ],
+}
+POOLED = """from scene.gaussian_model import GaussianModel
+
+
+class {name}(GaussianModel):
+    def oneupSHdegree(self):
+        super().oneupSHdegree()
+
+    def prune_after_render(self, iteration, scene, pipe, render):
+        if iteration == 12:
+            score = 0
+            for view in scene.getTrainCameras():
+                package = render(view, self, pipe, view.original_image.new_zeros(3), {score}=True)
+                score = score + package["important_score"]
+            self.prune_gaussians(0.3, score)
+"""
+
+
+class LPHost(Host):
+    """Models to choose from, and a script that ends by rendering and evaluating."""
+
+    def write(self, root: Path) -> None:
+        super().write(root)
+        rewrite(root, LP, Pruning)
+        with (root / "scene/gaussian_model.py").open("a") as file:
+            file.write("\n    def prune_after_render(self, *args):\n        pass\n")
+        files = {
+            "scene/gaussian_model_mini_splatting.py": POOLED.format(
+                name="MiniSplatting", score="bw_score"
+            ),
+            "scene/gaussian_model_rad_splat.py": POOLED.format(name="RadSplat", score="mw_score"),
+            "render.py": "def render_sets(dataset, iteration, pipe, skip_train, skip_test):\n"
+            '    return {"train": 1.0, "test": 1.0}\n',
+            "metrics.py": "def evaluate(model_paths):\n    return {p: {} for p in model_paths}\n",
+            "lpipsPyTorch/__init__.py": LPIPS,
+        }
+        for name, text in files.items():
+            (root / name).parent.mkdir(exist_ok=True)
+            (root / name).write_text(text)
