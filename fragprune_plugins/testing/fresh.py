@@ -43,7 +43,7 @@ def fresh(function: Callable[..., Any], *arguments: Any, seconds: float = 240.0)
     context.set_forkserver_preload(_PRELOAD)
     ours, theirs = context.Pipe(duplex=False)
     task = pickle.dumps((function, arguments))
-    process = context.Process(target=_serve, args=(theirs, _files_of(arguments), task))
+    process = context.Process(target=_serve, args=(theirs, _files_of((function, *arguments)), task))
     process.start()
     theirs.close()
     try:
@@ -65,17 +65,15 @@ def fresh(function: Callable[..., Any], *arguments: Any, seconds: float = 240.0)
     return value
 
 
-def _files_of(arguments: Sequence[Any]) -> dict[str, str]:
-    """Files of modules that the arguments' classes come from, by module name."""
-    files = {}
-    for argument in arguments:
-        for value in (argument, *vars(argument).values()) if hasattr(argument, "__dict__") else ():
-            for kind in type(value).__mro__:
-                module = sys.modules.get(kind.__module__)
-                file = getattr(module, "__file__", None)
-                if file and kind.__module__ != "__main__":
-                    files[kind.__module__] = file
-    return files
+def _files_of(values: Sequence[Any]) -> dict[str, str]:
+    """Files of modules that functions, classes and objects' classes come from, by module name."""
+    inside = [
+        part for value in values for part in (value, *getattr(value, "__dict__", {}).values())
+    ]
+    kinds = [each for part in inside for each in (part, *type(part).__mro__)]
+    names = {str(getattr(each, "__module__", "")) for each in kinds} - {"__main__"}
+    files = {name: getattr(sys.modules.get(name), "__file__", None) for name in names}
+    return {name: file for name, file in files.items() if file}
 
 
 def _serve(answer: Connection, files: dict[str, str], task: bytes) -> None:

@@ -55,7 +55,6 @@ class Chance:
     def __post_init__(self) -> None:
         generator = torch.Generator().manual_seed(self.seed)
         object.__setattr__(self, "generator", generator)
-        torch.manual_seed(self.seed)  # hosts draw parents and offsets from the global stream
 
     def uniform(self, *shape: int) -> Tensor:
         """Numbers in [0, 1)."""

@@ -54,6 +54,7 @@ def alignment(case: Case) -> str:
             actions = host.driver.actions()
             for name, chance in sequence:
                 chance = replace(chance)  # a fresh generator, also when Hypothesis tries again
+                torch.manual_seed(chance.seed)  # hosts draw parents from the global stream
                 actions[name](model, host.arguments, chance)
                 expect_ancestors(host, model)
                 done["actions"] += 1

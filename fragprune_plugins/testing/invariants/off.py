@@ -13,6 +13,7 @@ import wrapt
 
 from fragprune_plugins import session as sessions
 from fragprune_plugins.device import cpu_only
+from fragprune_plugins.errors import SessionError
 from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.seams import Seam
 from fragprune_plugins.session import Session
@@ -50,16 +51,26 @@ def off_is_off(case: Case, order: str) -> str:
                 for seam in case.seams:
                     import_module(seam.module)
                 originals = {seam: _pure(seam, active) for seam in case.seams}
-            elif event == "A" and not active:
+            elif event == "A" and active:
+                _refused_twice(session)
+            elif event == "A":
                 session.activate()
-            elif event == "D" and active:
-                findings = session.deactivate()
+            else:
+                findings = session.deactivate()  # harmless when inactive
                 require(not findings, f"{where}: {[str(f) for f in findings]}")
             active = sessions.active_session() is session
             for seam, original in originals.items():
                 ours = _found(seam) is not original
                 require(ours == active, f"{where}: {seam} is {'ours' if ours else 'its own'}")
     return f"{len(originals)} seams"
+
+
+def _refused_twice(session: Session) -> None:
+    try:
+        session.activate()
+    except SessionError:
+        return
+    raise AssertionError("a second activation was not refused")
 
 
 def _never_drawn(call: Any) -> Any:
@@ -87,6 +98,10 @@ def nothing_stays(case: Case) -> str:
     names = list(case.adapter.dialect(case.repo).modules(_never_drawn))
     fixed = FixedThresholds()
     with joint(plugins=[fixed], **case.options()) as host:
+        inside = [seam for seam in case.seams if not seam.external]
+        for seam in inside:
+            import_module(seam.module)
+        originals = {seam: _pure(seam, True) for seam in inside}
         model, camera = host.model(COUNT), host.camera()
         open_all(host, model)
         with torch.no_grad():
@@ -96,7 +111,10 @@ def nothing_stays(case: Case) -> str:
                 alone = host.render(camera, model)["render"]
         require(not torch.equal(truncated, alone), "paused, thresholds were still applied")
         rasterizers = {name: sys.modules[name] for name in names}
-        require(not host.deactivate(), "something could not be restored")
+        findings = [str(finding) for finding in host.deactivate()]
+        require(not findings, f"something could not be restored: {findings}")
+        kept = [str(seam) for seam, original in originals.items() if _found(seam) is not original]
+        require(not kept, f"not the host's own after the session: {kept}")
         require(not host.deactivate(), "deactivating twice is not harmless")
         left = [name for name in names if name in sys.modules]
         require(not left, f"stand-ins left in sys.modules: {left}")

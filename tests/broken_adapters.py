@@ -1,0 +1,100 @@
+"""Adapters with one fault each, which the conformance kit must find."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from fragprune_plugins.detect import Match
+from fragprune_plugins.lineage import GraphdecoDialect
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+
+class PatchesByHand(Vanilla3DGS):
+    """Wraps a function of the host by itself, and never takes it back."""
+
+    def rows(self, model: Any) -> int:
+        kind = type(model)
+        if not hasattr(kind.oneupSHdegree, "by_hand"):
+
+            def wrapper(model: Any, original: Any = kind.oneupSHdegree) -> None:
+                original(model)
+
+            wrapper.by_hand = True
+            kind.oneupSHdegree = wrapper
+        return super().rows(model)
+
+
+class TakesRandomNumbers(Vanilla3DGS):
+    """Moves the host's random stream."""
+
+    def rows(self, model: Any) -> int:
+        torch.rand(1)
+        return super().rows(model)
+
+
+class MixesUpParents(Vanilla3DGS):
+    """Gives children the thresholds of others, and says they are right."""
+
+    def parents(self, model: Any, method: str, arguments: Any) -> Any:
+        return super().parents(model, method, arguments).flip(0)
+
+    def check_children(self, model: Any, tensors: Any, parents: Any) -> bool:
+        return True
+
+
+class LosesTheCheckpoint(Vanilla3DGS):
+    """Puts thresholds into a copy of the host's checkpoint."""
+
+    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
+        return dict(super().checkpoint_state(capture))
+
+
+class TrainsTooMuch(Vanilla3DGS):
+    """Lets scales move with the opacities."""
+
+    def trained_groups(self, train: str) -> frozenset[str] | None:
+        groups = super().trained_groups(train)
+        return groups | {"scaling"} if groups else None
+
+
+class FitsEverything(Vanilla3DGS):
+    """Takes any folder for its host."""
+
+    def match(self, repo: Any) -> Match:
+        return Match(self.name, "known")
+
+
+@dataclass(frozen=True)
+class Glowing(GraphdecoDialect):
+    """Every Gaussian lights up the whole picture, drawn or not."""
+
+    def pack(self, outputs: Any, call: Any) -> Any:
+        image, *rest = super().pack(outputs, call)
+        return image + call["opacities"].mean(), *rest
+
+
+class LeavesATrace(Vanilla3DGS):
+    """Its picture depends on what was truncated."""
+
+    def dialect(self, repo: Any) -> Glowing:
+        return Glowing(**vars(super().dialect(repo)))
+
+
+class Wavering(GraphdecoDialect):
+    """Another dilation for every call."""
+
+    calls = [0]  # noqa: RUF012 - counts through all instances
+
+    def unpack(self, call: Any) -> Any:
+        self.calls[0] += 1
+        return replace(super().unpack(call), dilation=0.3 + 0.05 * self.calls[0])
+
+
+class DrawsOtherwiseEachTime(Vanilla3DGS):
+    """No two pictures agree, whatever draws them."""
+
+    def dialect(self, repo: Any) -> Wavering:
+        return Wavering(**vars(super().dialect(repo)))

@@ -1,0 +1,109 @@
+"""The kit finds what it is there to find, and says so."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import broken_adapters as broken
+import pytest
+from miniature import HOST
+
+from fragprune_plugins.testing import Host, invariants
+from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
+from fragprune_plugins.testing.plugin import table
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+
+def case(adapter, **options):
+    return invariants.Case(adapter, Host(), HOST, **options)
+
+
+@pytest.mark.parametrize(
+    ("check", "adapter", "words"),
+    [
+        (invariants.nothing_stays, broken.PatchesByHand, "could not be restored"),
+        (invariants.neutral_is_the_host, broken.TakesRandomNumbers, "differ from the host's own"),
+        (invariants.alignment, broken.MixesUpParents, "descends from"),
+        (invariants.monotone, broken.LeavesATrace, "not close"),
+        (invariants.round_trip, broken.LosesTheCheckpoint, "of a restored model differ"),
+        (invariants.freeze, broken.TrainsTooMuch, "moved ['opacity', 'scaling']"),
+        (invariants.refuse, broken.FitsEverything, "still taken for the host"),
+        (invariants.same_picture, broken.DrawsOtherwiseEachTime, "other fragments drawn"),
+    ],
+    ids=lambda value: getattr(value, "__name__", "words"),
+)
+def test_each_fault_is_found_by_its_invariant(check, adapter, words):
+    with pytest.raises(FreshProcessError) as caught:
+        fresh(check, case(adapter(), examples=5))
+    assert words in str(caught.value)
+
+
+def test_a_host_that_forgets_to_be_followed_is_found():
+    """Rows that change without a seam: the driver's own action goes past the host's methods."""
+    with pytest.raises(FreshProcessError, match="16 thresholds for 12 Gaussians"):
+        fresh(invariants.alignment, invariants.Case(Vanilla3DGS(), Forgetful(), HOST, examples=3))
+
+
+class Forgetful(Host):
+    def actions(self):
+        return {"behind the back": behind_the_back}
+
+
+def behind_the_back(model, arguments, chance):
+    for group in model.optimizer.param_groups:
+        name = {"f_dc": "features_dc", "f_rest": "features_rest"}.get(group["name"], group["name"])
+        setattr(model, f"_{name}", group["params"][0][:-4])
+
+
+@pytest.mark.parametrize("longest", [1, 2, 3, 4])
+def test_orders_have_one_import_and_end_anywhere(longest):
+    found = invariants.orders(longest)
+    assert len(found) == len(set(found)) == {1: 1, 2: 5, 3: 17, 4: 45}[longest]
+    assert all(order.count("I") == 1 and order.count("A") <= 2 for order in found)
+
+
+def raises():
+    print("on the way")
+    raise ValueError("a fault")
+
+
+def skips():
+    raise NotApplicable("nothing here")
+
+
+def dies():
+    os._exit(3)
+
+
+def lingers():
+    time.sleep(60)
+
+
+def test_what_a_fresh_process_does_comes_back():
+    assert fresh(os.path.join, "a", "b") == "a/b"
+    assert fresh(os.getpid) != fresh(os.getpid) != os.getpid()
+    with pytest.raises(FreshProcessError, match=r"on the way[\s\S]*ValueError: a fault"):
+        fresh(raises)
+    with pytest.raises(NotApplicable, match="nothing here"):
+        fresh(skips)
+    with pytest.raises(FreshProcessError, match="exit code 3"):
+        fresh(dies)
+    with pytest.raises(FreshProcessError, match="longer than 2 seconds"):
+        fresh(lingers, seconds=2)
+
+
+def test_the_table_has_adapters_down_and_invariants_across():
+    results = [
+        {"adapter": a, "host": h, "invariant": i, "outcome": o}
+        for a, h, i, o in [
+            ("one", "miniature", "freeze", "passed"),
+            ("one", "miniature", "alignment", "failed"),
+            ("another", "checkout", "freeze", "skipped"),
+        ]
+    ]
+    assert [line.split() for line in table(results)] == [
+        ["adapter", "host", "freeze", "alignment"],
+        ["one", "miniature", "ok", "FAILED"],
+        ["another", "checkout", "skipped", "-"],
+    ]
