@@ -85,6 +85,10 @@ class GaussianSplatting(GraphdecoAdapter):
         "gaussian-splatting (pip)",
         repo="yindaheng98/gaussian-splatting",
         states="2.11 (inria backend), gaussian-splatting-mcmc 1.3",
+        limits=(
+            "--backend gsplat and gsplat-2dgs are refused; so are, on a CPU, the MCMC extension's "
+            "modes pruning and shculling.",
+        ),
     )
     installed = (PACKAGE, MCMC, REDUCED)
     package = RASTERIZER
@@ -100,6 +104,7 @@ class GaussianSplatting(GraphdecoAdapter):
             external=True,
         ),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
+        Seam(Role.METRIC, f"{PACKAGE}.utils.lpipsPyTorch", "lpips"),
         Seam(
             Role.REARRANGE,
             f"{TRAINER}.densifier.trainer",
