@@ -36,7 +36,7 @@ class Compact3DGS(GraphdecoAdapter):
         repo="maincold2/Compact-3DGS",
         states="September 2024",
         limits=(
-            "Its checkpoints cannot be resumed: stage 2 is --stage finetune --from-iter N, one run.",
+            "Its checkpoints cannot be resumed: --stage finetune --from-iter N learns in one run.",
             "It needs tinycudann, and that a GPU; nothing of ours stands in for it.",
             "fragprune finetune, render and compare refuse its files: values are activated and the "
             "colours are not in them.",

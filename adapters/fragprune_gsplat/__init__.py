@@ -43,7 +43,17 @@ class Gsplat(HostAdapter):
     """gsplat, the library."""
 
     name = "gsplat"
-    info = HostInfo("gsplat", repo="nerfstudio-project/gsplat", states="1.5, 1.6 (pinhole cameras)")
+    info = HostInfo(
+        "gsplat",
+        repo="nerfstudio-project/gsplat",
+        states="1.5, 1.6 (pinhole cameras)",
+        limits=(
+            "Refused by name: other cameras, distortion, the unscented transform, distributed, "
+            "batches, channels other than three, tiles other than 16 pixels.",
+            "absgrad is refused while positions train; MCMCStrategy of 1.6 needs a GPU until "
+            "stage 2.",
+        ),
+    )
     installed = (PACKAGE,)
     steps_by_rendering = True
     seams = (

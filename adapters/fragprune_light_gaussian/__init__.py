@@ -60,6 +60,9 @@ class LightGaussian(GraphdecoAdapter):
         "LightGaussian",
         repo="VITA-Group/LightGaussian",
         states="2024, rasterizer of 240618b (score: opacity per fragment)",
+        limits=(
+            "VecTree and render.py --load_vq know no thresholds: their pictures are untruncated.",
+        ),
     )
     contracts = (
         Contract(frozenset({"f_count"})),

@@ -56,6 +56,9 @@ class MCMC(GraphdecoAdapter):
         "3D Gaussian Splatting as Markov Chain Monte Carlo",
         repo="ubc-vision/3dgs-mcmc",
         states="January 2025",
+        limits=(
+            "Ours clips at 3 sigma, as the rasterizer it pins; that one's branch gs-mcmc at 1.8.",
+        ),
     )
     contracts = (Contract(outputs=3),)
     seams = (

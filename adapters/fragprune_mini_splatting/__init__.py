@@ -79,7 +79,10 @@ class MiniSplatting(GraphdecoAdapter):
 
     name = "mini-splatting"
     info = HostInfo(
-        "Mini-Splatting", repo="fatPeter/mini-splatting", states="gs, ms, ms_d and ms_c"
+        "Mini-Splatting",
+        repo="fatPeter/mini-splatting",
+        states="gs, ms, ms_d and ms_c",
+        limits=("--compute_cov3D_python is refused where the host asks for depth (ms, ms_d).",),
     )
     contracts = (
         Contract(),

@@ -69,6 +69,9 @@ class MipSplatting(GraphdecoAdapter):
         "Mip-Splatting",
         repo="autonomousvision/mip-splatting",
         states="2024, with absolute gradients in densification",
+        limits=(
+            "fragprune finetune, render and compare take create_fused_ply.py's PLY, not its own.",
+        ),
     )
     contracts = (Contract(frozenset({"kernel_size", "subpixel_offset"})),)
     seams = (

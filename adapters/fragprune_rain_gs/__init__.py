@@ -65,7 +65,12 @@ class RainGS(GraphdecoAdapter):
     """RAIN-GS."""
 
     name = "rain-gs"
-    info = HostInfo("RAIN-GS", repo="KU-CVLAB/RAIN-GS", states="2024, both of its modes")
+    info = HostInfo(
+        "RAIN-GS",
+        repo="KU-CVLAB/RAIN-GS",
+        states="2024, both of its modes",
+        limits=("Stage 2 leaves its modes out (--ours, --ours_new, --c2f): they cannot resume.",),
+    )
     package = PACKAGE
     contracts = (Contract(frozenset({"low_pass"}), 3),)
     steps_by_rendering = True

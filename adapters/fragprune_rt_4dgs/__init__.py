@@ -39,6 +39,10 @@ class RT4DGS(GraphdecoAdapter):
         "RT-4DGS",
         repo="fudan-zvg/4d-gaussian-splatting",
         states="January 2026",
+        limits=(
+            "gaussian_dim 3 cannot be resumed: --stage finetune --from-iter N learns in one run.",
+            "It has no PLY: fragprune finetune, render, compare and export have nothing to read.",
+        ),
     )
     package = RASTERIZER
     contracts = (Contract(SETTINGS, OUTPUTS),)

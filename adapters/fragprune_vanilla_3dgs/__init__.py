@@ -46,6 +46,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         "3D Gaussian Splatting",
         repo="graphdeco-inria/gaussian-splatting",
         states="2023 (2-tuple), August 2024 (3-tuple), October 2024 (separate_sh, sparse Adam)",
+        limits=("With --antialiasing or --train_test_exp run does not compare before and after.",),
     )
     contracts = (Contract(), Contract(frozenset({"antialiasing"}), OUTPUTS))
 

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING
+
 import click
 
 from fragprune_plugins.cli.common import Command, Report
 
+if TYPE_CHECKING:
+    from fragprune_plugins.adapter import HostAdapter
+
 
 @click.command("adapters", cls=Command)
-def command() -> Report:
+@click.option("--table", is_flag=True, help="Print the support table, in Markdown.")
+def command(table: bool) -> Report:
     """List the installed adapters and every plugin that was blocked or failed.
 
     \b
-    Example:
+    Examples:
       fragprune adapters --json
+      fragprune adapters --table > docs/reference/support.md
     """
     from fragprune_plugins.plugins import load_plugins
 
@@ -24,6 +34,8 @@ def command() -> Report:
             "title": adapter.info.title,
             "repo": adapter.info.repo,
             "states": adapter.info.states,
+            "scripts": list(_scripts(adapter)),
+            "limits": list(adapter.info.limits),
             "seams": [
                 {"role": seam.role.name, "where": str(seam), "needs": list(seam.needs)}
                 for seam in adapter.seams
@@ -39,4 +51,53 @@ def command() -> Report:
     lines += [str(finding) for finding in plugins.findings]
     data = {"adapters": adapters, "findings": [f.as_dict() for f in plugins.findings]}
     failed = any(finding.level == "error" for finding in plugins.findings)
-    return Report(data, "\n".join(lines), exit_code=1 if failed else 0)
+    text = support(plugins.adapters) if table else "\n".join(lines)
+    return Report(data, text, exit_code=1 if failed else 0)
+
+
+def support(adapters: Sequence[HostAdapter]) -> str:
+    """What is supported, as a page of Markdown, made from the adapters alone."""
+    from fragprune_plugins.engines import ENGINES
+
+    head = ["host", "adapter", "states", "scripts that train"]
+    rows = [head, ["---"] * len(head)]
+    limits = []
+    for adapter in adapters:
+        info = adapter.info
+        host = f"[{info.title}](https://github.com/{info.repo})"
+        scripts = ", ".join(f"`{script}`" for script in _scripts(adapter)) or "your own"
+        rows.append([host, f"`{adapter.name}`", info.states, scripts])
+        limits += [f"* `{adapter.name}`: {limit}" for limit in info.limits]
+    table = "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
+    return _SUPPORT.substitute(
+        table=table, engines=", ".join(f"`{name}`" for name in ENGINES), limits="\n".join(limits)
+    )
+
+
+def _scripts(adapter: HostAdapter) -> tuple[str, ...]:
+    """Paths in the checkout, or modules of the package; none for a library.
+
+    They do not depend on the revision.
+    """
+    from fragprune_plugins.detect import HostRepo
+    from fragprune_plugins.errors import UsageError
+
+    try:
+        return adapter.command_line(HostRepo(Path("/nonexistent"))).scripts
+    except UsageError:
+        return ()
+
+
+_SUPPORT = Template("""# What is supported
+
+<!-- Made by `fragprune adapters --table`; a test compares it with the adapters. -->
+
+Scripts that do not train (render, evaluate) run under `fragprune run` as well, with the thresholds
+that lie beside their models. Every adapter draws with every engine: $engines. `fragprune check DIR`
+says which adapter fits a checkout, and where it does not.
+
+$table
+
+## What will not work, or is refused
+
+$limits""")

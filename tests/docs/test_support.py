@@ -1,0 +1,34 @@
+"""docs/reference/support.md is what the installed adapters say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from cli.commands import run, run_json
+
+from fragprune_plugins.plugins import load_plugins
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "support.md"
+ADAPTERS = load_plugins().adapters
+
+
+def test_the_support_table_is_current():
+    made = run("adapters", "--table").stdout
+    assert PAGE.read_text() == made, "Run: fragprune adapters --table > docs/reference/support.md"
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS, ids=lambda adapter: adapter.name)
+def test_every_adapter_says_what_it_is_for(adapter):
+    assert adapter.info.title
+    assert adapter.info.repo.count("/") == 1
+    assert adapter.info.states
+    for limit in adapter.info.limits:
+        assert limit.endswith(".")
+        assert "\n" not in limit
+
+
+def test_scripts_and_limits_are_data_too():
+    (vanilla,) = (a for a in run_json("adapters")["adapters"] if a["name"] == "vanilla-3dgs")
+    assert vanilla["scripts"] == ["train.py"]
+    assert vanilla["limits"]
