@@ -165,7 +165,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     host = _parse(script, arguments, adapter.command_line(repo), module)
     device = _device(options.device)
     started = time.perf_counter()
-    trains = script.relative_to(repo.root).as_posix() in host.line.scripts
+    trains = script in (repo.root / name for name in host.line.scripts)
     with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
         runner = _Runner(host, repo, adapter, plugins, options, device, Path(scratch))
         if not trains or options.stage == "off":

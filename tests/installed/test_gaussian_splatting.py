@@ -175,3 +175,13 @@ def test_its_own_command_trains_and_is_fine_tuned(mode, photographs, tmp_path):
         files = [folder / "cameras.json" for folder in (out, out / "finetuned")]
         first, second = ([c["position"] for c in json.loads(f.read_text())] for f in files)
         assert first == [pytest.approx(position, abs=1e-5) for position in second]  # rate: 1e-2
+
+
+def test_a_script_of_ones_own_runs_with_the_package_answered(tmp_path):
+    script = tmp_path / "mine.py"
+    script.write_text(
+        "from gaussian_splatting.diff_gaussian_rasterization import GaussianRasterizer\n"
+        "assert 'Stand-in' in GaussianRasterizer.__doc__\n"
+    )
+    summary = run(["python", str(script)], RunOptions(device="cpu"))
+    assert (summary.adapter, summary.iterations) == ("gaussian-splatting", 0)
