@@ -122,6 +122,17 @@ def test_stage_2_moves_opacities_and_thresholds_alone(kind, photographs, session
         session.expect_drawn()
 
 
+def test_steps_that_draw_nothing_with_thresholds_are_an_error(photographs, session_on):
+    with session_on(GaussianSplatting()) as session:
+        trainer, _, cameras = trained("densify", photographs)
+        session.expect_drawn()  # nothing has begun
+        trainer.update_learning_rate()
+        with pytest.raises(SessionError, match="no view"):
+            session.expect_drawn()
+        trainer.step(cameras[0])
+        session.expect_drawn()
+
+
 def test_every_original_is_back_when_the_session_ends(photographs, session_on):
     with session_on(GaussianSplatting()) as session:
         trained("densify", photographs)

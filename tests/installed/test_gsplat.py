@@ -17,7 +17,7 @@ from fragprune_gsplat import Gsplat
 from fragprune_plugins import sidecar
 from fragprune_plugins.cli import cli
 from fragprune_plugins.detect import HostRepo
-from fragprune_plugins.errors import InputError, SessionError, UsageError
+from fragprune_plugins.errors import AlignmentError, InputError, SessionError, UsageError
 from fragprune_plugins.ply import read_ply
 from fragprune_plugins.schedule import Settings
 
@@ -268,6 +268,27 @@ def test_stage_2_moves_opacities_and_thresholds_alone(session_on, kind):
         summary = session.finish()
         assert (summary.steps, summary.gaussians) == (8, 40)
         assert summary.fragments_after < summary.fragments_before
+
+
+def test_thresholds_go_through_a_file_beside_ones_own_checkpoint(unmoved, tmp_path):
+    with unmoved(Gsplat()) as session:
+        from gsplat import MCMCStrategy
+
+        params, optimizers = model()
+        MCMCStrategy().check_sanity(params, optimizers)
+        session.store(params).logits = torch.randn(40).requires_grad_(True)
+        file = tmp_path / "splats.pt"
+        torch.save(params.state_dict(), file)
+        session.save(params, file)
+        again, _ = model(seed=1)
+        again.load_state_dict(torch.load(file))
+        with pytest.raises(SessionError, match="without thresholds"):
+            session.save(again, file)
+        session.load(again, file)
+        assert torch.equal(session.store(again).logits, session.store(params).logits)
+        few, _ = model(7)
+        with pytest.raises(AlignmentError, match="7 Gaussians"):
+            session.load(few, file)
 
 
 def test_originals_are_back_wherever_they_were_imported_to(session_on):

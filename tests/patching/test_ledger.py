@@ -51,6 +51,18 @@ def noting(calls):
     return wrapper
 
 
+def test_copies_made_while_we_were_there_are_restored_too(host, monkeypatch):
+    original, ledger = host.render, PatchLedger()
+    for _ in range(2):  # two seams on one function, as hosts without a renderer class have
+        ledger.wrap(seam("render", "view"), noting([]))
+    other = ModuleType("another_module_of_the_ledgers_tests")
+    other.render, other.draw = host.render, host.render
+    monkeypatch.setitem(sys.modules, other.__name__, other)
+    assert ledger.undo() == []
+    assert other.render is host.render is original
+    assert other.draw("view", "model") == original("view", "model")  # by another name: inert
+
+
 def test_a_wrapped_function_is_called_through_us_and_restored_identically(host):
     original, calls = host.render, []
     ledger = PatchLedger()
