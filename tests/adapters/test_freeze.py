@@ -43,21 +43,6 @@ def test_only_what_is_named_moves(train):
         assert host.store(model).steps == 4
 
 
-@pytest.mark.parametrize("train", MOVES)
-def test_no_row_and_no_band_is_added_removed_or_reset(train):
-    with running(Settings(iterations=9, train=train)) as host:
-        model, camera = host.model(20), host.camera()
-        for iteration in (1, 2):
-            host.step(model, camera, iteration)
-        before = tensors(model)
-        model.xyz_gradient_accum += 1.0
-        model.densify_and_prune(1e-9, 0.9, 1.0, 20)
-        model.reset_opacity()
-        model.oneupSHdegree()
-        assert model.active_sh_degree == 0
-        assert all(torch.equal(value, before[name]) for name, value in tensors(model).items())
-
-
 def test_before_stage_two_the_host_has_its_way():
     with running(Settings(iterations=9), from_step=1) as host:
         model, camera = host.model(20), host.camera()

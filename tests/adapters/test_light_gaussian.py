@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import shutil
 import sys
 from importlib import import_module
@@ -14,8 +13,6 @@ import light_gaussian_host
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from miniature import HOST, TINY, expect_ancestors, joint, label, running, tensors
 from oracle import naive
 
@@ -159,50 +156,6 @@ def test_pruning_counts_what_is_left_after_truncation(mini, monkeypatch):
 
 
 # -- rows ----------------------------------------------------------------------------------------
-
-
-def act(model, arguments, action, seed, share):
-    generator = torch.Generator().manual_seed(seed)
-    n = len(model.get_xyz)
-    if action == "prune":
-        model.prune_gaussians(share, torch.rand(n, generator=generator))
-    elif action == "prune by opacity":
-        model.prune_opacity(share)
-    elif action == "densify":
-        model.xyz_gradient_accum = torch.rand(n, 1, generator=generator)
-        model.denom = (torch.rand(n, 1, generator=generator) < 0.8).float()
-        model.densify(1 - share, 3.0 if seed % 2 else 100.0)
-    elif action == "training setup":
-        model.training_setup(arguments)
-    elif action == "restore":
-        file = io.BytesIO()
-        torch.save((model.capture(), 7), file)
-        file.seek(0)
-        model.restore(torch.load(file, weights_only=False)[0], arguments)
-        if seed % 2:  # as distillation does, with a band less
-            model.training_setup(arguments)
-
-
-actions = st.tuples(
-    st.sampled_from(["prune", "prune by opacity", "densify", "training setup", "restore"]),
-    st.integers(0, 99),
-    st.floats(0.05, 0.5),
-)
-
-
-@settings(max_examples=40)
-@given(st.lists(actions, min_size=1, max_size=7))
-def test_every_row_has_its_ancestors_threshold(mini, sequence):
-    with joint(**of(mini)) as host:
-        model, camera = host.model(COUNT), host.camera(16, 12)
-        host.step(model, camera, 1)
-        label(host, model)
-        for action, seed, share in sequence:
-            act(model, host.arguments, action, seed, share)
-            expect_ancestors(host, model)
-            if len(model.get_xyz) in (0, *range(400, 10_000)):
-                return
-        assert host.render(camera, model)["render"].isfinite().all()
 
 
 def test_a_point_cloud_brings_its_thresholds_into_training(mini, tmp_path):

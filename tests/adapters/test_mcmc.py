@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import sys
 from dataclasses import replace
@@ -11,8 +10,6 @@ from importlib import import_module
 import mcmc_host
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from miniature import (
     HOST,
     TINY,
@@ -31,7 +28,7 @@ from fragprune_plugins.errors import AlignmentError, UnknownHostError, UsageErro
 from fragprune_plugins.launch import HostFailed, RunOptions, run
 from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Schedule, Settings
+from fragprune_plugins.schedule import Settings
 
 COUNT = 24
 
@@ -90,48 +87,6 @@ def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, cod
 # -- rows ----------------------------------------------------------------------------------------
 
 
-@torch.no_grad()
-def act(model, arguments, action, seed, share):
-    n = len(model.get_xyz)
-    generator = torch.Generator().manual_seed(seed)
-    torch.manual_seed(seed)  # the host draws parents from the global stream
-    if action == "relocate":
-        dead = torch.rand(n, generator=generator) < share
-        model.relocate_gs(dead_mask=dead)
-    elif action == "add":
-        model.add_new_gs(cap_max=n + int(share * 10))
-    elif action == "prune":
-        model.max_radii2D = model.denom = model.xyz_gradient_accum = torch.zeros(n, 1)
-        model.prune_points(torch.rand(n, generator=generator) < share / 2)
-    elif action == "restore":
-        file = io.BytesIO()
-        torch.save((model.capture(), 7), file)
-        file.seek(0)
-        model.restore(torch.load(file, weights_only=False)[0], arguments)
-
-
-actions = st.tuples(
-    st.sampled_from(["relocate", "relocate", "add", "add", "prune", "restore"]),
-    st.integers(0, 99),
-    st.sampled_from([0.0, 0.1, 0.4, 0.9, 1.0]),
-)
-
-
-@settings(max_examples=40)
-@given(st.lists(actions, min_size=1, max_size=7))
-def test_every_row_has_its_ancestors_threshold(mini, sequence):
-    with joint(**of(mini)) as host:
-        model, camera = host.model(COUNT), host.camera(16, 12)
-        host.step(model, camera, 1)  # so that the host's optimizer has moments to move
-        label(host, model)
-        for action, seed, share in sequence:
-            act(model, host.arguments, action, seed, share)
-            expect_ancestors(host, model)
-            if not len(model.get_xyz):
-                return
-        assert host.render(camera, model)["render"].isfinite().all()
-
-
 def test_relocated_rows_and_their_parents_start_without_moments(mini):
     """The host empties its parents' moments; ours of the row that is no more go as well."""
     with joint(**of(mini)) as host:
@@ -184,45 +139,6 @@ def test_a_relocation_that_copies_otherwise_is_refused(mini, monkeypatch):
             monkeypatch.undo()
             model.relocate_gs(dead_mask=torch.arange(COUNT) < 9)  # nothing was left pending
         expect_ancestors(host, model)
-
-
-def lifetime(host):
-    """Steps, relocation, addition and noise, as the training loop has them; what came of it."""
-    torch.manual_seed(3)
-    model, camera = host.model(COUNT), host.camera()
-    rates = []
-    for iteration in (1, 2, 3, 4):
-        rates.append(model.update_learning_rate(iteration))
-        host.render(camera, model)["render"].square().mean().backward()
-        with torch.no_grad():
-            model.relocate_gs(dead_mask=(model.get_opacity < 0.9).squeeze(-1))
-            model.add_new_gs(cap_max=COUNT + 3)
-            model.optimizer.step()
-            model.optimizer.zero_grad(set_to_none=True)
-            model._xyz.add_(torch.randn_like(model._xyz) * rates[-1])
-    return model, rates
-
-
-class Never(Schedule):
-    def at(self, step):
-        return replace(super().at(step), learn=False)
-
-
-def test_followed_but_not_learning_the_host_is_its_own_to_the_bit(mini):
-    """Sampled parents and noise included: no random number is taken."""
-    never = Never(Settings(iterations=9))
-    with running(**of(mini), active=False) as host:
-        host.session._install_stand_ins()
-        alone, rates = lifetime(host)
-        stream = torch.get_rng_state()
-        plain = tensors(alone)
-    with running(**of(mini), schedule=never, freeze=False) as host:
-        followed, ours = lifetime(host)
-        assert len(host.store(followed)) == COUNT + 3
-        assert (ours, rates) == (rates, ours)
-        assert torch.equal(torch.get_rng_state(), stream)
-        for name, value in tensors(followed).items():
-            assert torch.equal(value, plain[name])
 
 
 def test_the_dialect_gives_three_outputs_and_thresholds_leave_radii_and_use_alone(mini):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import time
+from pathlib import Path
 
 import broken_adapters as broken
 import pytest
 from miniature import HOST
 
+from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.testing import Host, invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
 from fragprune_plugins.testing.plugin import table
@@ -107,3 +110,10 @@ def test_the_table_has_adapters_down_and_invariants_across():
         ["one", "miniature", "ok", "FAILED"],
         ["another", "checkout", "skipped", "-"],
     ]
+
+
+def test_every_adapter_has_a_miniature_or_is_known_to_have_none():
+    tested = Path(__file__).parent.glob("test_*.py")
+    said = {name for file in tested for name in re.findall(r'adapter = "(.+)"', file.read_text())}
+    installed = {adapter.name for adapter in load_plugins().adapters}
+    assert installed - said == {"compact-3dgs", "gaussian-splatting", "gsplat"}
