@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     from fragprune_plugins.finetuning import finetune
     from fragprune_plugins.schedule import Settings
     from fragprune_plugins.thresholds import ThresholdStore
-    from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
+    from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats, View
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "Footprints": "types",
     "RasterInputs": "types",
     "RasterOutputs": "types",
     "Settings": "schedule",
@@ -33,6 +34,7 @@ _HOME = {
 }
 
 __all__ = [
+    "Footprints",
     "RasterInputs",
     "RasterOutputs",
     "Settings",

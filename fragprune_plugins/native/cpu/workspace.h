@@ -17,6 +17,14 @@
 #include <sys/mman.h>
 #endif
 
+#if defined(__SANITIZE_ADDRESS__)
+#define FP_EXACT_SIZES
+#elif defined(__has_feature)
+#if __has_feature(address_sanitizer)
+#define FP_EXACT_SIZES
+#endif
+#endif
+
 namespace fp {
 
 // Blocks by size class, four to an octave. What lies idle is bounded by what was in use at once,
@@ -33,7 +41,7 @@ class Pool {
 
   static size_t class_of(size_t bytes) {
     if (bytes > SIZE_MAX / 2) throw std::bad_alloc();  // rounding up would wrap around
-#if defined(__SANITIZE_ADDRESS__)
+#ifdef FP_EXACT_SIZES
     return std::max<size_t>(bytes, 1);  // so that one number too many is seen
 #endif
     size_t step = 64;
