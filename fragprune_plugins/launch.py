@@ -216,7 +216,7 @@ class _Runner:
             self._saving(total),
             learn=True,
             freeze=False,
-            start=_iteration_of(Path(resumed)) if resumed else 0,
+            start=self._iteration_of(Path(resumed)) if resumed else 0,
             schedule=schedule,
             settings=settings,
         )
@@ -274,7 +274,7 @@ class _Runner:
         """The checkpoint to resume from; one made from a PLY is removed afterwards."""
         if self.host.flags.resume and self.trained is None:
             path = Path(self.host.flags.resume)
-            yield (0 if self.host.line.restarts else _iteration_of(path)), path
+            yield self._iteration_of(path), path
             return
         saved = self.adapter.saved_iterations(self.output) if self.output else []
         if self.trained is not None:  # the folder may hold later ones of another run
@@ -380,6 +380,10 @@ class _Runner:
             settings=self.options.settings.as_dict(),
             drawing=self.adapter.drawing(self.repo, self.host.arguments),
         )
+
+    def _iteration_of(self, resumed: Path) -> int:
+        """The iteration that a run from this file goes on after."""
+        return 0 if self.host.line.restarts else _iteration_of(resumed)
 
     def _checkpoints(self, total: int) -> list[int]:
         """Iterations to write a checkpoint at: the command's, and the last."""

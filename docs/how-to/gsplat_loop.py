@@ -1,6 +1,7 @@
 """A training loop with gsplat, as its documentation has it, and stage 2 in three lines more.
 
 python gsplat_loop.py SCENE OUT [--strategy mcmc] [--steps 3000] [--stage2 1000]
+python gsplat_loop.py SCENE OUT --start MODEL.ply        (trained already: stage 2 alone)
 
 SCENE is a COLMAP folder with sparse/0/points3D.ply. OUT gets trained.ply and finetuned.ply, the
 thresholds beside the latter.
@@ -20,6 +21,7 @@ from fragprune_plugins.schedule import Settings
 parser = ArgumentParser()
 parser.add_argument("scene", type=Path)
 parser.add_argument("out", type=Path)
+parser.add_argument("--start", type=Path, help="a trained model, for no --steps")
 parser.add_argument("--strategy", choices=["default", "mcmc"], default="default")
 parser.add_argument("--steps", type=int, default=3000)
 parser.add_argument("--stage2", type=int, default=1000)
@@ -27,6 +29,7 @@ parser.add_argument("--cap", type=int, default=8000, help="Gaussians of --strate
 parser.add_argument("--grow", type=float, default=2e-4, help="gradient that densifies")
 parser.add_argument("--control", action="store_true", help="stage 2 without thresholds")
 args = parser.parse_args()
+args.steps = 0 if args.start else args.steps
 
 # 1. Above the import of gsplat. Learning and freezing begin once the loop has made --steps steps.
 settings = Settings(iterations=args.stage2, truncate=not args.control)
@@ -40,6 +43,7 @@ from scipy.spatial import cKDTree  # noqa: E402
 
 from fragprune_plugins.finetuning import load_dataset  # noqa: E402
 from fragprune_plugins.finetuning.losses import photometric_loss  # noqa: E402
+from fragprune_plugins.ply import read_ply  # noqa: E402
 from fragprune_plugins.types import View  # noqa: E402
 
 SH_DEGREE = 1
@@ -65,6 +69,17 @@ start = {
     "sh0": torch.tensor((colors - 0.5) / 0.28209479)[:, None],
     "shN": torch.zeros(count, bands - 1, 3),
 }
+if args.start:
+    trained = read_ply(args.start)
+    start = {
+        "means": trained.xyz,
+        "scales": trained.scaling,
+        "quats": trained.rotation,
+        "opacities": trained.opacity[:, 0],
+        "sh0": trained.f_dc,
+        "shN": trained.f_rest,
+    }
+    SH_DEGREE = trained.sh_degree
 rates = {
     "means": 1.6e-4 * dataset.extent,
     "scales": 5e-3,
@@ -79,7 +94,9 @@ params = torch.nn.ParameterDict(
 optimizers = {
     name: torch.optim.Adam([params[name]], lr=rate, eps=1e-15) for name, rate in rates.items()
 }
-decay = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], 0.01 ** (1 / args.steps))
+decay = torch.optim.lr_scheduler.ExponentialLR(
+    optimizers["means"], 0.01 ** (1 / max(1, args.steps))
+)
 strategy = (
     gsplat.MCMCStrategy(cap_max=args.cap, refine_stop_iter=args.steps * 5 // 6)
     if mcmc

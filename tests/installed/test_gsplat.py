@@ -306,12 +306,15 @@ def test_originals_are_back_wherever_they_were_imported_to(session_on):
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_the_documented_loop_runs_and_exports_its_thresholds(photographs, tmp_path, strategy):
-    words = [LOOP, photographs, tmp_path, "--strategy", strategy, "--steps", 6, "--stage2", 6]
-    done = subprocess.run(
-        [sys.executable, *map(str, words)], capture_output=True, text=True, timeout=240
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert "fragments per pixel" in done.stdout
+    def loop(*words: object) -> None:
+        command = [sys.executable, LOOP, photographs, *words, "--strategy", strategy]
+        done = subprocess.run(
+            [str(word) for word in command], capture_output=True, text=True, timeout=240
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        assert "fragments per pixel" in done.stdout
+
+    loop(tmp_path, "--steps", 6, "--stage2", 6)
     before, after = (read_ply(tmp_path / f"{name}.ply") for name in ("trained", "finetuned"))
     names = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
     moved = [n for n in names if not torch.equal(getattr(before, n), getattr(after, n))]
@@ -319,3 +322,6 @@ def test_the_documented_loop_runs_and_exports_its_thresholds(photographs, tmp_pa
     store, info = sidecar.load(tmp_path / "finetuned.ply")
     assert (len(store), info.adapter) == (len(after.xyz), "gsplat")
     assert not sidecar.path_beside(tmp_path / "trained.ply").exists()
+    loop(tmp_path / "again", "--start", tmp_path / "trained.ply", "--stage2", 3)
+    again = sidecar.load(tmp_path / "again" / "finetuned.ply")[0]
+    assert (len(again), again.steps) == (len(before.xyz), 3)
