@@ -208,7 +208,8 @@ class Session:
         self._drop_in = drop_in
         self._dialect = adapter.dialect(repo)
         self._ledger: PatchLedger | None = None
-        self._stand_ins: dict[str, ModuleType] = {}
+        self._made: dict[str, ModuleType] = {}  # once: a host keeps what it imported
+        self._stand_ins: dict[str, ModuleType] = {}  # those in sys.modules
         self._unpacked: tuple[Tensor, ThresholdStore] | None = None  # not yet a model's
         self._absent: set[Seam] = set()  # metrics without their weights
         self._models: weakref.WeakKeyDictionary[Any, _ModelState] = weakref.WeakKeyDictionary()
@@ -239,6 +240,7 @@ class Session:
             self._install_stand_ins()
             for seam in self.adapter.seams_for(self.repo):
                 self._ledger.wrap(seam, partial(self._enter, seam))
+            self._refuse_leftovers()
         except BaseException:
             self._take_back()
             raise
@@ -348,7 +350,8 @@ class Session:
     def _install_stand_ins(self) -> None:
         from importlib.util import find_spec
 
-        for name, module in self._dialect.modules(self._draw).items():
+        self._made = self._made or self._dialect.modules(self._draw)
+        for name, module in self._made.items():
             package = name.split(".")[0]
             if self._drop_in is None and package not in self._stand_ins:
                 wanted = not self._dialect.present(package)
@@ -368,6 +371,27 @@ class Session:
             if name not in sys.modules and find_spec(name) is None:
                 log.warning("%s is not installed: the host imports an empty stand-in", name)
                 sys.modules[name] = self._stand_ins[name] = module
+
+    def _refuse_leftovers(self) -> None:
+        """A host imported under an earlier session holds its classes, and draws with them."""
+        hosts = [
+            module
+            for module in list(sys.modules.values())
+            if (file := getattr(module, "__file__", None))
+            and Path(file).is_relative_to(self.repo.root)
+        ]
+        for name, stand_in in self._stand_ins.items():
+            for member, ours in vars(stand_in).items():
+                maker = getattr(ours, "__module__", None)
+                for module in hosts:
+                    held = vars(module).get(member, ours)
+                    if held is not ours and maker and getattr(held, "__module__", None) == maker:
+                        raise LateImportError(
+                            f"{name}.{member}",
+                            f"bound in {module.__name__} since an earlier session",
+                            "a host that is imported under this one",
+                            "Activate that session again, or start a fresh process.",
+                        )
 
     def _draw(self, call: HostCall) -> Any:
         """The host's picture without thresholds, from our engine."""

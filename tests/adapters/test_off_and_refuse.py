@@ -121,3 +121,14 @@ def test_a_render_function_that_a_script_already_holds_is_refused():
             assert import_module("gaussian_renderer").render is script.render
         finally:
             del sys.modules["a_training_script"]
+
+
+def test_a_host_that_holds_an_earlier_sessions_rasterizer_is_refused_by_another():
+    """It would be drawn by that one's classes, which nothing of ours is wrapped around."""
+    with imported(HOST):
+        with session():
+            import_module("gaussian_renderer")
+        with pytest.raises(LateImportError, match="bound in gaussian_renderer since an earlier"):
+            session().activate()
+        assert not [name for name in STAND_INS if name in sys.modules]
+        assert sessions.active_session() is None

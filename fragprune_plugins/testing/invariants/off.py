@@ -125,4 +125,10 @@ def nothing_stays(case: Case) -> str:
                 torch.equal(host.render(camera, model)["render"], alone),
                 "deactivated, the host's picture is not its own",
             )
-    return f"{len(names)} stand-ins"
+        host.session.activate()
+        model = host.model(COUNT)
+        open_all(host, model)
+        with torch.no_grad():
+            host.render(camera, model)
+        require(fixed.calls == 2, "activated again, a picture asked for no thresholds")
+    return f"{len(names)} stand-ins, activated twice"
