@@ -240,7 +240,7 @@ def sample_points(block: Block, options: Options, like: Tensor) -> Tensor:
     if options.sample_offsets is None:
         return points
     columns, rows = slice(block.x.start, block.x.stop), slice(block.y.start, block.y.stop)
-    return points + options.sample_offsets[rows, columns].reshape(-1, 2).to(like)
+    return points + options.sample_offsets[rows, columns].reshape(-1, 2).detach().to(like)
 
 
 def pixel_grid(block: Block, like: Tensor) -> Tensor:
