@@ -33,7 +33,7 @@ def activate(
             "off" only applies thresholds that sidecars bring.
         from_iter: iterations of this run to let pass first (0 when it was resumed).
         settings: of the fine-tuning; ``iterations`` is how long it lasts.
-        engine: "auto", "reference" or "cpu".
+        engine: "auto", "reference", "cpu" or "cuda".
 
     Raises:
         UnknownHostError: no adapter fits.

@@ -50,7 +50,7 @@ class RunOptions:
         from_iter: with "finetune": learn and freeze from this iteration of a run that was not
             resumed; with "joint": learn from it.
         alternate: with "joint", learn for so many iterations, hold for as many, and so on.
-        engine: "auto", "reference", "cpu".
+        engine: "auto", "reference", "cpu", "cuda".
         device: "auto" or "cpu" to run a CUDA-only host on the CPU; "cuda" insists on a GPU.
     """
 

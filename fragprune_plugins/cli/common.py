@@ -147,7 +147,7 @@ data_options = _together(
 engine_options = _together(
     click.option(
         "--engine",
-        type=click.Choice(["auto", "reference", "cpu"]),
+        type=click.Choice(["auto", "reference", "cpu", "cuda"]),
         default="auto",
         show_default=True,
         help="What rasterizes; auto takes the fastest that runs here.",

@@ -9,27 +9,38 @@ from typing import Any
 import click
 
 from fragprune_plugins.cli.common import Command, Report
+from fragprune_plugins.errors import EngineError, UsageError
 
 _PACKAGES = ("fragprune-plugins", "torch", "numpy", "pluggy", "wrapt", "plyfile", "scikit-image")
 
 
 @click.command("doctor", cls=Command)
-def command() -> Report:
+@click.option(
+    "--build-cuda",
+    metavar="ARCHITECTURES",
+    help="Compile the GPU's kernels beforehand, for compute capabilities like 80,90; needs no GPU.",
+)
+def command(build_cuda: str | None) -> Report:
     """Report versions, engines, the native build and plugins; paste it into a bug report.
 
-    Exit code 1 when something is wrong that has a remedy.
+    Where there is a GPU, the cuda engine draws a small scene, and what the reference engine makes
+    of it is compared. Exit code 1 when something is wrong that has a remedy.
 
     \b
-    Example:
+    Examples:
       fragprune doctor --json
+      fragprune doctor --build-cuda 80,86,90
     """
+    if build_cuda is not None:
+        return _build(build_cuda)
     import torch
 
-    from fragprune_plugins.native import loader
+    from fragprune_plugins.native import driver, loader
     from fragprune_plugins.plugins import load_plugins
 
     packages = {name: _version(name) for name in _PACKAGES}
     native = loader.describe()
+    gpu = {**driver.describe(), "agrees": _agrees() if driver.missing() is None else None}
     plugins = load_plugins()
     data: dict[str, Any] = {
         "python": platform.python_version(),
@@ -38,7 +49,12 @@ def command() -> Report:
         "cuda": torch.cuda.is_available(),
         "threads": torch.get_num_threads(),
         "native": native,
-        "engines": ["reference", *(["cpu"] if loader.available() else [])],
+        "gpu": gpu,
+        "engines": [
+            "reference",
+            *(["cpu"] if loader.available() else []),
+            *(["cuda"] if gpu["available"] else []),
+        ],
         "adapters": [adapter.name for adapter in plugins.adapters],
         "findings": [finding.as_dict() for finding in plugins.findings],
     }
@@ -47,6 +63,7 @@ def command() -> Report:
         ", ".join(f"{name} {found or 'missing'}" for name, found in packages.items()),
         f"CUDA {'yes' if data['cuda'] else 'no'}; {data['threads']} threads",
         "native engine: " + ", ".join(f"{key} {value}" for key, value in native.items()),
+        "cuda engine: " + ", ".join(f"{key} {value}" for key, value in gpu.items()),
         f"engines: {', '.join(data['engines'])}",
         f"adapters: {', '.join(data['adapters']) or 'none'}",
         *(str(finding) for finding in plugins.findings),
@@ -57,7 +74,73 @@ def command() -> Report:
             "The cpu engine is missing: rasterization on the CPU uses the slow reference engine. "
             "Install a C++17 compiler and install fragprune-plugins again."
         )
+    if gpu["agrees"] is False:
+        wrong = True
+        lines.append(
+            "The cuda engine draws something else than the reference engine here: use --engine "
+            "reference, and report it."
+        )
     return Report(data, "\n".join(lines), exit_code=1 if wrong else 0)
+
+
+def _agrees() -> bool:
+    """Whether the cuda engine draws what the reference engine does, and learns from it the same."""
+    import torch
+
+    from fragprune_plugins.engines import create_engine
+    from fragprune_plugins.testing import scenes
+
+    found = []
+    for name in ("cuda", "reference"):
+        made, leaves = scenes.leaves(scenes.random_scene(0, 200, 70, 50, device="cuda"))
+        thresholds = scenes.random_thresholds(0, 200, device="cuda").requires_grad_()
+        out = create_engine(name, "cuda").rasterize(made, thresholds)
+        out.image.square().mean().backward()  # type: ignore[no-untyped-call]
+        found.append([out.image.detach(), leaves["means"].grad, thresholds.grad])
+    # a fragment at a cut may fall to one or the other: half a per cent of the sum, not of each
+    return all(
+        bool((a - b).abs().sum() <= 5e-3 * b.abs().sum() + 1e-6)
+        for a, b in zip(*found, strict=True)
+        if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor)
+    )
+
+
+def _build(architectures: str) -> Report:
+    """Compile the usual kernels for some architectures and keep them."""
+    from fragprune_plugins.engines.frames import MACROS, VARIANTS
+    from fragprune_plugins.native import kernels
+
+    try:
+        codes = [int(code.strip().removeprefix("sm_")) for code in architectures.split(",")]
+    except ValueError:
+        raise UsageError(
+            "--build-cuda", architectures, "compute capabilities like 80,90", "List numbers."
+        ) from None
+    built: list[dict[str, Any]] = []
+    try:
+        compiler = kernels.compiler()
+        for code in codes:
+            target = kernels.target_of(code, compiler.architectures)
+            for source, macros in VARIANTS:
+                image, had = kernels.image_of(source, {**MACROS, **macros}, target, compiler)
+                for name, needs in kernels.resources(image.log).items():
+                    built.append({"target": target, "kernel": name, "kept": had, **vars(needs)})
+    except kernels.Unavailable as why:
+        raise EngineError(
+            "--build-cuda",
+            str(why),
+            "NVRTC (through cuda-bindings) or nvcc",
+            "Install fragprune-plugins[cuda12] or [cuda13], and torch or nvidia-cuda-nvrtc.",
+        ) from why
+    folder = str(kernels.cache_folder())
+    data = {"compiler": f"{compiler.name} {compiler.version}", "kept": folder, "kernels": built}
+    lines = [f"{data['compiler']}, kept in {folder}"]
+    lines += [
+        f"{k['target']} {k['kernel']}: {k['registers']} registers, {k['shared']} bytes shared, "
+        f"{k['spills']} spilled{', was there' if k['kept'] else ''}"
+        for k in built
+    ]
+    return Report(data, "\n".join(lines))
 
 
 def _version(package: str) -> str | None:

@@ -41,7 +41,7 @@ from fragprune_plugins.schedule import Settings
 @learning_options
 @click.option(
     "--engine",
-    type=click.Choice(["auto", "reference", "cpu"]),
+    type=click.Choice(["auto", "reference", "cpu", "cuda"]),
     default="auto",
     show_default=True,
     help="What rasterizes where thresholds apply or the host's own rasterizer is missing.",

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
-ENGINES = ("reference", "cpu")
+ENGINES = ("reference", "cpu", "cuda")
 
 
 class Engine(Protocol):
@@ -31,19 +31,30 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
         EngineError: an unknown name, or an engine that cannot run here.
     """
     if name == "auto":
-        from fragprune_plugins.native import loader
-
-        on_cpu = str(device).startswith("cpu")
-        name = "cpu" if on_cpu and loader.available() else "reference"
+        name = _fastest(str(device))
     if name == "cpu":
         from fragprune_plugins.engines.cpu import CpuEngine
 
         return CpuEngine()
+    if name == "cuda":
+        from fragprune_plugins.engines.cuda import CudaEngine
+
+        return CudaEngine()
     if name == "reference":
         from fragprune_plugins.engines.reference import ReferenceEngine
 
         return ReferenceEngine()
     raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
+
+
+def _fastest(device: str) -> str:
+    if device.startswith("cuda"):
+        from fragprune_plugins.native import driver
+
+        return "cuda" if driver.missing() is None else "reference"
+    from fragprune_plugins.native import loader
+
+    return "cpu" if device.startswith("cpu") and loader.available() else "reference"
 
 
 def rasterize(
@@ -57,7 +68,7 @@ def rasterize(
     Args:
         inputs: camera and Gaussians.
         thresholds: (N,) falloff in (0, 1), or None.
-        engine: a name ("auto", "reference", "cpu") or an engine object.
+        engine: a name ("auto", "reference", "cpu", "cuda") or an engine object.
 
     Raises:
         InputError: thresholds that do not match the Gaussians.

@@ -1,0 +1,155 @@
+// What kernels are handed: one struct by value, filled in by engines/cuda.py, which keeps the same
+// fields in the same order (FP_*_SIZE, which it defines, catches the rest).
+#pragma once
+
+#include "numbers.cuh"
+
+#include "../cpu/ellipse.h"
+
+#ifndef FP_PACKED  // brushes of 32 bytes instead of 48, for pictures alone
+#define FP_PACKED 0
+#endif
+#ifndef FP_FEATURES  // channels blended beside colour, 0 to 8
+#define FP_FEATURES 0
+#endif
+
+namespace fp {
+
+constexpr int kThreads = 256;  // of every block of every kernel
+constexpr int kWarps = kThreads / 32;
+constexpr int kDigits = 256;     // buckets of one pass of sorting
+constexpr int kSortItems = 16;   // of each thread
+constexpr int kPasses = 4;       // at most, 8 bits each
+constexpr int kBrush = FP_PACKED ? 8 : 12;  // floats of a Brush in memory
+
+// Zero when a frame begins.
+struct Counters {
+  uint64_t visible;    // Gaussians that reach a tile
+  uint64_t entries;    // of all tiles' lists; more than the capacity: the frame is void
+  uint64_t drawn;      // fragments
+  uint64_t evaluated;  // lanes spent on (Gaussian, pixel) pairs
+  uint32_t tickets[2 + 2 * kPasses];  // blocks that wait for others are numbered as they start
+};
+
+struct Rect {  // tiles, half open
+  uint16_t x0, x1, y0, y1;
+};
+
+struct Range {  // of a tile in the list of entries
+  uint32_t first, end;
+};
+
+// One forward pass. N Gaussians, E entries at most, T tiles, H x W pixels.
+struct Frame {
+  fragprune_inputs in;    // pointers into device memory, here as everywhere
+  fragprune_outputs out;  // counts and scores zero when a frame begins
+  const float* spread;    // (1) the largest of |sample_offsets|; or NULL: none
+
+  // sizes
+  uint32_t capacity;  // E
+  int32_t tiles_x, tiles_y;
+  int32_t tile_passes;
+
+  // zero when a frame begins
+  Counters* counters;
+  uint64_t* project_words;    // per block of fp_project
+  uint64_t* emit_words;       // per block of fp_emit
+  uint32_t* depth_histogram;  // (kPasses, kDigits)
+  uint32_t* tile_histogram;   // (kPasses, kDigits)
+  Range* ranges;              // (T)
+
+  // filled in by one kernel, read by others
+  float* brushes;           // (N, kBrush)
+  Rect* rects;              // (N)
+  uint32_t* tiles;          // (N) tiles reached
+  uint32_t* first_slot;     // (N) of those that reach a tile; or NULL
+  uint32_t* depth_keys;     // (N) bits of view depths, of those that reach a tile
+  uint32_t* depth_ids;      // (N) their rows; sorted front to back later on
+  uint32_t* entry_keys;     // (E) tiles
+  uint32_t* entry_values;   // (E) rows, or slots where slots are kept; sorted by tile later on
+  uint32_t* owners;         // (E) rows by slot; or NULL: no slots
+  float* transmittance;     // (H, W) final; or NULL: no backward pass will come
+  int32_t* stop;            // (H, W) fragments at this place of the list or later are not alive
+  uint64_t* weights;        // (N) sums of alpha T in units of 2^-32, zero when a frame begins
+};
+
+// One pass of the stable radix sort, by 8 bits of the keys.
+struct Sort {
+  const uint64_t* count;
+  uint32_t capacity;
+  int32_t shift;
+  const uint32_t* histogram;  // (kDigits)
+  uint32_t* words;            // (blocks, kDigits), zero
+  uint32_t* ticket;           // zero
+  const uint32_t *keys, *values;
+  uint32_t *sorted_keys, *sorted_values;
+};
+
+#ifdef FP_FRAME_SIZE
+static_assert(sizeof(Frame) == FP_FRAME_SIZE, "engines/cuda.py has other fields in Frame");
+static_assert(sizeof(Sort) == FP_SORT_SIZE, "engines/cuda.py has other fields in Sort");
+#endif
+
+__device__ inline Given<float> load_given(const fragprune_inputs& in, size_t i) {
+  Given<float> g;
+  g.mean = read3(in.means + 3 * i);
+  g.factored = in.cov3d == nullptr;
+  if (g.factored) {
+    g.scale = read3(in.scales + 3 * i);
+    for (int k = 0; k < 4; k++) g.rotation[k] = in.rotations[4 * i + k];
+  } else {
+    for (int k = 0; k < 6; k++) g.cov3d[k] = in.cov3d[6 * i + k];
+  }
+  return g;
+}
+
+__device__ inline Camera<float> camera_of(const Frame& f) {
+  return unpack_camera(f.in, f.spread ? *f.spread : 0.f);
+}
+
+// Where brushes are packed: logarithms of alpha, -8 to 8, in 16 bits; half a step is 2^-13.
+__device__ inline uint32_t to_fixed(float v) {
+  return static_cast<uint32_t>(clamp(floor((v + 8.f) * 4096.f + 0.5f), 0.f, 65535.f));
+}
+__device__ inline float from_fixed(uint32_t v) {
+  return static_cast<float>(v & 65535u) * (1.f / 4096.f) - 8.f;
+}
+
+__device__ inline void store_brush(float* brushes, size_t row, const Brush<float>& b) {
+  float4* to = reinterpret_cast<float4*>(brushes + kBrush * row);
+  to[0] = make_float4(b.x, b.y, b.scale, b.skew);
+#if FP_PACKED
+  const auto both_of = [](uint32_t low, uint32_t high) {
+    return __uint_as_float(low | high << 16);
+  };
+  to[1] = make_float4(b.down, both_of(to_fixed(b.log_opacity), to_fixed(b.cut)),
+                      both_of(to_half(b.r), to_half(b.g)), both_of(to_half(b.b), to_half(b.inv_z)));
+#else
+  to[1] = make_float4(b.down, b.log_opacity, b.cut, b.list_cut);
+  to[2] = make_float4(b.r, b.g, b.b, b.inv_z);
+#endif
+}
+
+__device__ inline Brush<float> load_brush(const float* brushes, size_t row) {
+  const float4* from = reinterpret_cast<const float4*>(brushes + kBrush * row);
+  const float4 p = from[0], q = from[1];
+#if FP_PACKED
+  const uint32_t logs = __float_as_uint(q.y), rg = __float_as_uint(q.z), bz = __float_as_uint(q.w);
+  const float cut = from_fixed(logs >> 16);
+  return {p.x, p.y, p.z, p.w, q.x, from_fixed(logs), cut, cut,
+          from_half(static_cast<uint16_t>(rg)), from_half(static_cast<uint16_t>(rg >> 16)),
+          from_half(static_cast<uint16_t>(bz)), from_half(static_cast<uint16_t>(bz >> 16))};
+#else
+  const float4 r = from[2];
+  return {p.x, p.y, p.z, p.w, q.x, q.y, q.z, q.w, r.x, r.y, r.z, r.w};
+#endif
+}
+
+}  // namespace fp
+
+// Kernels are named, not mangled, and take one struct. A multiprocessor shall have room for so many
+// blocks of them at least, as far as registers go.
+#ifndef FP_KERNEL
+#define FP_KERNEL(name, Arguments, blocks) \
+  extern "C" __global__ void __launch_bounds__(fp::kThreads, blocks) name(const Arguments f)
+#endif

@@ -1,0 +1,34 @@
+"""The kernels' own sources, emulated; and what else the tests of a GPU's engine share."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from gpu.emulated import EmulatedDevice
+
+from fragprune_plugins.engines.cuda import CudaEngine
+from fragprune_plugins.native import kernels
+
+
+@pytest.fixture(scope="session")
+def device(tmp_path_factory: pytest.TempPathFactory) -> EmulatedDevice:
+    """One for all tests: each set of macros is built once. Skips where there is no g++."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++ here")
+    return EmulatedDevice(compiler, tmp_path_factory.mktemp("emulated"))
+
+
+@pytest.fixture
+def engine(device: EmulatedDevice) -> CudaEngine:
+    """The engine, on the emulated device."""
+    return CudaEngine(device, deterministic=False)
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder for compiled kernels."""
+    monkeypatch.setenv(kernels.CACHE, str(tmp_path / "kept"))
+    return tmp_path / "kept"

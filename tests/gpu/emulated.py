@@ -1,0 +1,89 @@
+"""A device that runs the kernels' own sources on the CPU, thread by thread, in shuffled order."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+import fragprune_plugins.native
+
+HERE = Path(__file__).parent
+SOURCES = Path(fragprune_plugins.native.__file__).parent / "cuda"
+FLAGS = (
+    "-std=c++17",
+    "-O1",
+    "-w",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fPIC",
+    "-shared",
+    "-fvisibility=hidden",
+)
+
+
+class EmulatedDevice:
+    """Builds a source once per set of macros.
+
+    Args:
+        compiler: a C++17 compiler for ELF systems.
+        folder: where builds go.
+        seed: of the order in which threads and blocks run.
+
+    Attributes:
+        launched: kernels with their macros, in order.
+        opened: what was built, by source and macros.
+    """
+
+    def __init__(self, compiler: str, folder: Path, seed: int = 1) -> None:
+        self.compiler, self._folder, self.seed = compiler, folder, seed
+        self.launched: list[tuple[str, dict[str, int]]] = []
+        self.opened: dict[tuple[str, tuple[tuple[str, int], ...]], ctypes.CDLL] = {}
+
+    kind = "cpu"
+
+    def launch(
+        self,
+        where: torch.device,
+        source: str,
+        macros: dict[str, int],
+        kernel: str,
+        blocks: int,
+        arguments: ctypes.Structure,
+    ) -> None:
+        self.launched.append((kernel, macros))
+        library = self._open(source, macros)
+        status = library.emulated_launch(
+            kernel.encode(), blocks, 256, ctypes.byref(arguments), self.seed
+        )
+        if status:
+            raise RuntimeError(library.emulated_message().decode())
+
+    def _open(self, source: str, macros: dict[str, int]) -> ctypes.CDLL:
+        key = (source, tuple(sorted(macros.items())))
+        if key not in self.opened:
+            path = self._folder / f"{source}{len(self.opened)}.so"
+            defined = [f"-D{name}={value}" for name, value in macros.items()]
+            kernels = ("-x", "c++", "-include", str(HERE / "emulation.h"), self.source(source))
+            self._build(path, "-shared", *defined, self._machine, *kernels)
+            library = ctypes.CDLL(str(path))
+            library.emulated_message.restype = ctypes.c_char_p
+            self.opened[key] = library
+        return self.opened[key]
+
+    def source(self, name: str) -> str:
+        """The file of a source."""
+        return str(SOURCES / f"{name}.cu")
+
+    @cached_property
+    def _machine(self) -> str:
+        """The emulation itself, compiled once."""
+        path = self._folder / "emulation.o"
+        self._build(path, "-c", str(HERE / "emulation.cpp"))
+        return str(path)
+
+    def _build(self, path: Path, *arguments: str) -> None:
+        subprocess.run([self.compiler, *FLAGS, *arguments, "-o", str(path)], check=True)

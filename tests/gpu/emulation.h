@@ -1,0 +1,117 @@
+// The execution model of a GPU on one CPU thread, for tests: the kernels' sources, unchanged, run
+// under g++. A block's threads are fibers, which run in random order from one barrier or warp
+// operation to the next; a few blocks are under way at a time, taken from the grid and continued in
+// random order; shared memory is filled with NaN before each block. What works in one order only,
+// or reads what nobody wrote, shows.
+//
+// Stops with a message when threads wait for each other forever, when the lanes of a warp meet at
+// different operations, or when a thread has left while others wait for it.
+#pragma once
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#define FP_EMULATED
+#define __device__
+#define __host__
+#define __global__
+#define __launch_bounds__(...)
+#define __shared__ static __attribute__((section("emulated_shared")))
+
+struct alignas(16) float4 {
+  float x, y, z, w;
+};
+inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
+
+
+struct Index {
+  unsigned x, y, z;
+};
+extern Index threadIdx, blockIdx;
+
+namespace emulated {
+
+template <class T>
+inline uint64_t as_word(T v) {
+  static_assert(sizeof v <= 8, "");
+  uint64_t word = 0;
+  memcpy(&word, &v, sizeof v);
+  return word;
+}
+template <class T>
+inline T from_word(uint64_t word) {
+  T v;
+  memcpy(&v, &word, sizeof v);
+  return v;
+}
+
+// What each lane of this warp gave to the operation in `line`.
+const uint64_t* exchange(int line, uint32_t mask, uint64_t given);
+bool barrier(int line, bool v);  // whether all threads of the block gave true
+void pause();
+inline int lane() { return static_cast<int>(threadIdx.x) & 31; }
+
+template <class T>
+inline T shuffle(int line, uint32_t mask, T v, int from) {
+  const uint64_t* all = exchange(line, mask, as_word(v));
+  return from_word<T>(from >= 0 && from < 32 ? all[from] : all[lane()]);
+}
+inline uint32_t ballot(int line, uint32_t mask, bool v) {
+  const uint64_t* all = exchange(line, mask, v);
+  uint32_t bits = 0;
+  for (int l = 0; l < 32; l++) bits |= static_cast<uint32_t>(all[l] & 1) << l;
+  return bits;
+}
+inline uint32_t match(int line, uint32_t mask, uint32_t v) {
+  const uint64_t* all = exchange(line, mask, v);
+  uint32_t bits = 0;
+  for (int l = 0; l < 32; l++) bits |= static_cast<uint32_t>(all[l] == v) << l;
+  return bits;
+}
+
+// Makes a kernel known by its name.
+struct Register {
+  Register(const char* name, void (*run)(const void*));
+};
+
+}  // namespace emulated
+
+#define __shfl_sync(mask, v, from) emulated::shuffle(__LINE__, mask, v, from)
+#define __shfl_xor_sync(mask, v, by) emulated::shuffle(__LINE__, mask, v, emulated::lane() ^ (by))
+#define __shfl_up_sync(mask, v, by) emulated::shuffle(__LINE__, mask, v, emulated::lane() - (by))
+#define __shfl_down_sync(mask, v, by) emulated::shuffle(__LINE__, mask, v, emulated::lane() + (by))
+#define __ballot_sync(mask, v) emulated::ballot(__LINE__, mask, v)
+#define __any_sync(mask, v) (emulated::ballot(__LINE__, mask, v) != 0)
+#define __match_any_sync(mask, v) emulated::match(__LINE__, mask, v)
+#define __syncwarp() emulated::exchange(__LINE__, 0xffffffffu, 0)
+#define __syncthreads() emulated::barrier(__LINE__, true)
+#define __syncthreads_and(v) emulated::barrier(__LINE__, v)
+#define FP_PAUSE() emulated::pause()
+#define __popc(v) __builtin_popcount(v)
+#define __ffs(v) __builtin_ffs(static_cast<int>(v))
+#define __clz(v) ((v) ? __builtin_clz(v) : 32)
+
+inline float __uint_as_float(uint32_t v) {
+  return emulated::from_word<float>(emulated::as_word(v));
+}
+inline uint32_t __float_as_uint(float v) { return emulated::from_word<uint32_t>(emulated::as_word(v)); }
+
+template <class T, class U>
+inline T atomicAdd(T* at, U v) {
+  const T before = *at;
+  *at = before + static_cast<T>(v);
+  return before;
+}
+template <class T, class U>
+inline T atomicExch(T* at, U v) {
+  const T before = *at;
+  *at = static_cast<T>(v);
+  return before;
+}
+
+#define FP_KERNEL(name, Arguments, blocks)                                      \
+  static void name(const Arguments f);                                          \
+  static emulated::Register name##_registered(                                  \
+      #name, [](const void* a) { name(*static_cast<const Arguments*>(a)); });   \
+  static void name(const Arguments f)

@@ -1,0 +1,203 @@
+"""The kernels' own sources, emulated on the CPU, against the oracle in float64.
+
+The rules and tolerances of native/test_against_oracle.py apply. Emulated arithmetic is a GPU's to
+the last bit but for exp2 and 1/x, where a GPU takes its special unit (2 and 1 units in the last
+place); threads run in another order each time a seed says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from gpu.emulated import EmulatedDevice
+from native.test_against_oracle import check_gradients, check_images, draw_pair
+from native.test_dialects import check_scores, dialect, flat
+from native.test_invariants import assert_identical, everything
+
+from fragprune_plugins.engines import frames
+from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.engines.cuda import CudaEngine
+from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.testing import scenes
+from fragprune_plugins.types import RasterInputs
+
+KINDS = {
+    "plain": {},
+    "sh 3, antialiasing": {"sh_degree": 3, "compensation": "antialiasing"},
+    "sh 0, cov3d": {"cov3d": True, "sh_degree": 0},
+    "sh 2, one tile and a bit": {"width": 17, "height": 33, "sh_degree": 2},
+    "mip, offsets, absolute gradient": {
+        "compensation": "mip",
+        "dilation": 0.1,
+        "offsets": True,
+        "absolute_gradient": True,
+    },
+    "near, low cap": {"near": 2.5, "alpha_max": 0.6, "cap_gradient": False},
+    "features, colours": {"features": 3, "colors": True, "scale_modifier": 0.7},
+}
+
+
+@pytest.mark.parametrize("thresholded", [False, True], ids=["untruncated", "truncated"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_and_gradients_equal_the_oracle(
+    engine: CudaEngine, kind: str, thresholded: bool
+) -> None:
+    inputs = dialect(1, **KINDS[kind])
+    thresholds = scenes.random_thresholds(1, 60) if thresholded else None
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    assert torch.equal(truth.radii, ours.radii)
+    check_images(truth, ours, same)
+    check_gradients(engine, inputs, thresholds, same)
+
+
+@pytest.mark.parametrize("kind", ["plain", "features, colours"])
+def test_footprints_equal_the_oracle(engine: CudaEngine, kind: str) -> None:
+    inputs = replace(flat(dialect(5, **KINDS[kind])), absolute_gradient=True)
+    thresholds = scenes.random_thresholds(5, 60)
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    check_images(truth, ours, same)
+    check_gradients(engine, inputs, thresholds, same)
+
+
+def test_tall_stacks_stop_where_the_oracle_does(engine: CudaEngine) -> None:
+    inputs = scenes.stack([0.3, 0.9, 0.999, 0.5] * 90)  # more than is staged at once
+    thresholds = torch.linspace(0.01, 0.6, 360)
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    check_images(truth, ours, same)
+    check_gradients(engine, inputs, thresholds, same)
+
+
+@pytest.mark.parametrize("scene", [scenes.empty(), scenes.behind_camera()])
+def test_nothing_to_draw_leaves_the_background(engine: CudaEngine, scene: RasterInputs) -> None:
+    _, ours, same = draw_pair(engine, scene, None)
+    assert same.all()
+    assert torch.equal(ours.image, scene.view.background[:, None, None].expand_as(ours.image))
+    assert not ours.radii.any()
+    check_gradients(engine, scene, None, same)
+
+
+def test_scores_equal_the_oracles(engine: CudaEngine) -> None:
+    inputs = replace(scenes.random_scene(2, 200, 50, 37), scores=True)
+    truth, ours, same = draw_pair(engine, inputs, scenes.random_thresholds(2, 200))
+    check_images(truth, ours, same)
+    check_scores(truth, ours, same)
+
+
+def test_what_fine_tuning_freezes_costs_no_kernel_and_changes_no_gradient(
+    engine: CudaEngine, device: EmulatedDevice
+) -> None:
+    inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
+    made, leaves = scenes.leaves(inputs)
+    tau = thresholds.clone().requires_grad_()
+    engine.rasterize(made, tau).image.square().sum().backward()
+    opacities = inputs.splats.opacities.clone().requires_grad_()
+    frozen = replace(inputs, splats=replace(inputs.splats, opacities=opacities))
+    few = thresholds.clone().requires_grad_()
+    engine.rasterize(frozen, few).image.square().sum().backward()
+    assert device.launched[-1][1]["FP_GEOMETRY"] == device.launched[-1][1]["FP_COLOUR"] == 0
+    for whole, part in ((tau.grad, few.grad), (leaves["opacities"].grad, opacities.grad)):
+        assert (whole - part).abs().max() < 1e-5 * whole.abs().max()
+
+
+@pytest.mark.parametrize("options", [{}, {"features": 3, "colors": True}])
+def test_deterministic_runs_agree_to_the_bit_whatever_the_order(
+    device: EmulatedDevice, options: dict
+) -> None:
+    engine = CudaEngine(device, deterministic=True)
+    inputs, thresholds = scenes.random_scene(3, 150, 50, 37, **options), torch.full((150,), 0.05)
+    found = []
+    for device.seed in (1, 2, 3):
+        found.append(everything(engine, inputs, thresholds))
+    for other in found[1:]:
+        assert_identical(found[0], other)
+    _, _, same = draw_pair(engine, inputs, thresholds)
+    check_gradients(engine, inputs, thresholds, same)
+
+
+def test_images_counts_and_scores_do_not_depend_on_the_order(
+    engine: CudaEngine, device: EmulatedDevice
+) -> None:
+    inputs = replace(scenes.random_scene(4, 300, 70, 50), scores=True).with_counts()
+    found = []
+    for device.seed in (1, 2):
+        found.append(engine.rasterize(inputs, None))
+    for name in ("image", "winners", "weights_per_gaussian", "fragments_per_gaussian"):
+        assert torch.equal(getattr(found[0], name), getattr(found[1], name)), name
+    assert found[0].evaluated_per_pixel == found[1].evaluated_per_pixel
+
+
+@pytest.mark.parametrize(
+    ("n", "width", "height", "size"),
+    [(9000, 70, 50, 0.15), (150, 330, 290, 6.0)],
+    ids=["several blocks sort", "more tiles than one pass of sorting tells apart; giants"],
+)
+def test_larger_scenes_equal_the_cpu_engine(
+    engine: CudaEngine, n: int, width: int, height: int, size: float
+) -> None:
+    inputs = scenes.random_scene(3, n, width, height, scale_modifier=size).with_counts()
+    thresholds = scenes.random_thresholds(3, n)
+    with torch.no_grad():
+        expected = CpuEngine().rasterize(inputs, thresholds)
+        found = engine.rasterize(inputs, thresholds)
+    assert torch.equal(expected.radii, found.radii)
+    same = expected.fragments == found.fragments
+    assert (~same).sum() <= 1 + same.numel() // 500
+    assert (expected.image - found.image)[:, same].abs().max() < 4e-5
+
+
+def test_lists_that_do_not_fit_are_drawn_again_with_more_room(device: EmulatedDevice) -> None:
+    inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
+    whole, small = CudaEngine(device), CudaEngine(device)
+    small._capacity = 7
+    expected, found = (everything(e, inputs, thresholds) for e in (whole, small))
+    assert small._capacity > 60
+    for name in ("image", "alpha", "radii"):
+        assert torch.equal(expected[name], found[name]), name
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_packed_pictures_are_off_by_no_more_than_half_precision(
+    engine: CudaEngine, device: EmulatedDevice, seed: int
+) -> None:
+    inputs = scenes.random_scene(seed, 200, 50, 37, colors=True).with_counts()
+    thresholds = scenes.random_thresholds(seed, 200)
+    whole = engine.rasterize(inputs, thresholds)
+    packed = CudaEngine(device, packed=True).rasterize(inputs, thresholds)
+    same = whole.fragments == packed.fragments
+    assert (~same).sum() <= same.numel() // 100  # cuts move by 2^-13 of a power of two
+    away = (whole.image - packed.image)[:, same].abs().max()
+    assert 0 < away < 2**-11 * inputs.splats.colors.max()
+    everything(CudaEngine(device, packed=True), inputs, thresholds)  # gradients take the whole
+
+
+def test_more_entries_than_can_be_counted_are_refused(
+    engine: CudaEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frames, "ENTRIES_MAX", 10)
+    with pytest.raises(EngineError, match="entries"):
+        engine.rasterize(scenes.random_scene(0), None)
+
+
+def test_offsets_beyond_all_bounds_are_refused(engine: CudaEngine) -> None:
+    offsets = torch.zeros(28, 40, 2)
+    for offsets[3, 4, 1] in (torch.nan, torch.inf, 2e6):
+        with pytest.raises(EngineError, match="sample_offsets"):
+            engine.rasterize(replace(scenes.random_scene(0), sample_offsets=offsets), None)
+
+
+def test_tensors_elsewhere_are_refused(engine: CudaEngine) -> None:
+    inputs = scenes.random_scene(0)
+    meta = replace(inputs.splats, means=inputs.splats.means.to("meta"))
+    with pytest.raises(InputError, match="meta"):
+        engine.rasterize(replace(inputs, splats=meta), None)
+
+
+def test_changes_in_place_are_noticed(engine: CudaEngine) -> None:
+    made, leaves = scenes.leaves(scenes.random_scene(0))
+    loss = engine.rasterize(made, None).image.sum()
+    with torch.no_grad():
+        leaves["opacities"].mul_(0.5)
+    with pytest.raises(RuntimeError, match="inplace"):
+        loss.backward()

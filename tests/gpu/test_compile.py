@@ -1,0 +1,106 @@
+"""Every kernel compiles for every architecture, and none of its numbers leaves the registers."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from fragprune_plugins.engines.frames import MACROS, VARIANTS, unblend_macros
+from fragprune_plugins.native import kernels
+
+ARCHITECTURES = (
+    75,
+    90,
+    120,
+    *(pytest.param(n, marks=pytest.mark.slow) for n in (80, 86, 87, 89, 100)),
+)
+
+REGISTERS = {"fp_project": 85}
+"""At most so many: room for three blocks of 256 threads in the 65,536 of a multiprocessor."""
+
+OTHERS = 128
+"""For two."""
+
+EVERYTHING = {
+    "FP_FEATURES": 8,
+    **dict.fromkeys(("FP_COUNTS", "FP_SCORES", "FP_GEOMETRY", "FP_COLOUR"), 1),
+    **dict.fromkeys(("FP_THRESHOLD", "FP_DEPTH", "FP_ABSOLUTE"), 1),
+}
+
+
+TUNED = unblend_macros(frozenset(("opacities", "thresholds")), sh_turns=True)
+"""Fine-tuning."""
+
+
+@pytest.fixture(scope="module")
+def nvrtc() -> kernels.Nvrtc:
+    """The development extra brings it on Linux: there, its absence is a failure."""
+    try:
+        return kernels.Nvrtc()
+    except kernels.Unavailable as why:
+        if sys.platform.startswith("linux"):
+            raise
+        pytest.skip(str(why))
+
+
+def check(image: kernels.Image) -> None:
+    found = kernels.resources(image.log)
+    assert found
+    for name, needs in found.items():
+        assert (needs.stack, needs.spills) == (0, 0), (name, needs)
+        assert needs.registers <= REGISTERS.get(name, OTHERS), (name, needs)
+        assert needs.shared <= 48 << 10, (name, needs)
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_all_kernels_compile_without_stack_or_spills(
+    nvrtc: kernels.Nvrtc, architecture: int
+) -> None:
+    assert architecture in nvrtc.architectures
+    with ThreadPoolExecutor(2) as pool:
+        jobs = [
+            pool.submit(nvrtc.compile, source, {**MACROS, **macros}, f"sm_{architecture}")
+            for source, macros in (
+                ("scene", {}),
+                ("unblend", {}),
+                ("unblend", TUNED),
+                ("blend", {}),
+            )
+        ]
+    for job in jobs:
+        assert job.result().code.startswith(b"\x7fELF")
+        check(job.result())
+
+
+@pytest.mark.parametrize("source", ["blend", "unblend"])
+def test_all_that_can_be_asked_for_at_once_compiles(nvrtc: kernels.Nvrtc, source: str) -> None:
+    check(nvrtc.compile(source, {**MACROS, **EVERYTHING}, "sm_75"))
+
+
+def test_the_sources_check_the_structs_that_they_are_handed(nvrtc: kernels.Nvrtc) -> None:
+    for name in MACROS:
+        with pytest.raises(kernels.Unavailable, match="has other fields"):
+            nvrtc.compile("unblend", {**MACROS, name: 8}, "sm_90")
+
+
+def test_a_gpu_that_the_toolkit_does_not_know_gets_ptx(nvrtc: kernels.Nvrtc) -> None:
+    assert kernels.target_of(90, (75, 90)) == "sm_90"
+    assert kernels.target_of(99, (75, 90, 100)) == "compute_90"
+    with pytest.raises(kernels.Unavailable, match="older"):
+        kernels.target_of(70, (75, 90))
+    assert b".target sm_75" in nvrtc.compile("blend", MACROS, "compute_75").code
+
+
+def test_nvcc_compiles_the_same_sources() -> None:
+    if shutil.which("nvcc") is None:
+        pytest.skip("no nvcc here")
+    nvcc = kernels.Nvcc()
+    assert nvcc.version.count(".") == 1
+    check(nvcc.compile("unblend", MACROS, f"sm_{nvcc.architectures[0]}"))
+
+
+def test_what_is_built_beforehand_is_what_training_asks_for() -> None:
+    assert {source for source, _ in VARIANTS} == {"scene", "blend", "unblend"}

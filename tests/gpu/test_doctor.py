@@ -1,0 +1,89 @@
+"""What ``fragprune doctor`` says about GPUs, and what it builds for them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner
+from gpu.emulated import EmulatedDevice
+
+from fragprune_plugins import engines
+from fragprune_plugins.cli import cli, doctor
+from fragprune_plugins.engines.cuda import CudaEngine
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.native import kernels
+from fragprune_plugins.testing import scenes
+
+
+class Compiler:
+    """Makes up images."""
+
+    name, version, architectures = "made-up", "1.0", (75, 90)
+
+    def compile(self, source: str, macros: dict[str, int], target: str) -> kernels.Image:
+        if source == "unblend" and target == "sm_75":
+            raise kernels.Unavailable("it does not like it")
+        log = (
+            "Compiling entry function 'fp_a' for 'sm_90'\n 0 bytes stack frame, "
+            "4 bytes spill stores, 8 bytes spill loads\n Used 47 registers, 96 bytes smem"
+        )
+        return kernels.Image(b"code", log)
+
+
+def invoke(*arguments: str) -> tuple[int, dict]:
+    done = CliRunner().invoke(cli, ["doctor", "--json", *arguments])
+    return done.exit_code, json.loads(done.stdout)
+
+
+def test_kernels_are_built_beforehand_and_kept(kept: Path, monkeypatch) -> None:
+    monkeypatch.setattr(kernels, "compiler", Compiler)
+    status, first = invoke("--build-cuda", "90, sm_100")
+    assert status == 0
+    assert first["compiler"] == "made-up 1.0"
+    assert {(k["target"], k["kept"]) for k in first["kernels"]} == {
+        ("sm_90", False),
+        ("compute_90", False),
+    }
+    assert (first["kernels"][0]["registers"], first["kernels"][0]["spills"]) == (47, 12)
+    assert all(k["kept"] for k in invoke("--build-cuda", "90")[1]["kernels"])
+
+
+def test_what_cannot_be_built_is_an_error(kept: Path, monkeypatch) -> None:
+    monkeypatch.setattr(kernels, "compiler", Compiler)
+    status, said = invoke("--build-cuda", "75")
+    assert (status, said["error"]["code"]) == (1, "engine")
+    assert "does not like it" in said["error"]["found"]
+    assert invoke("--build-cuda", "ampere")[0] == 2
+
+
+def test_it_says_why_there_is_no_engine_for_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setenv(kernels.ENVIRONMENT, "off")
+    gpu = invoke()[1]["gpu"]
+    assert (gpu["available"], gpu["agrees"]) == (False, None)
+    assert "switched off" in gpu["reason"]
+    with pytest.raises(EngineError, match="switched off"):
+        engines.create_engine("cuda", "cuda")
+    assert engines.create_engine("auto", "cuda").name == "reference"
+
+
+def test_it_compares_what_the_gpu_draws(
+    device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random_scene, random_thresholds = scenes.random_scene, scenes.random_thresholds
+    monkeypatch.setattr(scenes, "random_scene", lambda *a, device: random_scene(*a))
+    monkeypatch.setattr(scenes, "random_thresholds", lambda *a, device: random_thresholds(*a))
+    made = {"cuda": CudaEngine(device), "reference": ReferenceEngine()}
+    monkeypatch.setattr(engines, "create_engine", lambda name, device: made[name])
+    assert doctor._agrees()
+
+    class Wrong(CudaEngine):
+        def rasterize(self, inputs, thresholds):
+            return super().rasterize(inputs, thresholds * 2)
+
+    made["cuda"] = Wrong(device)
+    assert not doctor._agrees()

@@ -1,0 +1,88 @@
+"""Compiled kernels are kept: by source, macros, architecture and toolkit; whole or not at all."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from fragprune_plugins.native import kernels
+
+
+class Slow:
+    """Counts compilations, and takes its time."""
+
+    name, architectures = "slow", (75, 90)
+
+    def __init__(self, version: str = "1.0") -> None:
+        self.version, self.count = version, 0
+
+    def compile(self, source: str, macros: dict[str, int], target: str) -> kernels.Image:
+        self.count += 1
+        time.sleep(0.1)
+        return kernels.Image(f"{source}{target}\n\0".encode(), "a log\nof two lines")
+
+
+def test_the_second_time_costs_nothing(kept: Path) -> None:
+    slow = Slow()
+    first, had = kernels.image_of("blend", {"A": 1}, "sm_90", slow)
+    assert not had
+    assert kernels.image_of("blend", {"A": 1}, "sm_90", slow) == (first, True)
+    assert slow.count == 1
+
+
+def test_whatever_changes_the_code_is_compiled_anew(kept: Path, monkeypatch) -> None:
+    slow = Slow()
+    for source, macros, target in (
+        ("blend", {}, "sm_90"),
+        ("blend", {"A": 1}, "sm_90"),
+        ("blend", {}, "sm_75"),
+        ("scene", {}, "sm_90"),
+    ):
+        assert not kernels.image_of(source, macros, target, slow)[1]
+    assert not kernels.image_of("blend", {}, "sm_90", Slow("1.1"))[1]
+    monkeypatch.setattr(kernels, "_digest_of_sources", lambda: b"edited")
+    assert not kernels.image_of("blend", {}, "sm_90", slow)[1]
+
+
+def test_damaged_files_are_compiled_anew(kept: Path) -> None:
+    slow = Slow()
+    whole, _ = kernels.image_of("blend", {}, "sm_90", slow)
+    (path,) = kept.glob("*.bin")
+    for damage in (b"", path.read_bytes()[:-1], path.read_bytes() + b"\0", b"\xff" * 100):
+        path.write_bytes(damage)
+        assert kernels.image_of("blend", {}, "sm_90", slow) == (whole, False)
+    assert kernels.image_of("blend", {}, "sm_90", slow) == (whole, True)
+
+
+def test_those_who_want_the_same_wait_for_the_first(kept: Path) -> None:
+    slow, found = Slow(), []
+    crowd = [
+        threading.Thread(target=lambda: found.append(kernels.image_of("a", {}, "sm_90", slow)))
+        for _ in range(5)
+    ]
+    for thread in crowd:
+        thread.start()
+    for thread in crowd:
+        thread.join()
+    assert slow.count == 1
+    assert sorted(had for _, had in found) == [False, True, True, True, True]
+
+
+def test_without_a_folder_nothing_is_kept(tmp_path: Path, monkeypatch) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    monkeypatch.setenv(kernels.CACHE, str(file / "folder"))
+    slow = Slow()
+    for _ in range(2):
+        assert not kernels.image_of("blend", {}, "sm_90", slow)[1]
+    assert slow.count == 2
+
+
+def test_the_environment_decides_on_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    for wanted, message in (("off", "switched off"), ("gcc", "none of off, nvrtc, nvcc")):
+        monkeypatch.setenv(kernels.ENVIRONMENT, wanted)
+        with pytest.raises(kernels.Unavailable, match=message):
+            kernels.compiler()
