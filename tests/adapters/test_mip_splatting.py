@@ -15,7 +15,7 @@ from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins import sidecar
-from fragprune_plugins.cli.run import _measure
+from fragprune_plugins.cli.run import _measure, _photographs
 from fragprune_plugins.detect import HostRepo, choose
 from fragprune_plugins.engines import rasterize
 from fragprune_plugins.errors import ModelFileError, UnknownHostError
@@ -239,7 +239,7 @@ def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained,
     theirs = np.asarray(Image.open(folder / "00000.png"))
     assert np.abs(pixels.astype(int) - theirs).max() <= 1  # a camera's float32, rounded
     assert (pixels != theirs).mean() < 0.05
-    before, after = _measure(words, summary)
+    before, after = _measure(_photographs(words, summary))
     assert after["fragments_per_pixel"] < before["fragments_per_pixel"]
 
 

@@ -15,7 +15,7 @@ from miniature import HOST, TINY, expect_ancestors, identity, joint, label, runn
 from rain_gs_host import RainHost
 
 from fragprune_plugins import sidecar
-from fragprune_plugins.cli.run import _measure
+from fragprune_plugins.cli.run import _measure, _photographs
 from fragprune_plugins.detect import HostRepo, choose
 from fragprune_plugins.engines import rasterize
 from fragprune_plugins.errors import AlignmentError, UnknownHostError
@@ -191,7 +191,7 @@ def test_every_mode_is_fine_tuned_and_moves_opacities_and_thresholds_alone(
     assert len(store) == info.rows == summary.gaussians == len(after)
     assert summary.fragments_after < summary.fragments_before
     assert summary.drawing == {}
-    assert _measure(words, summary) is not None  # though no --eval is in the command
+    assert _measure(_photographs(words, summary)) is not None  # though no --eval is in the command
     assert {PACKAGE, "wandb"} & set(sys.modules) == set()
 
 
