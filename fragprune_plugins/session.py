@@ -592,9 +592,9 @@ class Session:
         if self._unpacked is not None and model not in self._models:
             self._adopt(model, *self._unpacked)
         state, view = self._models.get(model), self.adapter.view(camera)
-        if self.adapter.steps_by_rendering and state is not None and not state.begun:
-            if self.learn and torch.is_grad_enabled():
-                self._begin_step(model, state)
+        begins = self.adapter.steps_by_rendering and self.learn and torch.is_grad_enabled()
+        if begins and state is not None and not state.begun:
+            self._begin_step(model, state)
         again = partial(self._render, wrapped, model, view, args, kwargs)
         measured = self.settings.target_speedup is not None  # keeps the model alive: only if needed
         if measured and state is not None and state.plan is not None and torch.is_grad_enabled():
@@ -831,7 +831,7 @@ class Session:
         return self.adapter.file_at(seam.attribute.split(".")[-1], Path(path))
 
     def save(self, model: Any, path: Path) -> None:
-        """Write a model's thresholds beside the file ``path`` that holds the model; none if neutral.
+        """Write a model's thresholds beside the file ``path`` that holds it; none if neutral.
 
         Raises:
             SessionError: the model is not one of this session's.

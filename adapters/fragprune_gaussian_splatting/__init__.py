@@ -1,4 +1,4 @@
-"""The pip package ``gaussian-splatting`` and ``gaussian-splatting-mcmc``, which extends it.
+"""yindaheng98/gaussian-splatting: the pip package, and ``gaussian-splatting-mcmc`` that extends it.
 
 No checkout: an installed package, run as ``python -m gaussian_splatting.train``. Its methods on
 rows belong to trainers and densifiers, which wrap one another. A densifier hands its trainer one
