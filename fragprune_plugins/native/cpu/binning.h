@@ -1,179 +1,213 @@
-// From splats to lists of splats per tile, front to back: one depth sort, then the spans of tiles
-// in that order to the rows of tiles, then each row to its tiles.
+// From splats to lists of splats per cell, front to back; and from a cell's list to the blocks of its
+// tiles' pixels.
 #pragma once
+
+#include <stdexcept>
 
 #include "projection.h"
 
 namespace fp {
 
-// Tile t holds entries [first[t], first[t + 1]) of `splat`, front to back. Each entry also has a
-// slot: those of a splat are next to each other, so that what the tiles find out about it can be
-// gathered in a fixed order, from memory in order, without atomics.
-struct TileLists {
-  Buffer<uint32_t> first;  // per tile, one more at the end
-  Buffer<uint32_t> splat;  // per entry
-  Buffer<uint32_t> slot;   // per entry; empty unless asked for
-  size_t tiles() const { return first.size() - 1; }
-};
-
-// How a team divides n things among itself: contiguous parts, in order.
-struct Parts {
-  Parts(const Team& team, size_t n, size_t least)
-      : count(n < least ? 1 : static_cast<size_t>(std::min(team.size(), 16))), size(n),
-        grain(n / count + 1) {}
-  size_t begin(size_t part) const { return std::min(size, part * grain); }
-  size_t end(size_t part) const { return std::min(size, (part + 1) * grain); }
-  size_t count, size, grain;
-};
-
-// Stable radix sort of the splats that reach a tile, by the bits of positive floats.
-inline Buffer<uint32_t> order_by_depth(Team& team, const Memory& memory, const Scene& scene) {
-  struct Item {
-    uint32_t key, index;
-  };
-  const size_t n = scene.total, pieces = scene.pieces();
-  Buffer<Item> a(memory, n), b(memory, n);
-  std::vector<size_t> place(pieces);
-  for (size_t k = 1; k < pieces; k++) place[k] = place[k - 1] + scene.count[k - 1];
-  std::vector<uint32_t> least(pieces, UINT32_MAX), most(pieces, 0);
-  team.each(pieces, 16, [&](size_t begin, size_t end) {
-    for (size_t k = begin; k < end; k++)
-      for (uint32_t j = 0; j < scene.count[k]; j++) {
-        const uint32_t key = bits_as<uint32_t>(scene.depth[k * kPiece + j]);
-        a[place[k] + j] = {key, static_cast<uint32_t>(k * kPiece + j)};
-        least[k] = std::min(least[k], key), most[k] = std::max(most[k], key);
-      }
-  });
-  Buffer<uint32_t> order(memory, n);
-  if (n == 0) return order;
-  const uint32_t from = *std::min_element(least.begin(), least.end());
-  const uint32_t range = *std::max_element(most.begin(), most.end()) - from;
-  const int bits = range ? 32 - __builtin_clz(range) : 1;
-  const int passes = (bits + 10) / 11, digit = (bits + passes - 1) / passes;
-  const uint32_t buckets = uint32_t{1} << digit;
-  const Parts parts(team, n, 1u << 14);
-  std::vector<uint32_t> count(parts.count * buckets);
-  for (int pass = 0; pass < passes; pass++) {
-    const auto bucket = [&](uint32_t key) { return (key - from) >> pass * digit & (buckets - 1); };
-    team.each(parts.count, 1, [&](size_t part, size_t) {
-      uint32_t* mine = &count[part * buckets];
-      std::fill_n(mine, buckets, 0);
-      for (size_t i = parts.begin(part); i < parts.end(part); i++) mine[bucket(a[i].key)]++;
-    });
-    uint32_t total = 0;
-    for (uint32_t k = 0; k < buckets; k++)
-      for (size_t part = 0; part < parts.count; part++)
-        total += std::exchange(count[part * buckets + k], total);
-    team.each(parts.count, 1, [&](size_t part, size_t) {
-      uint32_t* mine = &count[part * buckets];
-      for (size_t i = parts.begin(part); i < parts.end(part); i++) {
-        const uint32_t to = mine[bucket(a[i].key)]++;
-        if (pass == passes - 1)
-          order[to] = a[i].index;
-        else
-          b[to] = a[i];
-      }
-    });
-    a.swap(b);
-  }
-  return order;
-}
-
-// One splat's span in one row of tiles.
-struct RowSpan {
+// A splat on the list of a cell: it reaches none but the tiles x0..x1 of it, both included.
+struct CellEntry {
+  uint32_t depth;  // the bits of a positive float, which sort as it does
   uint32_t splat;
-  Span span;
-  uint32_t slot;  // of its first tile
+  uint8_t x0, x1;
 };
 
-// All rows' spans, front to back: row r holds [first[r], first[r + 1]).
-struct RowSpans {
-  Buffer<RowSpan> spans;
-  std::vector<uint32_t> first;  // per row, one more at the end
-  std::vector<uint32_t> tiles;  // per row, one more at the end: entries of the rows above
+// Cell c holds entries [first[c], first[c + 1]), in the order of the inputs.
+struct CellLists {
+  std::vector<uint32_t> first;  // per cell, row by row; one more at the end
+  Buffer<CellEntry> entries;
 };
 
 // Each thread walks all splats for a band of rows of its own: cheaper than counting beforehand what
 // each part of the splats puts into each row, up to some number of threads.
-inline RowSpans spans_by_row(Team& team, const Memory& memory, const Scene& scene,
-                             const Buffer<uint32_t>& order, bool with_slots) {
-  constexpr size_t ahead = 16;
-  const size_t rows = scene.rows.size();
-  RowSpans by_row;
-  by_row.first.resize(rows + 1), by_row.tiles.resize(rows + 1);
-  uint32_t spans = 0, tiles = 0;
-  for (size_t r = 0; r < rows; r++) {
-    by_row.first[r] = spans, by_row.tiles[r] = tiles;
-    spans += scene.rows[r].spans, tiles += scene.rows[r].tiles;
+inline CellLists list_cells(Team& team, const Memory& memory, const Scene& scene) {
+  const size_t across = scene.across, rows = scene.cells.size() / across;
+  CellLists lists;
+  lists.first.reserve(scene.cells.size() + 1);
+  uint64_t total = 0;
+  for (uint32_t count : scene.cells) {
+    lists.first.push_back(static_cast<uint32_t>(total));
+    total += count;
   }
-  by_row.first[rows] = spans, by_row.tiles[rows] = tiles;
-  by_row.spans = Buffer<RowSpan>(memory, spans);
-  const size_t bands = order.size() < 1u << 12 ? 1 : static_cast<size_t>(std::min(team.size(), 8));
-  const auto edge = [&](size_t band) {  // bands hold about as many spans each
-    const auto least = static_cast<uint32_t>(uint64_t{spans} * band / bands);
-    const auto found = std::lower_bound(by_row.first.begin(), by_row.first.end(), least);
-    return band == bands ? rows : static_cast<size_t>(found - by_row.first.begin());
-  };
-  const auto spans_of = [&](uint32_t k) {
-    return scene.spans[k / kPiece].data() + scene.reach[k].first;
+  if (total > UINT32_MAX) throw std::length_error("tile lists");
+  lists.first.push_back(static_cast<uint32_t>(total));
+  lists.entries = Buffer<CellEntry>(memory, total);
+  const size_t bands = total < 1u << 12 ? 1 : static_cast<size_t>(std::min(team.size(), 8));
+  const auto edge = [&](size_t band) {  // bands hold about as many entries each
+    size_t row = 0;
+    while (row < rows && (band == bands || lists.first[row * across] < total * band / bands)) row++;
+    return row;
   };
   team.each(bands, 1, [&](size_t band, size_t) {
     const size_t top = edge(band), bottom = edge(band + 1);
-    std::vector<RowSpan*> cursor(rows);
-    for (size_t r = top; r < bottom; r++) cursor[r] = by_row.spans.data() + by_row.first[r];
-    for (size_t i = 0; i < order.size(); i++) {
-      if (i + 2 * ahead < order.size()) __builtin_prefetch(&scene.reach[order[i + 2 * ahead]]);
-      if (i + ahead < order.size()) __builtin_prefetch(spans_of(order[i + ahead]));
-      const uint32_t k = order[i];
-      const Reach reach = scene.reach[k];
-      const size_t first = std::max<size_t>(reach.row, top);
-      const size_t end = std::min<size_t>(size_t{reach.row} + reach.rows, bottom);
-      if (first >= end) continue;
-      const Span* of_row = spans_of(k);
-      uint32_t slot = with_slots ? scene.slot_begin(k) : 0;
-      if (with_slots)
-        for (size_t r = reach.row; r < first; r++) slot += of_row[r - reach.row].tiles();
-      for (size_t r = first; r < end; r++) {
-        const Span span = of_row[r - reach.row];
-        *cursor[r]++ = {k, span, slot};
-        slot += span.tiles();
+    std::vector<uint32_t> cursor(lists.first.begin(), lists.first.end());
+    for (size_t piece = 0; piece < scene.pieces(); piece++)
+      for (size_t k = piece * kPiece; k < piece * kPiece + scene.count[piece]; k++) {
+        const Reach reach = scene.reach[k];
+        const size_t end = std::min<size_t>(reach.y1 + size_t{1}, bottom);
+        size_t y = std::max<size_t>(reach.y0, top);
+        if (y >= end) continue;
+        const auto depth = bits_as<uint32_t>(scene.depth[k]);
+        for (; y < end; y++)
+          for (int x = reach.x0 / kCell; x <= reach.x1 / kCell; x++)
+            lists.entries[cursor[y * across + static_cast<size_t>(x)]++] = {
+                depth, static_cast<uint32_t>(k),
+                static_cast<uint8_t>(std::max(reach.x0 - x * kCell, 0)),
+                static_cast<uint8_t>(std::min(reach.x1 - x * kCell, kCell - 1))};
       }
-    }
   });
-  return by_row;
+  return lists;
 }
 
-inline TileLists distribute(Team& team, const Memory& memory, const Memory& scratch, size_t across,
-                            const Scene& scene, bool with_slots) {
-  const size_t rows = scene.rows.size();
-  const Buffer<uint32_t> order = order_by_depth(team, scratch, scene);
-  const RowSpans by_row = spans_by_row(team, scratch, scene, order, with_slots);
-  const size_t entries = by_row.tiles[rows];
-  TileLists lists{Buffer<uint32_t>(memory, across * rows + 1), Buffer<uint32_t>(memory, entries),
-                  with_slots ? Buffer<uint32_t>(memory, entries) : Buffer<uint32_t>()};
-  team.each(rows, 1, [&](size_t row, size_t) {
-    const RowSpan *begin = by_row.spans.data() + by_row.first[row],
-                  *end = by_row.spans.data() + by_row.first[row + 1];
-    std::vector<uint32_t> cursor(across + 1, 0);
-    for (const RowSpan* s = begin; s < end; s++)  // an empty span, 1 to 0, cancels itself
-      cursor[s->span.x0]++, cursor[s->span.x1 + 1]--;
-    uint32_t position = by_row.tiles[row], open = 0;
-    for (size_t x = 0; x < across; x++) {
-      open += cursor[x];
-      lists.first[row * across + x] = cursor[x] = position;
-      position += open;
-    }
-    for (const RowSpan* s = begin; s < end; s++) {
-      uint32_t slot = s->slot;
-      for (uint32_t x = s->span.x0; x <= s->span.x1; x++) {
-        const uint32_t at = cursor[x]++;
-        lists.splat[at] = s->splat;
-        if (with_slots) lists.slot[at] = slot++;
+// The entries of one cell, front to back; those of one depth in the order of the inputs. Sorts no
+// more of them than are asked for: mostly, the foremost hide all others.
+class FrontToBack {
+ public:
+  FrontToBack(const Memory& memory, const CellEntry* begin, const CellEntry* end)
+      : memory_(memory), begin_(begin), end_(end), counts_(1, static_cast<uint32_t>(end - begin)) {
+    if (counts_[0] <= kRun) return;
+    const Range all(begin, end);
+    from_ = all.least;
+    shift_ = std::max(all.width() - kBucketBits, 0);
+    counts_.assign(static_cast<size_t>((all.most - all.least) >> shift_) + 1, 0);
+    for (const CellEntry* e = begin; e < end; e++) counts_[(e->depth - from_) >> shift_]++;
+  }
+
+  // The next ones, more each time; false: there are none.
+  bool next(const CellEntry*& begin, const CellEntry*& end) {
+    const size_t first = bucket_;
+    size_t n = 0;
+    while (bucket_ < counts_.size() && (n == 0 || n + counts_[bucket_] <= run_))
+      n += counts_[bucket_++];
+    run_ *= 2;
+    if (n == 0) return false;
+    sorted_ = Buffer<CellEntry>(memory_, n + 1);  // one more, to write what is not meant
+    if (counts_.size() == 1) {
+      std::copy(begin_, end_, sorted_.data());
+    } else {
+      size_t at = 0;
+      for (const CellEntry* e = begin_; e < end_; e++) {
+        sorted_[at] = *e;
+        const size_t bucket = (e->depth - from_) >> shift_;
+        at += bucket >= first && bucket < bucket_;
       }
     }
-  });
-  lists.first[across * rows] = static_cast<uint32_t>(entries);
-  return lists;
+    sort(n);
+    begin = sorted_.data(), end = begin + n;
+    return true;
+  }
+
+ private:
+  static constexpr int kBucketBits = 10, kDigitBits = 9;
+  static constexpr uint32_t kRun = 4096;
+
+  struct Range {
+    Range(const CellEntry* begin, const CellEntry* end) {
+      for (const CellEntry* e = begin; e < end; e++)
+        least = std::min(least, e->depth), most = std::max(most, e->depth);
+    }
+    int width() const { return most > least ? 32 - __builtin_clz(most - least) : 0; }
+    uint32_t least = UINT32_MAX, most = 0;
+  };
+
+  // A stable radix sort of sorted_[0..n).
+  void sort(size_t n) {
+    const Range all(sorted_.data(), sorted_.data() + n);
+    Buffer<CellEntry> other(memory_, n);
+    for (int shift = 0; shift < all.width(); shift += kDigitBits) {
+      uint32_t place[1 << kDigitBits] = {};
+      const auto digit = [&](const CellEntry& e) {
+        return (e.depth - all.least) >> shift & ((1 << kDigitBits) - 1);
+      };
+      for (size_t i = 0; i < n; i++) place[digit(sorted_[i])]++;
+      uint32_t total = 0;
+      for (uint32_t& p : place) total += std::exchange(p, total);
+      for (size_t i = 0; i < n; i++) other[place[digit(sorted_[i])]++] = sorted_[i];
+      sorted_.swap(other);
+    }
+  }
+
+  const Memory& memory_;
+  const CellEntry *begin_, *end_;
+  Buffer<CellEntry> sorted_;
+  std::vector<uint32_t> counts_;  // per bucket of depths
+  uint32_t from_ = 0;
+  int shift_ = 0;
+  size_t bucket_ = 0, run_ = kRun;
+};
+
+// ---- blocks ----------------------------------------------------------------------------------
+
+// A tile is cut into blocks of 4 columns by kLanes / 4 rows, one pixel per lane.
+constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
+constexpr int kBlockRows = kTile / kBlockHeight, kBlocks = kBlockRows * 4;
+static_assert(kCell * 4 == 64, "a cell's row of blocks fits a word");
+
+// One bit for each block of a tile.
+#if FP_LANES == 4
+typedef uint64_t Blocks;
+#else
+typedef uint32_t Blocks;
+#endif
+
+// The bits of a cell's tiles x0..x1, four for each.
+inline uint64_t tile_bits(int x0, int x1) {
+  return (uint64_t{2} << (4 * x1 + 3)) - (uint64_t{1} << 4 * x0);
+}
+
+// Columns of blocks of a cell that kLanes splats reach, by row of blocks: begin..end, both included;
+// from 1 to 0 where there are none.
+struct BlockSpans {
+  alignas(64) int32_t begin[kBlockRows][kLanes], end[kBlockRows][kLanes];
+};
+
+// One splat's, as bits.
+struct CellBlocks {
+  uint64_t row[kBlockRows], any;
+
+  CellBlocks(const BlockSpans& spans, int lane, uint64_t inside) : any(0) {
+    for (int r = 0; r < kBlockRows; r++) {
+      const uint64_t begin = uint64_t{1} << spans.begin[r][lane];
+      row[r] = ((uint64_t{2} << spans.end[r][lane]) - begin) & inside;
+      any |= row[r];
+    }
+  }
+  Blocks of_tile(int x) const {
+    Blocks blocks = 0;
+    for (int r = 0; r < kBlockRows; r++)
+      blocks |= static_cast<Blocks>(row[r] >> 4 * x & 15) << 4 * r;
+    return blocks;
+  }
+};
+
+// What kLanes splats reach of the cell whose first pixel is (x, y). Pixels are sampled up to `spread`
+// from their centres.
+inline void find_blocks(const Splat* splats, const uint32_t* which, float spread, float x, float y,
+                        BlockSpans& to) {
+  const auto splat = [&](int i) { return reinterpret_cast<const float*>(splats + which[i]); };
+  Lanes v[8];
+  load_columns(splat, v);
+  load_columns([&](int i) { return splat(i) + 4; }, v + 4);
+  const Lanes one = broadcast<Lanes>(1.f), none = broadcast<Lanes>(0.f);
+  const Lanes away = broadcast<Lanes>(spread), mean_x = v[0] - x, mean_y = v[1] - y;
+  const Ellipse<Lanes> e = ellipse_of(v[2], v[3], v[4], v[5] - v[7], away);
+  const Lanes top = ceil(mean_y - e.half_height), bottom = floor(mean_y + e.half_height);
+  const Lanes above = mean_y - away, below = mean_y + away;
+  for (int row = 0; row < kBlockRows; row++) {
+    const float first = static_cast<float>(row * kBlockHeight);
+    const Lanes low = max(broadcast<Lanes>(first), top);
+    const Lanes high = min(broadcast<Lanes>(first + (kBlockHeight - 1)), bottom);
+    const Lanes left = ceil(mean_x + span_end(e, low - below, high - above, -one));
+    const Lanes right = floor(mean_x + span_end(e, low - below, high - above, one));
+    const Lanes from = max(none, left), last = min(broadcast<Lanes>(kCell * kTile - 1), right);
+    const Mask some = both(ge(high, low), ge(last, from));
+    constexpr float block = 1.f / kBlockWidth;
+    store(to.begin[row], to_int(select(some, from * block, one)));
+    store(to.end[row], to_int(select(some, last * block, none)));
+  }
 }
 
 }  // namespace fp

@@ -1,25 +1,22 @@
 // Blending one tile, forwards and backwards.
 //
-// A tile is cut into blocks of 4 columns by kLanes / 4 rows, one pixel per lane. Which Gaussians of
-// the tile's list reach which block is found for kLanes Gaussians at once and kept as one bit each.
-// Forward goes block by block and keeps the pixels in registers; backward goes Gaussian by Gaussian
-// and keeps the Gaussian's sums in registers.
+// Forward collects what reaches the tile, kBatch Gaussians at a time, and goes block by block, the
+// pixels in registers; backward goes Gaussian by Gaussian, its sums in registers.
 #pragma once
 
 #include <cstring>
 #include <optional>
 #include <vector>
 
-#include "projection.h"
+#include "binning.h"
 
 namespace fp {
 
-constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
-constexpr int kBlockRows = kTile / kBlockHeight, kBlocks = kBlockRows * 4;
 constexpr int kPixels = kTile * kTile;
-constexpr int kWord = 64;    // Gaussians per word of bits
-constexpr int kBatch = 256;  // Gaussians staged at once
-constexpr int kAhead = 16;   // Gaussians; far enough to hide a miss of the caches
+constexpr int kWord = 64;        // Gaussians per word of bits
+constexpr int kInFlight = 4;     // Gaussians that one block blends at once
+constexpr int kNobody = kBatch;  // place of a Gaussian that reaches nothing
+constexpr int kAhead = 16;       // Gaussians; far enough to hide a miss of the caches
 
 // What the forward pass leaves for the backward pass, pixels in block order.
 struct TilePixels {
@@ -30,6 +27,7 @@ struct TilePixels {
 struct Tile {
   int x, y;  // of the first pixel
   const uint32_t* list;
+  const Blocks* reached;  // by each of the list
   int length;
 };
 
@@ -48,84 +46,72 @@ inline int block_y(int block) { return block / 4 * kBlockHeight; }
 
 // Up to kBatch Gaussians in coordinates of a tile, one array per number.
 struct Batch {
-  alignas(64) float scale[kBatch], skew[kBatch], u0[kBatch], down[kBatch], v0[kBatch],
-      log_opacity[kBatch], cut[kBatch], r[kBatch], g[kBatch], b[kBatch], inv_z[kBatch];
+  typedef float Numbers[kBatch + 1];
+  alignas(64) Numbers scale, skew, u0, down, v0, log_opacity, cut, r, g, b, inv_z;
 
+  Batch() {
+    for (float* numbers : {scale, skew, u0, down, v0, log_opacity, r, g, b, inv_z})
+      numbers[kNobody] = 0.f;
+    cut[kNobody] = 1e30f;
+  }
   LocalBrush<float> operator[](int j) const {
     return {scale[j], skew[j], u0[j], down[j], v0[j], log_opacity[j],
             cut[j],   r[j],    g[j],  b[j],    inv_z[j]};
   }
-};
 
-// Copies kLanes Gaussians of the list out of the scene; beyond its end, the last one again.
-// `list_cut` is as in Brush; returns the mean in coordinates of the tile, too.
-inline Brush<Lanes> stage(const Splat* splats, const Tile& tile, int first, int at, Batch& to) {
-  const int last = tile.length - 1;
-  const auto splat = [&](int i) {
-    return reinterpret_cast<const float*>(splats + tile.list[std::min(first + i, last)]);
-  };
-  for (int i = 0; i < kLanes; i++) __builtin_prefetch(splat(i + kAhead));
-  Lanes v[12];
-  load_columns(splat, v);
-  load_columns([&](int i) { return splat(i) + 4; }, v + 4);
-  load_columns([&](int i) { return splat(i) + 8; }, v + 8);
-  Brush<Lanes> b = {v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11]};
-  const Lanes x = broadcast<Lanes>(static_cast<float>(tile.x));
-  const Lanes y = broadcast<Lanes>(static_cast<float>(tile.y));
-  const LocalBrush<Lanes> local = localize(b, x, y);
-  store(to.scale + at, local.scale), store(to.skew + at, local.skew), store(to.u0 + at, local.u0);
-  store(to.down + at, local.down), store(to.v0 + at, local.v0);
-  store(to.log_opacity + at, local.log_opacity), store(to.cut + at, local.cut);
-  store(to.r + at, local.r), store(to.g + at, local.g), store(to.b + at, local.b);
-  store(to.inv_z + at, local.inv_z);
-  b.x = b.x - x, b.y = b.y - y;
-  return b;
-}
-
-// Sets bit i + lane of each block that a lane's Gaussian reaches. Pixels are sampled up to `spread`
-// from their centres.
-inline void find_blocks(const Brush<Lanes>& b, float spread, int i, uint64_t* reached) {
-  const Lanes one = broadcast<Lanes>(1.f), away = broadcast<Lanes>(spread);
-  const Ellipse<Lanes> e = ellipse_of(b.scale, b.skew, b.down, b.log_opacity - b.list_cut, away);
-  const Lanes top = ceil(b.y - e.half_height), bottom = floor(b.y + e.half_height);
-  const Lanes above = b.y - away, below = b.y + away;
-  for (int row = 0; row < kBlockRows; row++) {
-    const float first = static_cast<float>(row * kBlockHeight);
-    const Lanes low = max(broadcast<Lanes>(first), top);
-    const Lanes high = min(broadcast<Lanes>(first + (kBlockHeight - 1)), bottom);
-    const Mask crosses = ge(high, low);
-    if (!bits(crosses)) continue;
-    const Lanes right = floor(b.x + span_end(e, low - below, high - above, one));
-    const Lanes left = ceil(b.x + span_end(e, low - below, high - above, -one));
-    const Mask some = both(crosses, ge(right, left));
-    for (int column = 0; column < 4; column++) {
-      const float from = static_cast<float>(column * kBlockWidth);
-      const Mask hit = both(some, both(ge(right, broadcast<Lanes>(from)),
-                                       ge(broadcast<Lanes>(from + kBlockWidth - 1), left)));
-      reached[row * 4 + column] |= static_cast<uint64_t>(bits(hit)) << i;
+  // Copies `count` coloured Gaussians out of the scene.
+  void fill(const Splat* splats, const uint32_t* which, int count, int tile_x, int tile_y) {
+    for (int at = 0; at < count; at += kLanes) {
+      const auto splat = [&](int i) {
+        return reinterpret_cast<const float*>(splats + which[std::min(at + i, count - 1)]);
+      };
+      Lanes v[8];
+      load_columns(splat, v);
+      load_columns([&](int i) { return splat(i) + 4; }, v + 4);
+      const Lanes none = broadcast<Lanes>(0.f);
+      const Brush<Lanes> brush = {v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7],
+                                  none, none, none, none};
+      const LocalBrush<Lanes> local =
+          localize(brush, broadcast<Lanes>(static_cast<float>(tile_x)),
+                   broadcast<Lanes>(static_cast<float>(tile_y)));
+      store(scale + at, local.scale), store(skew + at, local.skew), store(u0 + at, local.u0);
+      store(down + at, local.down), store(v0 + at, local.v0);
+      store(log_opacity + at, local.log_opacity), store(cut + at, local.cut);
+    }
+    for (int j = 0; j < count; j++) {
+      float rgbz[4];
+      Colours::get(splats[which[j]], rgbz);
+      r[j] = rgbz[0], g[j] = rgbz[1], b[j] = rgbz[2], inv_z[j] = rgbz[3];
     }
   }
-}
+};
 
-// Stages a word's worth of the list and finds its blocks' bits.
-inline void stage_word(const Splat* splats, const Tile& tile, float spread, int first, int at,
-                       Batch& batch, uint64_t* reached) {
-  std::memset(reached, 0, kBlocks * sizeof *reached);
-  const int count = std::min(kWord, tile.length - first);
-  for (int i = 0; i < count; i += kLanes)
-    find_blocks(stage(splats, tile, first + i, at + i, batch), spread, i, reached);
-  if (count < kWord)
-    for (int b = 0; b < kBlocks; b++) reached[b] &= (uint64_t{1} << count) - 1;
+// For each block one bit per Gaussian, from one bit per block for each Gaussian.
+inline void transpose_bits(const Blocks* reached, int count, uint64_t (*words)[kBlocks]) {
+  std::memset(words, 0, kBatch / kWord * sizeof *words);
+#if FP_LANES == 16
+  for (int j = 0; j < count; j += kLanes) {
+    const auto some = static_cast<__mmask16>((1u << std::min(count - j, kLanes)) - 1);
+    const __m512i all = _mm512_loadu_si512(reached + j);
+    const __m512i mine = _mm512_maskz_mov_epi32(some, all);
+    for (int b = 0; b < kBlocks; b++)
+      words[j / kWord][b] |= uint64_t{_mm512_test_epi32_mask(mine, _mm512_set1_epi32(1 << b))}
+                             << j % kWord;
+  }
+#else
+  for (int j = 0; j < count; j++)
+    for (Blocks todo = reached[j]; todo; todo &= todo - 1)
+      words[j / kWord][__builtin_ctzll(todo)] |= uint64_t{1} << j % kWord;
+#endif
 }
 
 // ---- forward ---------------------------------------------------------------------------------
 
 struct BlockPixels {
-  Lanes light;        // transmittance as if pixels never stopped: below the stop, it stays there
-  Lanes final_light;  // transmittance at the stop
+  Lanes light;  // transmittance; stays what it was where the pixel stopped
   Lanes r, g, b, inv_z;
   IntLanes drawn, stop;
-  bool alive;
+  Mask alive;  // has not stopped, and lies in the image
 };
 
 struct TileCounts {
@@ -203,59 +189,61 @@ struct ExtraTile {
   ExtraTile(const Extras& e, const Tile& tile, int width, int height)
       : extras(e), samples(tile, width, height, e.offsets) {
     for (ExtraPixels& block : blocks) block.clear();
-    if (extras.counts) each.fragments.resize(tile.length);
-    if (extras.scores) each.weight.resize(tile.length);
   }
-  const float* row(const Splat* splats, const Tile& tile, int place) const {
+  void grow(int length) {
+    if (extras.counts) each.fragments.resize(length);
+    if (extras.scores) each.weight.resize(length);
+  }
+  const float* row(const Splat& splat) const {
     if (!extras.feature_count) return nullptr;
-    return extras.features + size_t{splats[tile.list[place]].id} * extras.feature_count;
+    return extras.features + size_t{splat.id} * extras.feature_count;
   }
 };
 
-// Blends a batch, front to back, into one block: the Gaussians whose bit is set in words[0],
-// words[kBlocks], ... and each of them also by `also(j, weight, drawn)`. Returns how many it met.
-// (Local copies of the pixels, one by one: a struct would be copied in small pieces, which stalls
-// the loads that follow.)
-template <class Also>
-inline int blend_block(const Batch& batch, const uint64_t* words, int count, int first, Lanes px,
-                       Lanes py, float alpha_max, BlockPixels& pixels, Also also) {
+// Blends the Gaussians `which` of a batch, front to back, into one block, kInFlight at a time: their
+// exponentials do not wait for each other. `which` ends in kInFlight - 1 times kNobody. The batch is
+// what the list holds from `first` to `end`. Each is handed to `also(j, weight, drawn)`, too. Returns
+// how many it met. (Local copies of the pixels, one by one: a struct would be copied in small
+// pieces, which stalls the loads that follow.)
+template <bool kKeep, class Also>
+inline int blend_block(const Batch& batch, const int32_t* which, int count, int first, int end,
+                       Lanes px, Lanes py, float alpha_max, BlockPixels& pixels, Also also) {
   const Lanes floor = broadcast<Lanes>(kTransmittanceMin);
-  const Lanes tiny = broadcast<Lanes>(1e-30f);  // no denormal numbers: they are slow
-  Lanes light = pixels.light, final_light = pixels.final_light;
+  Lanes light = pixels.light;
   Lanes r = pixels.r, g = pixels.g, blue = pixels.b, inv_z = pixels.inv_z;
   IntLanes drawn_count = pixels.drawn, stop = pixels.stop;
-  int met = 0;
-  for (int base = 0; base < count && pixels.alive; base += kWord, words += kBlocks) {
-    for (uint64_t todo = *words; todo; todo &= todo - 1) {
-      const int j = base + __builtin_ctzll(todo);
-      const LocalBrush<float> b = batch[j];
-      met++;
-      const Lanes exponent = meet(b, px, py).exponent;
-      const Mask inside = ge(exponent, broadcast<Lanes>(b.cut));
-      const Lanes alpha = where(inside, capped(exp2(exponent), alpha_max));
-      const Lanes after = fnma(light, alpha, light);
-      const Mask alive = ge(after, floor);
-      const Lanes weight = where(alive, alpha * light);
-      light = max(after, tiny);
-      final_light = select(alive, after, final_light);
-      stop = select(alive, broadcast_int(first + j + 1), stop);
-      const Mask drawn = both(inside, alive);
+  Mask alive = pixels.alive;
+  int i = 0;
+  for (; i < count && bits(alive); i += kInFlight) {
+    Lanes alpha[kInFlight];
+    Mask inside[kInFlight];
+    for (int k = 0; k < kInFlight; k++) {
+      const int j = which[i + k];
+      alpha[k] = meet(batch[j], px, py).exponent;
+      inside[k] = ge(alpha[k], broadcast<Lanes>(batch.cut[j]));
+    }
+    for (int k = 0; k < kInFlight; k++)
+      alpha[k] = where(inside[k], capped(exp2(alpha[k]), alpha_max));
+    for (int k = 0; k < kInFlight; k++) {
+      const int j = which[i + k];
+      const Lanes after = fnma(light, alpha[k], light);
+      alive = both(alive, ge(after, floor));
+      const Lanes weight = where(alive, alpha[k] * light);
+      light = select(alive, after, light);
+      if (kKeep) stop = select(alive, broadcast_int(std::min(first + j + 1, end)), stop);
+      const Mask drawn = both(inside[k], alive);
       drawn_count = increment(drawn, drawn_count);
-      r = fma(weight, broadcast<Lanes>(b.r), r);
-      g = fma(weight, broadcast<Lanes>(b.g), g);
-      blue = fma(weight, broadcast<Lanes>(b.b), blue);
-      inv_z = fma(weight, broadcast<Lanes>(b.inv_z), inv_z);
-      also(j, weight, drawn);
-      if (!bits(alive)) {
-        pixels.alive = false;
-        break;
-      }
+      r = fma(weight, broadcast<Lanes>(batch.r[j]), r);
+      g = fma(weight, broadcast<Lanes>(batch.g[j]), g);
+      blue = fma(weight, broadcast<Lanes>(batch.b[j]), blue);
+      inv_z = fma(weight, broadcast<Lanes>(batch.inv_z[j]), inv_z);
+      if (j != kNobody) also(j, weight, drawn);
     }
   }
-  pixels.light = light, pixels.final_light = final_light;
+  pixels.light = light, pixels.alive = alive;
   pixels.r = r, pixels.g = g, pixels.b = blue, pixels.inv_z = inv_z;
   pixels.drawn = drawn_count, pixels.stop = stop;
-  return met;
+  return std::min(i, count);
 }
 
 struct Canvas {
@@ -266,121 +254,174 @@ struct Canvas {
   int32_t *fragments, *winners;
 };
 
-// One number per pixel of a block, from block order to rows of the image.
+// One number per pixel of a tile, from block order to rows of the image.
 template <class T>
-inline void paint_plane(T* plane, int width, int x0, int y0, int wide, int high, const T* from) {
-  if (!plane) return;
-  for (int y = 0; y < high; y++) {
-    T* to = plane + static_cast<size_t>(y0 + y) * width + x0;
-    if (wide == kBlockWidth)
-      std::memcpy(to, from + y * kBlockWidth, kBlockWidth * sizeof *to);
-    else
-      for (int x = 0; x < wide; x++) to[x] = from[y * kBlockWidth + x];
+class Painting {
+ public:
+  void set(int block, const T* values) {
+    for (int i = 0; i < kBlockHeight; i++)
+      std::memcpy(&rows_[block_y(block) + i][block_x(block)], values + i * kBlockWidth,
+                  kBlockWidth * sizeof(T));
   }
-}
+  void paint(T* plane, int width, int height, int x0, int y0) const {
+    const int wide = std::min(kTile, width - x0), high = std::min(kTile, height - y0);
+    for (int y = 0; y < high; y++) {
+      T* to = plane + static_cast<size_t>(y0 + y) * width + x0;
+      if (wide == kTile)
+        std::memcpy(to, rows_[y], sizeof rows_[y]);
+      else
+        std::copy_n(rows_[y], wide, to);
+    }
+  }
 
-inline void paint_block(const Canvas& c, int x0, int y0, const BlockPixels& p) {
-  const int wide = std::min(kBlockWidth, c.width - x0);
-  const int high = std::min(kBlockHeight, c.height - y0);
+ private:
+  alignas(64) T rows_[kTile][kTile];
+};
+
+// Asks for the rows of the image that a tile will be painted on: they come while it is blended.
+inline void prefetch_canvas(const Canvas& c, int tile_x, int tile_y) {
   const size_t size = static_cast<size_t>(c.width) * c.height;
-  const auto paint = [&](float* plane, Lanes v) {
-    float values[kLanes];
-    store(values, v);
-    paint_plane(plane, c.width, x0, y0, wide, high, values);
-  };
-  paint(c.image, fma(p.final_light, broadcast<Lanes>(c.background[0]), p.r));
-  paint(c.image + size, fma(p.final_light, broadcast<Lanes>(c.background[1]), p.g));
-  paint(c.image + 2 * size, fma(p.final_light, broadcast<Lanes>(c.background[2]), p.b));
-  paint(c.invdepth, p.inv_z);
-  paint(c.alpha, broadcast<Lanes>(1.f) - p.final_light);
-  int32_t drawn[kLanes];
-  store(drawn, p.drawn);
-  paint_plane(c.fragments, c.width, x0, y0, wide, high, drawn);
-}
-
-// `row_of` gives the row of the inputs for a place of the tile's list.
-template <class RowOf>
-inline void paint_extras(const Canvas& c, int x0, int y0, int features, const ExtraPixels& p,
-                         RowOf row_of) {
-  const int wide = std::min(kBlockWidth, c.width - x0);
-  const int high = std::min(kBlockHeight, c.height - y0);
-  for (int k = 0; c.features && k < features; k++) {
-    float values[kLanes];
-    store(values, p.features[k]);
-    float* plane = c.features + static_cast<size_t>(k) * c.width * c.height;
-    paint_plane(plane, c.width, x0, y0, wide, high, values);
-  }
-  int32_t winner[kLanes];
-  store(winner, p.winner);
-  for (int32_t& place : winner) place = place < 0 ? -1 : row_of(place);
-  paint_plane(c.winners, c.width, x0, y0, wide, high, winner);
+  const int high = std::min(kTile, c.height - tile_y);
+  for (const float* plane : {c.image, c.image + size, c.image + 2 * size, c.invdepth, c.alpha})
+    for (int y = 0; plane && y < high; y++)
+      __builtin_prefetch(plane + static_cast<size_t>(tile_y + y) * c.width + tile_x, 1);
 }
 
 // Lanes whose pixel lies in the image: all ones, the others 0.
 inline Lanes in_image(const Canvas& c, int x0, int y0) {
+  if (x0 + kBlockWidth <= c.width && y0 + kBlockHeight <= c.height) return broadcast<Lanes>(1.f);
   float a[kLanes];
   for (int i = 0; i < kLanes; i++)
     a[i] = x0 + i % kBlockWidth < c.width && y0 + i / kBlockWidth < c.height ? 1.f : 0.f;
   return load(a);
 }
 
-// `keep` and `reached`, for the backward pass, may be NULL; `extra` is, unless kExtra.
-template <bool kExtra>
-inline TileCounts blend_tile(const Splat* splats, const Tile& tile, const Canvas& canvas,
-                             TilePixels* keep, uint64_t* reached, ExtraTile* extra) {
+// A tile's list as far as it was blended, for those who want to know afterwards.
+struct TileList {
+  Heap<uint32_t> splat;
+  Heap<Blocks> reached;
+
+  explicit TileList(const Memory& memory) : splat(memory, kBatch), reached(memory, kBatch) {}
+};
+
+// A tile while it is being blended.
+struct OpenTile {
+  int x, y;     // of the first pixel
+  int blended;  // length of the list so far
+  int waiting;  // what goes next
+  int alive;    // blocks
+  uint32_t splat[kBatch];
+  Blocks reached[kBatch];
   BlockPixels blocks[kBlocks];
-  const Lanes zero = broadcast<Lanes>(0.f), lx = lane_x(), ly = lane_y();
-  int alive = 0;
-  for (int b = 0; b < kBlocks; b++) {
-    const Lanes inside = in_image(canvas, tile.x + block_x(b), tile.y + block_y(b));
-    blocks[b] = {inside, inside, zero, zero, zero, zero, broadcast_int(0), broadcast_int(0),
-                 bits(ge(inside, broadcast<Lanes>(1.f))) != 0};
-    alive += blocks[b].alive;
+
+  void open(int tile_x, int tile_y) {
+    x = tile_x, y = tile_y;
+    blended = waiting = 0;
+    alive = kBlocks;
   }
-  TileCounts counts;
+  // A block before anything is blended into it.
+  BlockPixels untouched(const Canvas& canvas, int b) const {
+    const Lanes inside = in_image(canvas, x + block_x(b), y + block_y(b)), none = inside * 0.f;
+    return {inside, none, none, none, none, broadcast_int(0), broadcast_int(0),
+            ge(inside, broadcast<Lanes>(1.f))};
+  }
+
+};
+
+// Blends what waits; returns lanes spent. A `list` grows by it; `extra` is NULL, unless kExtra.
+template <bool kKeep, bool kExtra>
+inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const Canvas& canvas,
+                             OpenTile& tile, TileList* list, ExtraTile* extra) {
+  const int count = tile.waiting, first = tile.blended, end = first + count;
+  tile.blended = end, tile.waiting = 0;
+  if (first == 0) prefetch_canvas(canvas, tile.x, tile.y);
+  colours.fill(tile.splat, count);
   Batch batch;
-  uint64_t scratch[kBatch / kWord * kBlocks];
-  for (int first = 0; first < tile.length && alive; first += kBatch) {
-    const int count = std::min(kBatch, tile.length - first);
-    uint64_t* words = reached ? reached + static_cast<size_t>(first) / kWord * kBlocks : scratch;
-    for (int base = 0; base < count; base += kWord)
-      stage_word(splats, tile, canvas.spread, first + base, base, batch,
-                 words + base / kWord * kBlocks);
-    for (int b = 0; b < kBlocks; b++) {
-      if (!blocks[b].alive) continue;
-      int met;
-      if constexpr (kExtra) {
-        const auto also = [&, first](int j, Lanes weight, Mask drawn) {
-          const float* row = extra->row(splats, tile, first + j);
-          extra->blocks[b].blend(extra->extras, row, first + j, weight, drawn, extra->each);
-        };
-        met = blend_block(batch, words + b, count, first, extra->samples.x[b], extra->samples.y[b],
-                          canvas.alpha_max, blocks[b], also);
-      } else {
-        const Lanes px = lx + broadcast<Lanes>(static_cast<float>(block_x(b)));
-        const Lanes py = ly + broadcast<Lanes>(static_cast<float>(block_y(b)));
-        met = blend_block(batch, words + b, count, first, px, py, canvas.alpha_max, blocks[b],
-                          [](int, Lanes, Mask) {});
-      }
-      counts.evaluated += kLanes * met;
-      alive -= !blocks[b].alive;
-    }
+  batch.fill(splats, tile.splat, count, tile.x, tile.y);
+  for (int j = 0; j < count; j++)
+    if (!(batch.inv_z[j] > 0)) tile.reached[j] = 0;  // no finite colour: not even 0 times it
+  if (list) {
+    list->splat.append(tile.splat, static_cast<size_t>(count));
+    list->reached.append(tile.reached, static_cast<size_t>(count));
   }
+  if (kExtra) extra->grow(end);
+  uint64_t words[kBatch / kWord][kBlocks];
+  transpose_bits(tile.reached, count, words);
+  int64_t met = 0;
   for (int b = 0; b < kBlocks; b++) {
-    paint_block(canvas, tile.x + block_x(b), tile.y + block_y(b), blocks[b]);
-    if (kExtra)
-      paint_extras(canvas, tile.x + block_x(b), tile.y + block_y(b), extra->extras.feature_count,
-                   extra->blocks[b],
-                   [&](int place) { return static_cast<int32_t>(splats[tile.list[place]].id); });
-    int32_t drawn[kLanes];
-    store(drawn, blocks[b].drawn);
-    for (int i = 0; i < kLanes; i++) counts.drawn += drawn[i];
-    if (keep) {
-      store(keep->transmittance + b * kLanes, blocks[b].final_light);
-      store(keep->stop + b * kLanes, blocks[b].stop);
+    BlockPixels& pixels = tile.blocks[b];
+    if (first == 0) {
+      pixels = tile.untouched(canvas, b);
+      tile.alive -= !bits(pixels.alive);
     }
+    if (!bits(pixels.alive)) continue;
+    int32_t which[kBatch + kLanes + kInFlight], *last = which;
+    for (int w = 0; w < kBatch / kWord; w++) last = expand(words[w][b], w * kWord, last);
+    std::fill_n(last, kInFlight - 1, kNobody);
+    const int reached = static_cast<int>(last - which);
+    if constexpr (kExtra) {
+      const auto also = [&](int j, Lanes weight, Mask drawn) {
+        const float* row = extra->row(splats[tile.splat[j]]);
+        extra->blocks[b].blend(extra->extras, row, first + j, weight, drawn, extra->each);
+      };
+      met += blend_block<kKeep>(batch, which, reached, first, end, extra->samples.x[b],
+                                extra->samples.y[b], canvas.alpha_max, pixels, also);
+    } else {
+      const Lanes px = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
+      const Lanes py = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(b)));
+      met += blend_block<kKeep>(batch, which, reached, first, end, px, py, canvas.alpha_max, pixels,
+                                [](int, Lanes, Mask) {});
+    }
+    tile.alive -= !bits(pixels.alive);
   }
-  return counts;
+  return kLanes * met;
+}
+
+// Paints a tile; returns how many fragments it drew. `list` is read with `extra` only.
+inline int64_t close_tile(const Splat* splats, const Canvas& c, const OpenTile& tile,
+                          const TileList* list, const ExtraTile* extra, TilePixels* keep) {
+  const size_t size = static_cast<size_t>(c.width) * c.height;
+  const auto paint = [&](auto* plane, auto value_of) {
+    if (!plane) return;
+    Painting<std::remove_reference_t<decltype(*plane)>> painting;
+    for (int b = 0; b < kBlocks; b++) {
+      const auto value = value_of(b);
+      std::remove_reference_t<decltype(*plane)> values[kLanes];
+      store(values, value);
+      painting.set(b, values);
+    }
+    painting.paint(plane, c.width, c.height, tile.x, tile.y);
+  };
+  const auto over = [&](int b, Lanes v, float back) {
+    return fma(tile.blocks[b].light, broadcast<Lanes>(back), v);
+  };
+  paint(c.image, [&](int b) { return over(b, tile.blocks[b].r, c.background[0]); });
+  paint(c.image + size, [&](int b) { return over(b, tile.blocks[b].g, c.background[1]); });
+  paint(c.image + 2 * size, [&](int b) { return over(b, tile.blocks[b].b, c.background[2]); });
+  paint(c.invdepth, [&](int b) { return tile.blocks[b].inv_z; });
+  paint(c.alpha, [&](int b) { return broadcast<Lanes>(1.f) - tile.blocks[b].light; });
+  paint(c.fragments, [&](int b) { return tile.blocks[b].drawn; });
+  if (extra) {
+    for (int k = 0; c.features && k < extra->extras.feature_count; k++)
+      paint(c.features + static_cast<size_t>(k) * size,
+            [&](int b) { return extra->blocks[b].features[k]; });
+    paint(c.winners, [&](int b) {
+      IntLanes rows = extra->blocks[b].winner;
+      for (int i = 0; i < kLanes; i++)
+        if (rows[i] >= 0) rows[i] = static_cast<int32_t>(splats[list->splat.data()[rows[i]]].id);
+      return rows;
+    });
+  }
+  IntLanes drawn = broadcast_int(0);
+  for (int b = 0; b < kBlocks; b++) {
+    drawn = drawn + tile.blocks[b].drawn;
+    if (!keep) continue;
+    store(keep->transmittance + b * kLanes, tile.blocks[b].light);
+    store(keep->stop + b * kLanes, tile.blocks[b].stop);
+  }
+  int64_t total = 0;
+  for (int i = 0; i < kLanes; i++) total += drawn[i];
+  return total;
 }
 
 // ---- backward --------------------------------------------------------------------------------
@@ -497,26 +538,18 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const 
   }
 }
 
-// Turns one word of bits per block into one word of blocks per Gaussian, leaving out what lies
-// behind every pixel of its block.
-inline void transpose_bits(const uint64_t* reached, const int32_t* last_stop, int first,
-                           uint64_t* blocks_of) {
-  std::memset(blocks_of, 0, kWord * sizeof *blocks_of);
-  for (int b = 0; b < kBlocks; b++) {
-    const int limit = last_stop[b] - first;
-    if (limit <= 0) continue;
-    uint64_t word = reached[b];
-    if (limit < kWord) word &= (uint64_t{1} << limit) - 1;
-    for (; word; word &= word - 1) blocks_of[__builtin_ctzll(word)] |= uint64_t{1} << b;
-  }
-}
+// Where a splat's sums of one cell go.
+struct CellSlots {
+  const Scene& scene;
+  uint32_t row, column;  // of the cell
+  size_t operator()(uint32_t splat) const { return scene.slot(splat, row, column); }
+};
 
-// Writes sums_of(kWant) numbers and the features' per entry of the list, at `out` + slot times their
+// Adds sums_of(kWant) numbers and the features' per entry of the list, at `out` + slot times their
 // number.
 template <int kWant>
 inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels& kept,
-                         const uint64_t* reached, const uint32_t* slots, const Asked& asked,
-                         LossPixels& loss, float* out) {
+                         const CellSlots& slot, const Asked& asked, LossPixels& loss, float* out) {
   constexpr int base = sums_of(kWant), most = kWant & kExtra ? kMostSums : base;
   const int n = kWant & kExtra ? base + asked.extras.feature_count : base;
   Lanes xs[4], ys[kBlockRows];  // of each column and row of blocks
@@ -528,53 +561,50 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
   if (kWant & kExtra)
     samples.emplace(tile, static_cast<int>(asked.width), static_cast<int>(asked.height),
                     asked.extras.offsets);
-  int32_t last_stop[kBlocks], end = 0;
-  for (int b = 0; b < kBlocks; b++) {
-    last_stop[b] = *std::max_element(kept.stop + b * kLanes, kept.stop + (b + 1) * kLanes);
-    end = std::max(end, last_stop[b]);
-  }
-  const auto place = [&](int position) { return out + static_cast<size_t>(slots[position]) * n; };
-  for (int i = end; i < tile.length; i++) std::fill_n(place(i), n, 0.f);
-  uint64_t blocks_of[kWord];
-  for (int first = (end - 1) / kWord * kWord; first >= 0 && end > 0; first -= kWord) {
-    transpose_bits(reached + static_cast<size_t>(first) / kWord * kBlocks, last_stop, first,
-                   blocks_of);
-    for (int j = std::min(kWord, end - first) - 1; j >= 0; j--) {
-      uint64_t todo = blocks_of[j];
-      if (!todo) {
-        std::fill_n(place(first + j), n, 0.f);
-        continue;
-      }
-      if (first + j >= kAhead) __builtin_prefetch(&splats[tile.list[first + j - kAhead]]);
-      const Splat& s = splats[tile.list[first + j]];
-      const LocalBrush<float> brush =
-          localize(s.brush, static_cast<float>(tile.x), static_cast<float>(tile.y));
-      const Rim rim = {s.brush.list_cut, s.threshold, s.inv_opacity, asked.per_fragment,
-                       asked.alpha_max};
-      Beyond beyond = {};
-      if (kWant & kExtra) {  // dL/dx = w u times the first, and so on
-        const float x = asked.width / kLog2E, y = asked.height / kLog2E;
-        beyond = {asked.extras.features + size_t{s.id} * asked.extras.feature_count,
-                  x * brush.scale, y * brush.skew, y * brush.down};
-      }
-      Lanes sums[most];
-      for (Lanes& v : sums) v = broadcast<Lanes>(0.f);
-      for (; todo; todo &= todo - 1) {
-        const int b = __builtin_ctzll(todo);
-        unblend_block<kWant>(brush, rim, asked, beyond, first + j,
-                             kWant & kExtra ? samples->x[b] : xs[b % 4],
-                             kWant & kExtra ? samples->y[b] : ys[b / 4], kept.stop, b * kLanes,
-                             loss, sums);
-      }
-      float* to = place(first + j);
-      if (!(kWant & kExtra)) {
-        sum_each<base>(sums, to);
-      } else {
-        float all[most];
-        sum_each<most>(sums, all);
-        std::copy(all, all + n, to);
-      }
+  // Blocks in the order in which they open, the deepest pixel first.
+  struct Opening {
+    int32_t stop;
+    int block;
+  } opening[kBlocks];
+  for (int b = 0; b < kBlocks; b++)
+    opening[b] = {*std::max_element(kept.stop + b * kLanes, kept.stop + (b + 1) * kLanes), b};
+  std::sort(opening, opening + kBlocks,
+            [](const Opening& a, const Opening& b) { return a.stop > b.stop; });
+  Blocks open = 0;
+  int next = 0;
+  for (int position = std::min(opening[0].stop, tile.length) - 1; position >= 0; position--) {
+    for (; next < kBlocks && opening[next].stop > position; next++)
+      open |= Blocks{1} << opening[next].block;
+    if (position >= kAhead) {
+      __builtin_prefetch(&splats[tile.list[position - kAhead]]);
+      __builtin_prefetch(out + slot(tile.list[position - kAhead / 2]) * n, 1);
     }
+    const Splat& s = splats[tile.list[position]];
+    Blocks todo = tile.reached[position] & open;
+    if (!todo) continue;
+    const LocalBrush<float> brush =
+        localize(s.brush, static_cast<float>(tile.x), static_cast<float>(tile.y));
+    const Rim rim = {s.brush.list_cut, s.threshold, s.inv_opacity, asked.per_fragment,
+                     asked.alpha_max};
+    Beyond beyond = {};
+    if (kWant & kExtra) {  // dL/dx = w u times the first, and so on
+      const float x = asked.width / kLog2E, y = asked.height / kLog2E;
+      beyond = {asked.extras.features + size_t{s.id} * asked.extras.feature_count,
+                x * brush.scale, y * brush.skew, y * brush.down};
+    }
+    Lanes sums[most];
+    for (Lanes& v : sums) v = broadcast<Lanes>(0.f);
+    for (; todo; todo &= todo - 1) {
+      const int b = __builtin_ctzll(todo);
+      unblend_block<kWant>(brush, rim, asked, beyond, position,
+                           kWant & kExtra ? samples->x[b] : xs[b % 4],
+                           kWant & kExtra ? samples->y[b] : ys[b / 4], kept.stop, b * kLanes, loss,
+                           sums);
+    }
+    float all[most];
+    sum_each<most>(sums, all);
+    float* to = out + slot(tile.list[position]) * n;
+    for (int i = 0; i < n; i++) to[i] += all[i];
   }
 }
 

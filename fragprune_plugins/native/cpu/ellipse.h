@@ -36,8 +36,8 @@ FP_HD inline Ellipse<V> ellipse_of(V scale, V skew, V down, V power, V spread) {
   e.var_along = unit / (scale * scale);
   e.inv_down = down * down * broadcast<V>(2 / kLog2E);
   e.margin = spread + kSpanMargin;
-  e.half_height = sqrt(e.reach * var_down) + e.margin;
-  e.rightmost = cov * sqrt(e.reach / (e.var_along + slope * cov));
+  e.half_height = root(e.reach * var_down) + e.margin;
+  e.rightmost = cov * root(e.reach / (e.var_along + slope * cov));
   return e;
 }
 
@@ -47,7 +47,7 @@ template <class V>
 FP_HD inline V span_end(const Ellipse<V>& e, V low, V high, V side) {
   const V at = min(max(e.rightmost * side, low), high);
   const V inside = e.var_along * (e.reach - at * at * e.inv_down);
-  return e.slope * at + side * (sqrt(max(inside, broadcast<V>(0.f))) + e.margin);
+  return e.slope * at + side * (root(max(inside, broadcast<V>(0.f))) + e.margin);
 }
 
 // The pixels that may matter of one splat: its ellipse within the host's rectangle of tiles and the

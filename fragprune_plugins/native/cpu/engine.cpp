@@ -12,6 +12,17 @@
 #include "binning.h"
 #include "blend.h"
 
+namespace fp {
+
+// The lists of a cell's tiles: tile x has entries [first[x], first[x + 1]).
+struct KeptCell {
+  Buffer<uint32_t> splat;
+  Buffer<Blocks> reached;
+  uint32_t first[kCell + 1];
+};
+
+}  // namespace fp
+
 struct fragprune_workspace {
   fp::Memory memory = std::make_shared<fp::Pool>();
 };
@@ -22,9 +33,8 @@ struct fragprune_state {
   fp::Camera<float> camera;
   fp::Extras extras;
   fp::Scene scene;  // what backward needs of it
-  fp::TileLists lists;
-  fp::Buffer<size_t> words;           // per tile: where its bits begin
-  fp::Buffer<uint64_t> reached;       // see find_blocks
+  std::vector<fp::KeptCell> cells;
+  size_t slots;
   fp::Buffer<fp::TilePixels> pixels;  // per tile
 };
 
@@ -32,13 +42,6 @@ namespace fp {
 namespace {
 
 // ---- forward ---------------------------------------------------------------------------------
-
-Tile tile_at(const Camera<float>& c, const TileLists& lists, size_t t) {
-  const uint32_t first = lists.first[t];
-  const size_t across = static_cast<size_t>(c.tiles_x);
-  return {static_cast<int>(t % across) * kTile, static_cast<int>(t / across) * kTile,
-          lists.splat.data() + first, static_cast<int>(lists.first[t + 1] - first)};
-}
 
 // Sums of weights, the same in any order: whole numbers, a pixel's whole light being `one`.
 class Weights {
@@ -69,13 +72,13 @@ Extras extras_of(const fragprune_inputs& in, const fragprune_outputs& out) {
 }
 
 // Adds what a tile found out about each Gaussian.
-void add_up(const ExtraTile& found, const Tile& tile, const Splat* splats,
+void add_up(const ExtraTile& found, const TileList& list, const Splat* splats,
             const fragprune_outputs& out, Weights* weights) {
   const auto add = [](int32_t* to, uint32_t row, int32_t n) {
     __atomic_fetch_add(to + row, n, __ATOMIC_RELAXED);
   };
-  for (int j = 0; j < tile.length; j++) {
-    const uint32_t row = splats[tile.list[j]].id;
+  for (size_t j = 0; j < list.splat.size(); j++) {
+    const uint32_t row = splats[list.splat.data()[j]].id;
     if (found.extras.counts && found.each.fragments[j])
       add(out.fragments_per_gaussian, row, found.each.fragments[j]);
     if (weights && found.each.weight[j] > 0) weights->add(row, found.each.weight[j]);
@@ -83,35 +86,168 @@ void add_up(const ExtraTile& found, const Tile& tile, const Splat* splats,
   for (int b = 0; out.wins_per_gaussian && b < kBlocks; b++)
     for (int i = 0; i < kLanes; i++)
       if (const int place = found.blocks[b].winner[i]; place >= 0)
-        add(out.wins_per_gaussian, splats[tile.list[place]].id, 1);
+        add(out.wins_per_gaussian, splats[list.splat.data()[place]].id, 1);
 }
 
+// What the cells of one picture share.
+struct Picture {
+  const Memory& memory;
+  const Camera<float>& camera;
+  const Extras& extras;
+  const Scene& scene;
+  const CellLists& lists;
+  const Colours& colours;
+  const Canvas& canvas;
+  fragprune_outputs& out;
+  Weights* weights;       // or NULL
+  fragprune_state* keep;  // or NULL
+};
+
+// The tiles of one cell, front to back until nothing shows through.
+class Cell {
+ public:
+  Cell(const Picture& picture, size_t cell)
+      : p_(picture), splats_(picture.scene.splats.data()), cell_(cell),
+        row_(static_cast<int>(cell / picture.scene.across)),
+        left_(static_cast<int>(cell % picture.scene.across) * kCell),
+        wide_(std::min(kCell, static_cast<int>(picture.camera.tiles_x) - left_)),
+        tiles_(picture.memory, static_cast<size_t>(wide_)) {
+    const bool listed = p_.keep || p_.extras.any();
+    for (int x = 0; x < wide_; x++) {
+      tiles_[x].open((left_ + x) * kTile, row_ * kTile);
+      open_ |= uint64_t{15} << 4 * x;
+      if (listed) lists_.emplace_back(p_.memory);
+      if (p_.extras.any()) {
+        const Tile tile{tiles_[x].x, tiles_[x].y, nullptr, nullptr, 0};
+        extra_.push_back(std::make_unique<ExtraTile>(p_.extras, tile, p_.canvas.width,
+                                                     p_.canvas.height));
+      }
+    }
+  }
+
+  // Blends all of them; returns lanes spent.
+  int64_t blend() {
+    const CellEntry* entries = p_.lists.entries.data();
+    FrontToBack order(p_.memory, entries + p_.lists.first[cell_],
+                      entries + p_.lists.first[cell_ + 1]);
+    const CellEntry *begin, *end;
+    while (open_ && order.next(begin, end)) hand_out(begin, end);
+    for (int x = 0; x < wide_; x++)
+      if (tiles_[x].waiting || tiles_[x].blended == 0) blend_waiting(x);
+    return evaluated_;
+  }
+
+  // Paints all of them and keeps what is to be kept; returns how many fragments were drawn.
+  int64_t close() {
+    int64_t drawn = 0;
+    for (int x = 0; x < wide_; x++) {
+      const size_t t = static_cast<size_t>(row_) * static_cast<size_t>(p_.camera.tiles_x) +
+                       static_cast<size_t>(left_ + x);
+      const ExtraTile* extra = extra_.empty() ? nullptr : extra_[x].get();
+      const TileList* list = lists_.empty() ? nullptr : &lists_[x];
+      drawn += close_tile(splats_, p_.canvas, tiles_[x], list, extra,
+                          p_.keep ? &p_.keep->pixels[t] : nullptr);
+      if (extra) add_up(*extra, *list, splats_, p_.out, p_.weights);
+    }
+    if (p_.keep) keep_lists(p_.keep->cells[cell_]);
+    return drawn;
+  }
+
+ private:
+  void hand_out(const CellEntry* entry, const CellEntry* end) {
+    constexpr int kSome = 4 * kLanes;
+    const float x = static_cast<float>(left_ * kTile), y = static_cast<float>(row_ * kTile);
+    while (entry < end && open_) {
+      uint32_t some[kSome + kLanes];  // of those that reach an open tile
+      uint64_t inside[kSome + kLanes];
+      int n = 0;
+      for (; entry < end && n < kSome; entry++) {
+        some[n] = entry->splat;
+        inside[n] = tile_bits(entry->x0, entry->x1);
+        __builtin_prefetch(&splats_[entry->splat]);
+        n += (inside[n] & open_) != 0;
+      }
+      std::fill_n(some + n, kLanes, n ? some[n - 1] : 0);
+      for (int i = 0; i < n; i += kLanes) {
+        BlockSpans spans;
+        find_blocks(splats_, some + i, p_.canvas.spread, x, y, spans);
+        for (int lane = 0; lane < std::min(kLanes, n - i); lane++)
+          hand_out(some[i + lane], CellBlocks(spans, lane, inside[i + lane] & open_));
+      }
+    }
+  }
+
+  // Puts a splat on the lists of the open tiles that it reaches.
+  void hand_out(uint32_t splat, const CellBlocks& found) {
+    if (found.any) p_.colours.prefetch(splats_[splat]);
+    for (uint64_t any = found.any; any;) {
+      const int x = __builtin_ctzll(any) / 4;
+      any &= ~(uint64_t{15} << 4 * x);
+      OpenTile& tile = tiles_[x];
+      tile.splat[tile.waiting] = splat;
+      tile.reached[tile.waiting] = found.of_tile(x);
+      if (++tile.waiting == kBatch) blend_waiting(x);
+    }
+  }
+
+  void blend_waiting(int x) {
+    const auto blend = p_.extras.any()
+                           ? p_.keep ? fp::blend_waiting<true, true> : fp::blend_waiting<false, true>
+                       : p_.keep ? fp::blend_waiting<true, false>
+                                 : fp::blend_waiting<false, false>;
+    evaluated_ += blend(splats_, p_.colours, p_.canvas, tiles_[x],
+                        lists_.empty() ? nullptr : &lists_[x],
+                        extra_.empty() ? nullptr : extra_[x].get());
+    if (!tiles_[x].alive) open_ &= ~(uint64_t{15} << 4 * x);
+  }
+
+  void keep_lists(KeptCell& to) const {
+    uint32_t total = 0;
+    for (int x = 0; x <= kCell; x++) {
+      to.first[x] = total;
+      if (x < wide_) total += static_cast<uint32_t>(lists_[x].splat.size());
+    }
+    to.splat = Buffer<uint32_t>(p_.memory, total);
+    to.reached = Buffer<Blocks>(p_.memory, total);
+    for (int x = 0; x < wide_; x++) {
+      const size_t n = lists_[x].splat.size();
+      std::copy_n(lists_[x].splat.data(), n, to.splat.data() + to.first[x]);
+      std::copy_n(lists_[x].reached.data(), n, to.reached.data() + to.first[x]);
+    }
+  }
+
+  const Picture& p_;
+  const Splat* splats_;
+  const size_t cell_;
+  const int row_, left_, wide_;  // tiles
+  uint64_t open_ = 0;            // four bits for each tile where something shows through
+  int64_t evaluated_ = 0;
+  Buffer<OpenTile> tiles_;
+  std::vector<TileList> lists_;
+  std::vector<std::unique_ptr<ExtraTile>> extra_;
+};
+
 void draw(Team& team, const Memory& memory, const Camera<float>& c, const fragprune_inputs& in,
-          const Extras& extras, const Buffer<Splat>& splats, const TileLists& lists,
-          fragprune_outputs& out, fragprune_state* keep) {
+          const Extras& extras, Scene& scene, const CellLists& lists, fragprune_outputs& out,
+          fragprune_state* keep) {
   const float* back = in.background;
   const Canvas canvas{in.width,     in.height,    {back[0], back[1], back[2]},
                       c.spread,     in.alpha_max, out.image,
                       out.invdepth, out.alpha,    out.features,
                       out.fragments, out.winners};
-  const size_t tiles = lists.tiles(), n = static_cast<size_t>(in.count);
+  const size_t n = static_cast<size_t>(in.count);
   std::optional<Weights> weights;
   if (out.weights_per_gaussian) weights.emplace(memory, in);
   for (int32_t* counts : {out.fragments_per_gaussian, out.wins_per_gaussian})
     if (counts) std::fill_n(counts, n, 0);
+  const Colours colours(c, in, scene.splats.data());
+  const Picture picture{memory,  c,      extras, scene,                        lists,
+                        colours, canvas, out,    weights ? &*weights : nullptr, keep};
   std::atomic<int64_t> drawn{0}, evaluated{0};
-  team.each(tiles, 1, [&](size_t t, size_t) {
-    const Tile tile = tile_at(c, lists, t);
-    TilePixels* pixels = keep ? &keep->pixels[t] : nullptr;
-    uint64_t* reached = keep ? keep->reached.data() + keep->words[t] : nullptr;
-    std::unique_ptr<ExtraTile> extra;
-    if (extras.any()) extra = std::make_unique<ExtraTile>(extras, tile, in.width, in.height);
-    const auto blend = extra ? blend_tile<true> : blend_tile<false>;
-    const TileCounts counts =
-        blend(splats.data(), tile, canvas, pixels, reached, extra.get());
-    if (extra) add_up(*extra, tile, splats.data(), out, weights ? &*weights : nullptr);
-    drawn.fetch_add(counts.drawn, std::memory_order_relaxed);
-    evaluated.fetch_add(counts.evaluated, std::memory_order_relaxed);
+  team.each(scene.cells.size(), 1, [&](size_t k, size_t) {
+    Cell cell(picture, k);
+    evaluated.fetch_add(cell.blend(), std::memory_order_relaxed);
+    drawn.fetch_add(cell.close(), std::memory_order_relaxed);
   });
   if (weights) weights->write(out.weights_per_gaussian);
   out.drawn = drawn;
@@ -132,19 +268,6 @@ class Clock {
   std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
 };
 
-// Room for what the tiles keep for the backward pass.
-void prepare(fragprune_state& keep, const TileLists& lists) {
-  const size_t tiles = lists.tiles();
-  keep.words = Buffer<size_t>(keep.memory, tiles);
-  size_t words = 0;
-  for (size_t t = 0; t < tiles; t++) {
-    keep.words[t] = words;
-    words += (lists.first[t + 1] - lists.first[t] + kWord - 1) / kWord * kBlocks;
-  }
-  keep.reached = Buffer<uint64_t>(keep.memory, words);
-  keep.pixels = Buffer<TilePixels>(keep.memory, tiles);
-}
-
 void forward(const fragprune_inputs& in, float spread, fragprune_outputs& out,
              const Memory& memory, fragprune_state* keep) {
   Clock clock;
@@ -152,23 +275,25 @@ void forward(const fragprune_inputs& in, float spread, fragprune_outputs& out,
   const Camera<float> camera = unpack_camera(in, spread);
   // A state holds on to its memory until the backward pass is done, which then wants more: what the
   // forward pass alone needed goes back to the system first, lest both lie idle in turns.
-  Memory scratch = keep ? std::make_shared<Pool>() : memory;
+  const Memory scratch = keep ? std::make_shared<Pool>() : memory;
   Scene scene = project_all(team, memory, scratch, camera, in, out.radii);
   out.projection_ms = clock.lap();
-  const size_t across = static_cast<size_t>(camera.tiles_x);
-  TileLists lists = distribute(team, memory, scratch, across, scene, keep != nullptr);
-  scene.drop_reach();
-  scratch.reset();
+  const CellLists lists = list_cells(team, scratch, scene);
+  scene.depth = Buffer<float>();
   out.binning_ms = clock.lap();
-  if (keep) prepare(*keep, lists);
+  if (keep) {
+    keep->cells.resize(scene.cells.size());
+    keep->pixels = Buffer<TilePixels>(
+        memory, static_cast<size_t>(camera.tiles_x) * static_cast<size_t>(camera.tiles_y));
+  }
   const Extras extras = extras_of(in, out);
-  draw(team, memory, camera, in, extras, scene.splats, lists, out, keep);
+  draw(team, memory, camera, in, extras, scene, lists, out, keep);
   if (keep) {
     keep->in = in;
     keep->camera = camera;
     keep->extras = extras;
+    keep->slots = number_slots(team, scene);
     keep->scene = std::move(scene);
-    keep->lists = std::move(lists);
   }
   out.blend_ms = clock.lap();
 }
@@ -228,8 +353,8 @@ void load_losses(const Camera<float>& c, const Losses& from, int features, const
   for (int k = 0; k < 3; k++) by_background[k] = sum(sums[k]);
 }
 
-using UnblendTile = void (*)(const Splat*, const Tile&, const TilePixels&, const uint64_t*,
-                             const uint32_t*, const Asked&, LossPixels&, float*);
+using UnblendTile = void (*)(const Splat*, const Tile&, const TilePixels&, const CellSlots&,
+                             const Asked&, LossPixels&, float*);
 
 template <size_t... kWants>
 constexpr std::array<UnblendTile, sizeof...(kWants)> unblenders(std::index_sequence<kWants...>) {
@@ -433,7 +558,7 @@ struct GradientRows {
 void backward(const fragprune_state& state, const fragprune_output_grads& grads,
               const fragprune_input_grads& to, int threads) {
   const fragprune_inputs& in = state.in;
-  const TileLists& lists = state.lists;
+  const Scene& scene = state.scene;
   Team team(threads);
   int want = 0;
   if (to.means || to.hook || to.scales || to.rotations || to.cov3d || to.means2d || to.conics ||
@@ -464,24 +589,33 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
 
   const UnblendTile unblend = unblender(want);
   const int size = sums_of(want) + extras.feature_count;
-  const size_t tiles = lists.tiles();
+  const size_t tiles_x = static_cast<size_t>(state.camera.tiles_x), tiles = state.pixels.size();
   const Losses losses{grads,
                       {in.background[0], in.background[1], in.background[2]},
                       static_cast<size_t>(in.width) * in.height};
   const float pixels = static_cast<float>(losses.plane);
   const Asked asked{grads.fragments_per_pixel / pixels, in.alpha_max,        in.cap_gradient != 0,
                     extras,                             state.camera.width,  state.camera.height};
-  Buffer<float> sums(state.memory, per_gaussian ? lists.splat.size() * size + 32 : 0);
+  Buffer<float> sums(state.memory, per_gaussian ? state.slots * size + 32 : 0);
+  team.each(sums.size(), 1u << 18,
+            [&](size_t begin, size_t end) { std::fill(&sums[begin], sums.data() + end, 0.f); });
   Buffer<double> by_background(state.memory, 3 * tiles);
-  team.each(tiles, 1, [&](size_t t, size_t) {
-    const Tile tile = tile_at(state.camera, lists, t);
-    LossPixels loss;
-    load_losses(state.camera, losses, extras.feature_count, tile, state.pixels[t], loss,
-                &by_background[3 * t]);
-    if (per_gaussian)
-      unblend(state.scene.splats.data(), tile, state.pixels[t],
-              state.reached.data() + state.words[t], lists.slot.data() + lists.first[t], asked,
-              loss, sums.data());
+  team.each(state.cells.size(), 1, [&](size_t cell, size_t) {
+    const KeptCell& kept = state.cells[cell];
+    const size_t row = cell / scene.across, column = cell % scene.across;
+    const CellSlots slots{scene, static_cast<uint32_t>(row), static_cast<uint32_t>(column)};
+    for (size_t x = column * kCell; x < std::min((column + 1) * kCell, tiles_x); x++) {
+      const uint32_t from = kept.first[x % kCell];
+      const Tile tile{static_cast<int>(x) * kTile, static_cast<int>(row) * kTile,
+                      kept.splat.data() + from, kept.reached.data() + from,
+                      static_cast<int>(kept.first[x % kCell + 1] - from)};
+      const size_t t = row * tiles_x + x;
+      LossPixels loss;
+      load_losses(state.camera, losses, extras.feature_count, tile, state.pixels[t], loss,
+                  &by_background[3 * t]);
+      if (per_gaussian)
+        unblend(scene.splats.data(), tile, state.pixels[t], slots, asked, loss, sums.data());
+    }
   });
   if (to.background)
     for (int k = 0; k < 3; k++) {
@@ -491,8 +625,7 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
     }
   if (!per_gaussian) return;
   const Chain chain(state, to, want);
-  team.each(state.scene.pieces(), 1, [&](size_t piece, size_t) {
-    const Scene& scene = state.scene;
+  team.each(scene.pieces(), 1, [&](size_t piece, size_t) {
     const size_t begin = piece * kPiece, end = begin + scene.count[piece];
     size_t row = begin;  // the first whose gradients are not written yet
     Picked who;
@@ -504,13 +637,12 @@ void backward(const fragprune_state& state, const fragprune_output_grads& grads,
       who.count = 0;
     };
     for (size_t k = begin; k < end; k++) {
-      const uint32_t from = scene.slot_begin(k), until = scene.slot_end(k);
-      if (from == until) continue;
+      if (!(scene.splats[k].brush.inv_z > 0)) continue;
       const size_t i = scene.splats[k].id;
       clear(row, i);
       row = i + 1;
-      const float* v = sums.data() + static_cast<size_t>(from) * size;
-      const float* last = sums.data() + static_cast<size_t>(until) * size;
+      const float* v = sums.data() + scene.slot(k) * size;
+      const float* last = v + size_t{scene.reach[k].cells()} * size;
       Record mine = {}, more = {};
       for (; v < last; v += size) {
         mine = mine + load_record(v);

@@ -1,7 +1,8 @@
 // From Gaussians to splats: all that blending and binning need of those that can draw.
 //
 // Gaussians go kLanes at a time through the mathematics of gaussian.h. Those that are left are
-// packed per piece of kPiece rows; colours come last, for them alone.
+// packed per piece of kPiece rows. Colours come when a splat is about to be blended: most of a
+// scene lies behind something.
 #pragma once
 
 #include <algorithm>
@@ -16,27 +17,25 @@
 namespace fp {
 
 constexpr size_t kPiece = 1024;  // Gaussians per piece of work
+constexpr int kBatch = 256;      // splats blended, and coloured, at once
+constexpr int kCell = 16;        // tiles of a cell; they lie side by side
 
 // One cache line, for blending reads splats in no order at all.
 struct alignas(64) Splat {
-  Brush<float> brush;
+  Brush<float> brush;  // its colour may be unknown, see Colours
   uint32_t id;         // row of the inputs
   float threshold;     // 0 for none
   float inv_opacity;   // of the compensated opacity
-  float unused;
+  uint32_t slot;       // see Scene
 };
 static_assert(sizeof(Splat) == 64, "four columns of four");
 
-// Tiles x0..x1, both included, of one row of tiles; none when x0 > x1.
-struct Span {
-  uint16_t x0, x1;
-  uint32_t tiles() const { return static_cast<uint32_t>(x1 - x0 + 1); }
-};
-
-// The tiles that a splat reaches: spans[first] is of row `row`, and so on down.
+// Tiles x0..x1, y0..y1, all included: none beyond them are reached.
 struct Reach {
-  uint32_t first;  // within the piece
-  uint16_t row, rows;
+  uint16_t x0, y0, x1, y1;
+
+  uint32_t cells_across() const { return static_cast<uint32_t>(x1 / kCell - x0 / kCell + 1); }
+  uint32_t cells() const { return cells_across() * static_cast<uint32_t>(y1 - y0 + 1); }
 };
 
 // What projection leaves. Splats of piece k begin at kPiece * k, in the order of the inputs.
@@ -44,27 +43,19 @@ struct Scene {
   Buffer<Splat> splats;
   Buffer<float> depth;
   Buffer<Reach> reach;
-  Buffer<uint32_t> slot;            // per splat: tiles of its piece's splats before it
-  std::vector<Heap<Span>> spans;    // per piece
   std::vector<uint32_t> count;      // per piece: splats
-  std::vector<uint32_t> slot_base;  // per piece: tiles of the splats before it; one more at the end
-  struct RowTotal {
-    uint32_t spans, tiles;
-  };
-  std::vector<RowTotal> rows;       // per row of tiles: what reaches it
+  std::vector<uint32_t> cells;      // per cell, row by row: splats that reach it
+  std::vector<uint32_t> slot_base;  // per piece: slots of the splats before it
+  size_t across = 0;                // cells in a row
   size_t total = 0;                 // splats
 
   size_t pieces() const { return count.size(); }
-  // Gives up what only binning reads.
-  void drop_reach() {
-    depth = Buffer<float>();
-    reach = Buffer<Reach>();
-    spans.clear();
-  }
-  // A splat's slots, from its own first to the next one's.
-  uint32_t slot_begin(size_t k) const { return slot_base[k / kPiece] + slot[k]; }
-  uint32_t slot_end(size_t k) const {
-    return k % kPiece + 1 < count[k / kPiece] ? slot_begin(k + 1) : slot_base[k / kPiece + 1];
+  // What backward finds out about a splat in one cell has a slot; a splat's slots are next to each
+  // other, row by row.
+  size_t slot(size_t k) const { return size_t{slot_base[k / kPiece]} + splats[k].slot; }
+  size_t slot(size_t k, uint32_t row, uint32_t column) const {
+    const Reach& r = reach[k];
+    return slot(k) + size_t{row - r.y0} * r.cells_across() + (column - r.x0 / kCell);
   }
 };
 
@@ -159,32 +150,119 @@ inline void load_coefficients(const fragprune_inputs& in, const uint32_t* ids, i
 
 // ---- a piece ---------------------------------------------------------------------------------
 
+// Colours, of splats that are about to be blended. Until then inv_z is -1/z; it is 0 where colour or
+// features are beyond all bounds: such a splat draws nothing.
+class Colours {
+ public:
+  Colours(const Camera<float>& camera, const fragprune_inputs& in, Splat* splats)
+      : c_(lift<Lanes>(camera)), in_(in), splats_(splats), means_(in.means, in.count),
+        colors_(in.colors, in.count) {}
+
+  // Colours those of at most kBatch splats that have none. Several threads may do so with the same
+  // splat: each writes the same.
+  void fill(const uint32_t* which, int count) const {
+    uint32_t todo[kBatch];
+    int n = 0;
+    for (int i = 0; i < count; i++) {
+      todo[n] = which[i];
+      n += read(splats_[which[i]].brush.inv_z) < 0;
+    }
+    for (int i = 0; i < std::min(n, 2 * kLanes); i++) prefetch(splats_[todo[i]]);
+    for (int i = 0; i < n; i += kLanes) {
+      for (int k = i + 2 * kLanes; k < std::min(n, i + 3 * kLanes); k++) prefetch(splats_[todo[k]]);
+      colour(todo + i, std::min(kLanes, n - i));
+    }
+  }
+
+  // Asks for what fill() will read of a splat that has no colour yet.
+  void prefetch(const Splat& s) const {
+    if (!(read(s.brush.inv_z) < 0)) return;
+    const size_t id = s.id;
+    if (in_.means) __builtin_prefetch(in_.means + 3 * id);
+    if (!in_.sh) return;
+    const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
+    for (size_t k = 0; k < width; k += 16) __builtin_prefetch(in_.sh + id * width + k, 0, 2);
+  }
+
+  // A splat's colour and 1/z: r, g, b, inv_z.
+  static void get(const Splat& s, float* rgbz) {
+    rgbz[3] = read(s.brush.inv_z);
+    rgbz[0] = read(s.brush.r), rgbz[1] = read(s.brush.g), rgbz[2] = read(s.brush.b);
+  }
+
+ private:
+  static float read(const float& from) {
+    float v;
+    __atomic_load(&from, &v, __ATOMIC_ACQUIRE);
+    return v;
+  }
+  static void write(float& to, float v) { __atomic_store(&to, &v, __ATOMIC_RELEASE); }
+
+  void colour(const uint32_t* which, int count) const {
+    uint32_t ids[kLanes];
+    float depth[kLanes];
+    for (int lane = 0; lane < kLanes; lane++) {
+      const Splat& s = splats_[which[std::min(lane, count - 1)]];
+      ids[lane] = s.id;
+      depth[lane] = read(s.brush.inv_z);
+    }
+    const Lanes none = broadcast<Lanes>(0.f);
+    Vec<Lanes> colour;
+    if (in_.colors) {
+      colour = colors_.load(ids);
+    } else {
+      Lanes inv_length;
+      Harmonics<Lanes> h;
+      const int terms =
+          harmonics(in_.sh_degree, direction_to(c_, means_.load(ids), inv_length), h, false);
+      Coefficients coefficients;
+      load_coefficients(in_, ids, terms, coefficients);
+      colour = raw_colour(h, terms, coefficients);
+    }
+    const Lanes size = abs(colour.x) + abs(colour.y) + abs(colour.z);
+    uint32_t broken = ~bits(gt(broadcast<Lanes>(1e30f), size));
+    for (int lane = 0; in_.features && lane < count; lane++) broken |= has_wild(ids[lane]) << lane;
+    if (!in_.colors) colour = {max(colour.x, none), max(colour.y, none), max(colour.z, none)};
+    float r[kLanes], g[kLanes], b[kLanes];
+    store(r, colour.x), store(g, colour.y), store(b, colour.z);
+    for (int lane = 0; lane < count; lane++) {
+      Brush<float>& to = splats_[which[lane]].brush;
+      write(to.r, r[lane]), write(to.g, g[lane]), write(to.b, b[lane]);
+      write(to.inv_z, broken >> lane & 1 ? 0.f : abs(depth[lane]));
+    }
+  }
+
+  // Whether a Gaussian's features are beyond all bounds.
+  uint32_t has_wild(uint32_t id) const {
+    const float* row = in_.features + size_t{id} * in_.feature_count;
+    return !std::all_of(row, row + in_.feature_count, [](float v) { return abs(v) < 1e30f; });
+  }
+
+  const Camera<Lanes> c_;
+  const fragprune_inputs& in_;
+  Splat* splats_;
+  const Triples means_, colors_;
+};
+
 // Projects one piece.
 class Projector {
  public:
-  Projector(const Camera<float>& camera, const fragprune_inputs& in, int32_t* radii)
-      : c_(lift<Lanes>(camera)), in_(in), radii_(radii), means_(in.means, in.count),
-        colors_(in.colors, in.count) {}
+  Projector(const Camera<float>& camera, const fragprune_inputs& in, int32_t* radii,
+            const Colours& colours)
+      : c_(lift<Lanes>(camera)), in_(in), radii_(radii), colours_(colours),
+        many_(kManyLayers * static_cast<uint64_t>(camera.tiles_x * camera.tiles_y)) {}
 
-  // Fills piece k of the scene; returns how many tiles its splats reach.
-  uint64_t run(const Memory& scratch, Scene& scene, size_t k) const {
+  // Fills piece k of the scene.
+  void run(Scene& scene, size_t k) const {
     const size_t begin = k * kPiece;
     const size_t end = std::min(begin + kPiece, static_cast<size_t>(in_.count));
-    Place to{&scene.splats[begin], &scene.depth[begin], &scene.reach[begin], &scene.slot[begin],
-             Heap<Span>(scratch, 4 * kPiece), 0};
+    Place to{&scene.splats[begin], &scene.depth[begin], &scene.reach[begin], 0};
     for (size_t i = begin; i < end; i += kLanes)
       shape(i, std::min<size_t>(kLanes, end - i), to);
-    colour(to);
-    uint64_t slots = 0;
-    for (uint32_t j = 0; j < to.count; j++) {
-      const uint32_t mine = to.slot[j];
-      to.slot[j] = static_cast<uint32_t>(slots);
-      slots += mine;
-    }
-    add_rows(to, scene);
     scene.count[k] = to.count;
-    scene.spans[k] = std::move(to.spans);
-    return slots;
+    // Where few lie behind others they are coloured at once, in the order of the inputs: reading
+    // them in the order of depth takes twice as long. The piece stands for all.
+    if (count_cells(to, scene) * scene.pieces() < many_) colour(begin, to.count);
   }
 
  private:
@@ -192,26 +270,33 @@ class Projector {
     Splat* splats;
     float* depth;
     Reach* reach;
-    uint32_t* slot;  // tiles of each splat, until run adds them up
-    Heap<Span> spans;
     uint32_t count;
   };
 
-  // Adds a piece's spans to the totals of the rows, which all pieces share.
-  static void add_rows(const Place& from, Scene& scene) {
-    std::vector<Scene::RowTotal> mine(scene.rows.size(), Scene::RowTotal{0, 0});
+  void colour(size_t begin, uint32_t count) const {
+    uint32_t which[kBatch];
+    for (uint32_t j = 0; j < count; j += kBatch) {
+      const uint32_t n = std::min<uint32_t>(kBatch, count - j);
+      for (uint32_t i = 0; i < n; i++) which[i] = static_cast<uint32_t>(begin) + j + i;
+      colours_.fill(which, static_cast<int>(n));
+    }
+  }
+
+  // Adds a piece's splats to the cells' counts, which all pieces share; returns how many tiles are
+  // in their reach, added up.
+  static uint64_t count_cells(const Place& from, Scene& scene) {
+    std::vector<uint32_t> mine(scene.cells.size());
+    uint64_t tiles = 0;
     for (uint32_t j = 0; j < from.count; j++) {
-      const Reach& reach = from.reach[j];
-      for (uint32_t r = 0; r < reach.rows; r++) {
-        Scene::RowTotal& total = mine[reach.row + r];
-        total.spans++, total.tiles += from.spans.data()[reach.first + r].tiles();
-      }
+      const Reach reach = from.reach[j];
+      tiles += uint64_t{reach.x1 - reach.x0 + 1u} * (reach.y1 - reach.y0 + 1u);
+      for (size_t y = reach.y0; y <= reach.y1; y++)
+        for (size_t x = reach.x0 / kCell; x <= reach.x1 / size_t{kCell}; x++)
+          mine[y * scene.across + x]++;
     }
-    for (size_t r = 0; r < mine.size(); r++) {
-      if (!mine[r].spans) continue;
-      __atomic_fetch_add(&scene.rows[r].spans, mine[r].spans, __ATOMIC_RELAXED);
-      __atomic_fetch_add(&scene.rows[r].tiles, mine[r].tiles, __ATOMIC_RELAXED);
-    }
+    for (size_t c = 0; c < mine.size(); c++)
+      if (mine[c]) __atomic_fetch_add(&scene.cells[c], mine[c], __ATOMIC_RELAXED);
+    return tiles;
   }
 
   // Everything but colour, for `count` Gaussians from row i.
@@ -300,133 +385,43 @@ class Projector {
     std::copy(values, values + count, radii_ + i);
   }
 
-  // Appends those of the lanes that live and reach a tile.
+  // Appends those of the lanes that live and whose ellipse's box reaches a tile.
   void pack(size_t i, uint32_t living, const Brush<Lanes>& b, Lanes threshold, Lanes inv_opacity,
             Lanes z, const Bounds<Lanes>& bounds, Place& to) const {
-    alignas(64) float quads[3][kLanes][4];
-    const Lanes columns[3][4] = {{b.x, b.y, b.scale, b.skew},
-                                 {b.down, b.log_opacity, b.cut, b.list_cut},
-                                 {threshold, inv_opacity, z, z}};
-    for (int k = 0; k < 3; k++) store_rows(columns[k], [&](int lane) { return quads[k][lane]; });
+    const Lanes far = broadcast<Lanes>(1e9f), none = broadcast<Lanes>(0.f);
+    const Lanes half = span_end(bounds.ellipse, -far, far, broadcast<Lanes>(1.f));
+    const Lanes left = max(bounds.left, ceil(b.x - half));
+    const Lanes right = min(bounds.right, floor(b.x + half));
+    living &= bits(both(ge(bounds.bottom, bounds.top), ge(right, left)));
+    if (!living) return;
     constexpr float tile = 1.f / kTile;
-    const Lanes first_row = floor(bounds.top * tile);
-    const Lanes rows = floor(bounds.bottom * tile) - first_row + 1.f;
-    alignas(64) int32_t row[kLanes], height[kLanes];
-    store(row, to_int(first_row));
-    store(height, to_int(select(ge(bounds.bottom, bounds.top), rows, broadcast<Lanes>(0.f))));
-    int highest = 0;
-    for (uint32_t todo = living; todo; todo &= todo - 1)
-      highest = std::max(highest, height[__builtin_ctz(todo)]);
-    constexpr int kAtOnce = 32;  // rows of tiles; higher splats take theirs one by one
-    alignas(64) int32_t from[kAtOnce][kLanes], last[kAtOnce][kLanes];
-    for (int r = 0; r < std::min(highest, kAtOnce); r++) {
-      Lanes x0, x1;
-      span_of(bounds, first_row + static_cast<float>(r), x0, x1);
-      store(from[r], to_int(x0)), store(last[r], to_int(x1));
-    }
-    for (uint32_t todo = living; todo; todo &= todo - 1) {
-      const int lane = __builtin_ctz(todo);
-      const size_t before = to.spans.size();
-      uint32_t tiles = 0;
-      const auto push = [&](int x0, int x1) {
-        const Span span{static_cast<uint16_t>(x0), static_cast<uint16_t>(x1)};
-        to.spans.push(span);
-        tiles += span.tiles();
-      };
-      for (int r = 0; r < std::min(height[lane], kAtOnce); r++) push(from[r][lane], last[r][lane]);
-      if (height[lane] > kAtOnce) {
-        const Bounds<float> mine = lane_of(bounds, lane);
-        for (int r = kAtOnce; r < height[lane]; r++) {
-          float x0, x1;
-          span_of(mine, static_cast<float>(row[lane] + r), x0, x1);
-          push(static_cast<int>(x0), static_cast<int>(x1));
-        }
-      }
-      if (!tiles) {
-        to.spans.shrink(before);
-        continue;
-      }
+    alignas(64) int32_t box[4][kLanes];
+    store(box[0], to_int(left * tile)), store(box[1], to_int(bounds.top * tile));
+    store(box[2], to_int(right * tile)), store(box[3], to_int(bounds.bottom * tile));
+    alignas(64) float quads[4][kLanes][4];
+    const Lanes columns[4][4] = {{b.x, b.y, b.scale, b.skew},
+                                 {b.down, b.log_opacity, b.cut, b.list_cut},
+                                 {none, none, none, -1.f / z},
+                                 {threshold, threshold, inv_opacity, z}};
+    for (int k = 0; k < 4; k++) store_rows(columns[k], [&](int lane) { return quads[k][lane]; });
+    for (; living; living &= living - 1) {
+      const int lane = __builtin_ctz(living);
       const uint32_t j = to.count++;
       float* splat = reinterpret_cast<float*>(to.splats + j);
-      std::memcpy(splat, quads[0][lane], 16);
-      std::memcpy(splat + 4, quads[1][lane], 16);
+      for (int k = 0; k < 4; k++) std::memcpy(splat + 4 * k, quads[k][lane], 16);
       to.splats[j].id = static_cast<uint32_t>(i) + lane;
-      prefetch_colour(i + lane);
-      to.splats[j].threshold = quads[2][lane][0];
-      to.splats[j].inv_opacity = quads[2][lane][1];
-      to.depth[j] = quads[2][lane][2];
-      to.reach[j] = {static_cast<uint32_t>(before), static_cast<uint16_t>(row[lane]),
-                     static_cast<uint16_t>(height[lane])};
-      to.slot[j] = tiles;
+      to.depth[j] = quads[3][lane][3];
+      const auto edge = [&](int k) { return static_cast<uint16_t>(box[k][lane]); };
+      to.reach[j] = {edge(0), edge(1), edge(2), edge(3)};
     }
   }
 
-  static Bounds<float> lane_of(const Bounds<Lanes>& v, int lane) {
-    static_assert(sizeof(Bounds<Lanes>) == kLanes * sizeof(Bounds<float>), "numbers only");
-    Bounds<float> one;
-    float all[sizeof(Bounds<Lanes>) / sizeof(float)], *to = reinterpret_cast<float*>(&one);
-    std::memcpy(all, &v, sizeof v);
-    for (size_t k = 0; k < sizeof one / sizeof(float); k++) to[k] = all[k * kLanes + lane];
-    return one;
-  }
-
-  // Colour and 1/z of a piece's splats; those of no finite colour, or of features that are not,
-  // reach no tile any more.
-  void colour(Place& to) const {
-    for (uint32_t j = 0; j < to.count; j += kLanes) {
-      const int count = static_cast<int>(std::min<uint32_t>(kLanes, to.count - j));
-      uint32_t ids[kLanes];
-      float depth[kLanes];
-      for (int lane = 0; lane < kLanes; lane++) {
-        const uint32_t from = j + std::min(lane, count - 1);
-        ids[lane] = to.splats[from].id;
-        depth[lane] = to.depth[from];
-      }
-      const Lanes none = broadcast<Lanes>(0.f);
-      Vec<Lanes> colour;
-      if (in_.colors) {
-        colour = colors_.load(ids);
-      } else {
-        Lanes inv_length;
-        Harmonics<Lanes> h;
-        const int terms = harmonics(
-            in_.sh_degree, direction_to(c_, means_.load(ids), inv_length), h, false);
-        Coefficients coefficients;
-        load_coefficients(in_, ids, terms, coefficients);
-        colour = raw_colour(h, terms, coefficients);
-      }
-      const Lanes size = abs(colour.x) + abs(colour.y) + abs(colour.z);
-      uint32_t broken = ~bits(gt(broadcast<Lanes>(1e30f), size));
-      for (int lane = 0; in_.features && lane < count; lane++) broken |= has_wild(ids[lane]) << lane;
-      if (!in_.colors)
-        colour = {max(colour.x, none), max(colour.y, none), max(colour.z, none)};
-      const Lanes columns[4] = {colour.x, colour.y, colour.z, 1.f / load(depth)};
-      alignas(64) float quads[kLanes][4];
-      store_rows(columns, [&](int lane) { return quads[lane]; });
-      for (int lane = 0; lane < count; lane++) {
-        std::memcpy(reinterpret_cast<float*>(&to.splats[j + lane]) + 8, quads[lane], 16);
-        if (broken >> lane & 1) to.reach[j + lane].rows = 0, to.slot[j + lane] = 0;
-      }
-    }
-  }
-
-  // Whether a Gaussian's features are beyond all bounds.
-  uint32_t has_wild(uint32_t id) const {
-    const float* row = in_.features + size_t{id} * in_.feature_count;
-    return !std::all_of(row, row + in_.feature_count, [](float v) { return abs(v) < 1e30f; });
-  }
-
-  // Asks for what colour() will read of a splat: it comes while the piece's others are projected.
-  void prefetch_colour(size_t id) const {
-    if (!in_.sh) return;
-    const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
-    for (size_t k = 0; k < width; k += 16) __builtin_prefetch(in_.sh + id * width + k, 0, 2);
-  }
-
+  static constexpr uint64_t kManyLayers = 1024;  // splats whose reach covers a tile
   const Camera<Lanes> c_;
   const fragprune_inputs& in_;
   int32_t* radii_;
-  const Triples means_, colors_;
+  const Colours& colours_;
+  const uint64_t many_;
 };
 
 // What only binning reads lies in `scratch`.
@@ -436,24 +431,34 @@ inline Scene project_all(Team& team, const Memory& memory, const Memory& scratch
   Scene scene;
   scene.splats = Buffer<Splat>(memory, n);
   scene.depth = Buffer<float>(scratch, n);
-  scene.reach = Buffer<Reach>(scratch, n);
-  scene.slot = Buffer<uint32_t>(memory, n);
-  scene.spans.resize(pieces);
+  scene.reach = Buffer<Reach>(memory, n);
   scene.count.resize(pieces);
-  scene.slot_base.resize(pieces + 1);
-  scene.rows.resize(static_cast<size_t>(c.tiles_y));
-  std::vector<uint64_t> slots(pieces);
-  const Projector projector(c, in, radii);
-  team.each(pieces, 1, [&](size_t k, size_t) { slots[k] = projector.run(scratch, scene, k); });
-  uint64_t total = 0;
-  for (size_t k = 0; k < pieces; k++) {
-    scene.slot_base[k] = static_cast<uint32_t>(total);
-    scene.total += scene.count[k];
-    total += slots[k];
-    if (total > UINT32_MAX) throw std::length_error("tile lists");
-  }
-  scene.slot_base[pieces] = static_cast<uint32_t>(total);
+  scene.across = (static_cast<size_t>(c.tiles_x) + kCell - 1) / kCell;
+  scene.cells.resize(scene.across * static_cast<size_t>(c.tiles_y));
+  const Colours colours(c, in, scene.splats.data());
+  const Projector projector(c, in, radii, colours);
+  team.each(pieces, 1, [&](size_t k, size_t) { projector.run(scene, k); });
+  for (uint32_t count : scene.count) scene.total += count;
   return scene;
+}
+
+// Gives every splat that was coloured its slots; returns how many there are.
+inline size_t number_slots(Team& team, Scene& scene) {
+  std::vector<uint32_t> slots(scene.pieces());
+  team.each(scene.pieces(), 16, [&](size_t begin, size_t end) {
+    for (size_t piece = begin; piece < end; piece++)
+      for (size_t k = piece * kPiece; k < piece * kPiece + scene.count[piece]; k++) {
+        scene.splats[k].slot = slots[piece];
+        if (scene.splats[k].brush.inv_z > 0) slots[piece] += scene.reach[k].cells();
+      }
+  });
+  size_t total = 0;
+  scene.slot_base.clear();
+  for (uint32_t count : slots) {
+    scene.slot_base.push_back(static_cast<uint32_t>(total));
+    total += count;
+  }
+  return total;
 }
 
 }  // namespace fp

@@ -69,6 +69,7 @@ inline float min(float a, float b) { return a < b ? a : b; }
 inline float max(float a, float b) { return a > b ? a : b; }
 inline float abs(float a) { return std::fabs(a); }
 inline float sqrt(float a) { return std::sqrt(a); }
+inline float root(float a) { return sqrt(a); }
 inline float floor(float a) { return std::floor(a); }
 inline float ceil(float a) { return std::ceil(a); }
 inline bool ge(float a, float b) { return a >= b; }
@@ -129,6 +130,12 @@ inline IntLanes to_int(Lanes a) { return (IntLanes)_mm512_cvttps_epi32(a); }
 inline Lanes reciprocal(Lanes a) {
   const __m512 x = _mm512_rcp14_ps(a);
   return _mm512_fmadd_ps(x, _mm512_fnmadd_ps(a, x, _mm512_set1_ps(1.f)), x);
+}
+// The square root within rounding, likewise; a is not negative.
+inline Lanes root(Lanes a) {
+  const __m512 x = _mm512_rsqrt14_ps(_mm512_max_ps(a, _mm512_set1_ps(1e-30f)));
+  const __m512 s = a * x;
+  return _mm512_fmadd_ps(_mm512_fnmadd_ps(s, s, a), x * 0.5f, s);
 }
 inline Mask ge(Lanes a, Lanes b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
 inline Mask gt(Lanes a, Lanes b) { return _mm512_cmp_ps_mask(a, b, _CMP_GT_OQ); }
@@ -206,6 +213,7 @@ inline Lanes abs(Lanes a) {
 }
 inline IntLanes to_int(Lanes a) { return __builtin_convertvector(a, IntLanes); }
 inline Lanes reciprocal(Lanes a) { return broadcast<Lanes>(1.f) / a; }
+inline Lanes root(Lanes a) { return sqrt(a); }
 inline Mask gt(IntLanes a, IntLanes b) { return (Mask)(a > b); }
 inline Mask both(Mask a, Mask b) { return a & b; }
 inline Lanes where(Mask m, Lanes a) { return bits_as<Lanes>(bits_as<IntLanes>(a) & m); }
@@ -231,6 +239,23 @@ inline Lanes select(Mask m, Lanes a, Lanes b) {
 inline IntLanes increment(Mask m, IntLanes a) { return a - m; }
 
 #endif
+
+// Appends base + i for each bit i of the word, in order; returns the end. May write kLanes numbers
+// beyond it.
+inline int32_t* expand(uint64_t word, int32_t base, int32_t* end) {
+#if FP_LANES == 16
+  const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  for (int i = 0; i < 64; i += 16) {
+    const __mmask16 some = static_cast<__mmask16>(word >> i);
+    const __m512i place = _mm512_add_epi32(_mm512_set1_epi32(base + i), lane);
+    _mm512_storeu_si512(end, _mm512_maskz_compress_epi32(some, place));
+    end += __builtin_popcount(some);
+  }
+#else
+  for (; word; word &= word - 1) *end++ = base + __builtin_ctzll(word);
+#endif
+  return end;
+}
 
 // 2^x, relative error 1e-7, for x in -125 to 127; beyond, anything: the caller masks it.
 // Adding 1.5 * 2^23 rounds x to the nearest integer and leaves it in the low mantissa bits.

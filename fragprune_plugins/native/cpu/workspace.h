@@ -83,7 +83,7 @@ class Pool {
   // read would first have to find out where its page is.
   static constexpr size_t kLargePage = size_t{1} << 21;
   static size_t alignment_of(size_t size_class) {
-    return size_class >= 16 * kLargePage ? kLargePage : 64;
+    return size_class >= kLargePage ? kLargePage : 64;
   }
 
   static void* obtain(size_t size_class) {
@@ -167,11 +167,11 @@ class Heap {
  public:
   Heap() = default;
   Heap(const Memory& memory, size_t capacity) : memory_(memory), buffer_(memory, capacity) {}
-  void push(T value) {
-    if (size_ == buffer_.size()) grow();
-    buffer_[size_++] = value;
+  void append(const T* values, size_t n) {
+    while (size_ + n > buffer_.size()) grow();
+    std::copy(values, values + n, buffer_.data() + size_);
+    size_ += n;
   }
-  void shrink(size_t size) { size_ = size; }
   size_t size() const { return size_; }
   const T* data() const { return buffer_.data(); }
 
