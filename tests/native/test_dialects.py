@@ -262,3 +262,26 @@ def test_the_oracle_and_the_engine_take_the_same_footprints(engine: CpuEngine) -
     found = engine.rasterize(scene.with_counts(), None)
     assert (expected.fragments != found.fragments).sum() <= 4
     assert (expected.fragments_per_gaussian - found.fragments_per_gaussian).abs().sum() <= 4
+
+
+@pytest.mark.parametrize(
+    ("side", "dilation"), [(0.0315, 0.0), (0.0318, 0.0), (0.0589, 0.4), (0.1, 0.1), (0.5, 0.1)]
+)
+def test_mips_small_numbers_count_where_determinants_are_small(
+    engine: CpuEngine, side: float, dilation: float
+) -> None:
+    scene = scenes.one_splat(sigma=(side, side), opacity=0.99)
+    scene = replace(scene, compensation="mip", dilation=dilation)
+    found = []
+    for draws, case in (
+        (engine, scene),
+        (ReferenceEngine(), scenes.cast(scene, torch.float64)),
+    ):
+        made, leaves = scenes.leaves(case)
+        drawn = draws.rasterize(made.with_counts(), None)
+        assert (drawn.fragments.sum() > 0).item() is (side > 0.0316)
+        drawn.image[:, 8, 8].sum().backward()
+        alpha = drawn.alpha[0, 8, 8].item()
+        found.append([alpha, leaves["opacities"].grad.item(), leaves["scales"].grad[0, 0].item()])
+    # 1e-6 in a ratio of 2.4e-5 moves alpha by 2%.
+    assert found[0] == pytest.approx(found[1], rel=1e-3)
