@@ -8,7 +8,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines.frames import Device, Drawing, Wanted, learnable
-from fragprune_plugins.errors import InputError
+from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterOutputs
 
 if TYPE_CHECKING:
@@ -90,6 +90,7 @@ class CudaEngine:
         self._device = device
         self._deterministic, self._packed = deterministic, packed
         self._capacity = _FIRST_CAPACITY
+        self._captured: list[tuple[Drawing, int]] = []
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
@@ -135,6 +136,25 @@ class CudaEngine:
             deterministic = torch.are_deterministic_algorithms_enabled()
         how = {"deterministic": deterministic, "packed": self._packed}
         entries = drawing.draw(self._capacity, wanted, **how)
-        if entries > self._capacity:
+        if self._device.capturing():
+            self._captured.append((drawing, self._capacity))
+        elif entries > self._capacity:
             self._capacity = entries + entries // 4
             drawing.draw(self._capacity, wanted, **how)
+
+    def check(self) -> None:
+        """Look at the frames captured into graphs, after a replay; waits for the GPU.
+
+        Raises:
+            EngineError: the last replay of one found no room for its lists: its picture is void.
+        """
+        for drawing, capacity in self._captured:
+            entries = drawing.read()
+            if entries > capacity:
+                self._capacity = max(self._capacity, entries + entries // 4)
+                raise EngineError(
+                    "engine 'cuda'",
+                    f"{entries} entries in a captured frame's lists",
+                    f"at most {capacity}, what there was room for",
+                    "Capture the graph again: there is more room now.",
+                )

@@ -7,6 +7,7 @@ All memory is torch's and all work goes to torch's current stream. Nothing here 
 from __future__ import annotations
 
 import ctypes
+import math
 from typing import TYPE_CHECKING, Any, Final, Protocol, get_args
 
 import torch
@@ -172,6 +173,9 @@ class Device(Protocol):
         Asynchronous, on the current stream; ``arguments`` is copied before this returns.
         """
 
+    def capturing(self) -> bool:
+        """Whether the current stream records a graph, so that nothing can be read back."""
+
 
 class _Arena:
     """Named arrays in one tensor, each at a multiple of 256 bytes."""
@@ -224,7 +228,7 @@ class Drawing:
 
     Attributes:
         image: and the other outputs, as in ``RasterOutputs``.
-        evaluated: lanes spent on (Gaussian, pixel) pairs.
+        evaluated: lanes spent on (Gaussian, pixel) pairs; NaN until it is read.
     """
 
     image: Tensor
@@ -232,7 +236,7 @@ class Drawing:
     alpha: Tensor
     radii: Tensor
     fragments_per_pixel: Tensor
-    evaluated: int
+    evaluated: float
     features: Tensor | None = None
     fragments: Tensor | None = None
     fragments_per_gaussian: Tensor | None = None
@@ -376,15 +380,19 @@ class Drawing:
             self.weights_per_gaussian = (weights.double() * 2.0**-32).float()
         self._frame = frame if keep else None
         self._memory = (cleared, kept)
-        return self._read(found)
+        self._found = found
+        if self._device.capturing():
+            self.evaluated = math.nan
+            return 0
+        return self.read()
 
-    def _read(self, found: Tensor) -> int:
+    def read(self) -> int:
         """Waits for the GPU; entries of the lists.
 
         Raises:
             EngineError: what the kernels could not draw.
         """
-        _, entries, _, self.evaluated = map(int, found.tolist())
+        _, entries, _, self.evaluated = map(int, self._found.tolist())
         if entries > ENTRIES_MAX:
             raise EngineError(
                 "engine 'cuda'",

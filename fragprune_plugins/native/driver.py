@@ -81,6 +81,10 @@ class Driver:
             *(ctypes.addressof(parameters), 0),
         )
 
+    def capturing(self) -> bool:
+        """Whether the current stream records a graph."""
+        return bool(torch.cuda.is_current_stream_capturing())
+
     def _enter(self, index: int) -> None:
         """Makes torch's context current in this thread, which may never have met it."""
         with self._lock:

@@ -44,6 +44,7 @@ class EmulatedDevice:
         self.opened: dict[tuple[str, tuple[tuple[str, int], ...]], ctypes.CDLL] = {}
 
     kind = "cpu"
+    recording = False
 
     def launch(
         self,
@@ -61,6 +62,9 @@ class EmulatedDevice:
         )
         if status:
             raise RuntimeError(library.emulated_message().decode())
+
+    def capturing(self) -> bool:
+        return self.recording
 
     def _open(self, source: str, macros: dict[str, int]) -> ctypes.CDLL:
         key = (source, tuple(sorted(macros.items())))

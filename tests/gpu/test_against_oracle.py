@@ -7,6 +7,7 @@ place); threads run in another order each time a seed says so.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -170,6 +171,23 @@ def test_packed_pictures_are_off_by_no_more_than_half_precision(
     away = (whole.image - packed.image)[:, same].abs().max()
     assert 0 < away < 2**-11 * inputs.splats.colors.max()
     everything(CudaEngine(device, packed=True), inputs, thresholds)  # gradients take the whole
+
+
+def test_captured_frames_read_nothing_back_until_they_are_checked(
+    engine: CudaEngine, device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = scenes.random_scene(0)
+    expected = engine.rasterize(inputs, None)
+    monkeypatch.setattr(device, "recording", True)
+    found = engine.rasterize(inputs, None)
+    assert torch.equal(found.image, expected.image)
+    assert math.isnan(found.evaluated_per_pixel)
+    engine.check()
+    engine._capacity = 7
+    engine.rasterize(inputs, None)
+    with pytest.raises(EngineError, match="Capture the graph again"):
+        engine.check()
+    assert engine._capacity > 60
 
 
 def test_more_entries_than_can_be_counted_are_refused(

@@ -40,6 +40,7 @@ torch.cuda.init = lambda: None
 torch.cuda.current_device = lambda: 0
 torch.cuda.current_stream = lambda index: SimpleNamespace(cuda_stream=0)
 torch.cuda.get_device_capability = lambda index: (9, 0)
+torch.cuda.is_current_stream_capturing = lambda: False
 Driver.kind = "cpu"
 assert create_engine("auto", "cuda").name == "cuda"
 
