@@ -43,6 +43,8 @@ class _Redirect(TorchFunctionMode):
         kwargs = kwargs or {}
         if func is torch.Tensor.cuda:
             return args[0]
+        if func is torch.Tensor.get_device:  # hosts hand its number on to .to(), and -1 is none
+            return torch.device("cpu")
         if "device" in kwargs or len(args) > 1:
             args = tuple(_redirected(a) for a in args)
             kwargs = {k: _redirected(v) for k, v in kwargs.items()}

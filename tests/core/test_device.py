@@ -51,6 +51,12 @@ def test_cuda_methods_return_the_tensor_itself_as_on_a_gpu_they_would():
     assert module.weight.device.type == "cpu"
 
 
+def test_a_tensors_device_can_be_handed_on():
+    """Outside, its number is -1, and no tensor goes there."""
+    with cpu_only():
+        assert torch.ones(2).to(torch.zeros(1).get_device()).sum() == 2
+
+
 def test_values_that_only_look_like_devices_are_left_alone():
     with cpu_only():
         assert torch.nn.functional.pad(torch.ones(1, 2), (1, 1), mode="reflect").shape == (1, 4)
