@@ -33,7 +33,7 @@ class Case:
     adapter: HostAdapter
     driver: Host
     root: Path
-    examples: int = 20
+    examples: int = 10
     longest: int = 3
 
     @property
