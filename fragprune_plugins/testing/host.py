@@ -205,7 +205,7 @@ class Host:
             "clone": clone,
             "split": split,
             "densify and prune": densify_and_prune,
-            "reset opacity": lambda model, arguments, chance: model.reset_opacity(),
+            "reset opacity": reset_opacity,
             "another band": lambda model, arguments, chance: model.oneupSHdegree(),
             "restore": self.restore_from_file,
             "training setup": lambda model, arguments, chance: model.training_setup(arguments),
@@ -250,6 +250,12 @@ class Host:
     def restore(self, model: Any, captured: Any, arguments: Any) -> None:
         """Take it up again."""
         model.restore(captured, arguments)
+
+
+def reset_opacity(model: Any, arguments: Any, chance: Chance) -> None:
+    """Only once the optimizer has stepped: hosts fail before, and never do it so early."""
+    if model.optimizer.state:
+        model.reset_opacity()
 
 
 def prune(model: Any, arguments: Any, chance: Chance) -> None:
