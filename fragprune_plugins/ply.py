@@ -122,8 +122,8 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
     if missing == list(_DC):
         raise ModelFileError(
             str(path),
-            "Gaussians without colours, as Compact-3DGS saves them: activated, and the colours in a "
-            "network beside the PLY",
+            "Gaussians without colours, as codebases save them that keep colours in a network: "
+            "activated already",
             "a splat that holds its colours, before activation",
             "Fine-tune with fragprune run inside that host.",
         )
