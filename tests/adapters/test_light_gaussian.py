@@ -424,7 +424,7 @@ def test_a_teacher_is_drawn_with_its_own_thresholds_and_never_trained(mini):
         assert not torch.equal(host.store(student).logits, taught)
         with host.paused():
             assert not torch.equal(host.render(camera, teacher)["render"], pictures[0])
-        state = host._last_state
+        state = host.last_state
         assert state.store is host.store(student)
         assert list(state.baseline) == [camera.uid]  # copies of a camera are one view
 

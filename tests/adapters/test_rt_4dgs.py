@@ -390,7 +390,7 @@ def test_copies_of_a_camera_are_one_view(mini):
         model, camera = host.model(COUNT), host.camera()
         for iteration in (2, 3, 4):
             host.step(model, camera, iteration)
-        (state,) = host._models.values()
+        (state,) = host.models.values()
         assert list(state.drawn) == [camera.uid]
         assert len(host.curves) == 2
         import_module("scene")

@@ -78,7 +78,7 @@ def flat(value):
 def test_a_neutral_run_is_the_hosts_own_to_the_bit(photographs, tmp_path):
     alone = host_run(photographs, tmp_path / "alone", wrapped=False)
     ours = host_run(photographs, tmp_path / "ours", wrapped=True)
-    assert ours[3]._last_state.steps == 25  # it did follow
+    assert ours[3].last_state.steps == 25  # it did follow
     assert len(read_ply(tmp_path / "ours/point_cloud/iteration_25/point_cloud.ply").xyz) != 150
     assert ours[0] == alone[0]
     for one, other in zip(flat(ours[1]), flat(alone[1]), strict=True):

@@ -30,8 +30,8 @@ def neutral_is_the_host(case: Case) -> str:
         alone = _lifetime(host)
     with running(never.settings, schedule=never, freeze=False, **case.options()) as host:
         followed = _lifetime(host)
-        require(host._last_state is not None, "the session never saw the model")
-        require(host._last_state.steps == _STEPS, f"{host._last_state.steps} steps were counted")
+        require(host.last_state is not None, "the session never saw the model")
+        require(host.last_state.steps == _STEPS, f"{host.last_state.steps} steps were counted")
     _compare(alone, followed)
     pixels, gradients = _opened_changes_nothing(case)
     return f"{len(alone)} tensors after {_STEPS} steps; {pixels} pixels, {gradients} gradients"
