@@ -54,9 +54,10 @@ def measure(
 
     Returns:
         One dict a case and engine: scene, width, height, gaussians, pass, engine, threads,
-        truncated, fragments_per_pixel, evaluated_per_pixel, ms_median, ms_min, ms_se, stages
-        (medians in ms), peak_mb (beyond inputs and outputs; None where the system cannot tell),
-        difference (mean absolute, from the first engine's picture).
+        truncated, fragments_per_pixel, evaluated_per_pixel, ms_median, ms_min, ms_se,
+        ns_per_fragment (of the median; None where nothing is drawn), stages (medians in ms),
+        peak_mb (beyond inputs and outputs; None where the system cannot tell), difference (mean
+        absolute, from the first engine's picture).
     """
     jobs = [(case, engine, _prepare(case, engine)) for case in cases for engine in engines]
     times: list[list[float]] = [[] for _ in jobs]
@@ -82,6 +83,11 @@ def measure(
     results = []
     for index, (case, engine, _) in enumerate(jobs):
         first = last[index - index % len(engines)]
+        median, drawn = (
+            statistics.median(times[index]),
+            float(last[index].fragments_per_pixel.detach()),
+        )
+        fragments = drawn * case.view.width * case.view.height
         results.append(
             {
                 "scene": case.scene,
@@ -92,11 +98,12 @@ def measure(
                 "engine": engine.name,
                 "threads": torch.get_num_threads(),
                 "truncated": case.thresholds is not None,
-                "fragments_per_pixel": float(last[index].fragments_per_pixel.detach()),
+                "fragments_per_pixel": drawn,
                 "evaluated_per_pixel": last[index].evaluated_per_pixel,
-                "ms_median": statistics.median(times[index]),
+                "ms_median": median,
                 "ms_min": min(times[index]),
                 "ms_se": _standard_error(times[index]),
+                "ns_per_fragment": 1e6 * median / fragments if fragments else None,
                 "stages": {
                     name: statistics.median(part[name] for part in stages[index])
                     for name in stages[index][0]
@@ -130,6 +137,23 @@ def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, dic
                     "share": time_ratio / fragments,
                 }
     return found
+
+
+def scaling(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float] | None:
+    """How a fragment's price moves with Gaussians and pixels: untruncated, forward.
+
+    Returns:
+        least and most, ns per fragment, and their ratio; None for fewer than two such rows.
+    """
+    prices = [
+        r["ns_per_fragment"]
+        for r in results
+        if r["engine"] == engine and r["pass"] == "forward" and not r["truncated"]
+    ]
+    known = [price for price in prices if price is not None]
+    if len(known) < 2:
+        return None
+    return {"least": min(known), "most": max(known), "ratio": max(known) / min(known)}
 
 
 def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:

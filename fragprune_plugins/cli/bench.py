@@ -75,7 +75,7 @@ def command(
 
     import torch
 
-    from fragprune_plugins.bench.measure import Case, measure, translation
+    from fragprune_plugins.bench.measure import Case, measure, scaling, translation
     from fragprune_plugins.engines import create_engine
 
     set_threads(threads)
@@ -111,10 +111,11 @@ def command(
             key.split()[-1] if one_scene else key: saved["share"] for key, saved in share.items()
         },
         "saved": share,
+        "scaling": scaling(results, rasterizer.name),
         "peers": others,
         "machine": machine,
     }
-    return Report(data, _table(results, share, others, machine))
+    return Report(data, _table(data))
 
 
 def _scenes(
@@ -166,31 +167,33 @@ def _peers(
     return rows
 
 
-def _table(
-    results: list[dict[str, Any]],
-    share: dict[str, dict[str, float]],
-    others: list[dict[str, Any]],
-    machine: dict[str, Any],
-) -> str:
+def _table(data: dict[str, Any]) -> str:
+    results, others, machine = data["results"], data["peers"], data["machine"]
     lines = [
         f"{'scene':<16}{'size':>11}  {'pass':<17}{'cut':<5}{'frag/px':>8}{'tested':>8}"
-        f"{'median ms':>11}{'min':>9}{'±se':>7}{'peak MB':>9}"
+        f"{'median ms':>11}{'min':>9}{'±se':>7}{'ns/frag':>9}{'peak MB':>9}"
     ]
     for r in results:
         peak = "-" if r["peak_mb"] is None else f"{r['peak_mb']:.0f}"
+        price = "-" if r["ns_per_fragment"] is None else f"{r['ns_per_fragment']:.2f}"
         lines.append(
             f"{r['scene']:<16}{r['width']:>6}x{r['height']:<4}  {r['pass']:<17}"
             f"{'yes' if r['truncated'] else 'no':<5}{r['fragments_per_pixel']:>8.1f}"
             f"{r['evaluated_per_pixel']:>8.1f}{r['ms_median']:>11.2f}{r['ms_min']:>9.2f}"
-            f"{r['ms_se']:>7.2f}{peak:>9}"
+            f"{r['ms_se']:>7.2f}{price:>9}{peak:>9}"
         )
         if r["stages"]:
             parts = ", ".join(f"{name} {ms:.2f}" for name, ms in r["stages"].items())
             lines.append(f"{'':<29}{parts}")
-    for name, saved in share.items():
+    for name, saved in data["saved"].items():
         lines.append(
             f"{name}: {saved['fragments']:.2f}x fewer fragments, {saved['time']:.2f}x less time "
             f"({100 * saved['share']:.0f}% of it)"
+        )
+    if (prices := data["scaling"]) is not None:
+        lines.append(
+            f"a fragment costs {prices['least']:.2f} to {prices['most']:.2f} ns: "
+            f"{prices['ratio']:.1f}x from the cheapest scene and size to the dearest"
         )
     if others:
         lines.append("forward, SH degree 0, 8 bits from peers:")

@@ -19,7 +19,9 @@ SMALL = ("--size", "40x30", "--gaussians", 200, "--repeats", 2)
 
 def test_json_shape() -> None:
     found = run_json("bench", *SMALL, "--threads", 1)
-    assert set(found) == {"results", "translation", "saved", "peers", "machine"}
+    parts = {"results", "translation", "saved", "scaling", "peers", "machine"}
+    assert set(found) == parts
+    assert found["scaling"] is None  # one scene at one size
     assert len(found["results"]) == 4
     assert {row["scene"] for row in found["results"]} == {"bench-200"}
     assert {row["threads"] for row in found["results"]} == {1}
@@ -45,6 +47,13 @@ def test_every_size_and_count_forward_only() -> None:
     assert len(found["results"]) == 2 * 2 * 2
     assert {row["pass"] for row in found["results"]} == {"forward"}
     assert len(found["translation"]) == 4
+    plain = [row for row in found["results"] if not row["truncated"]]
+    prices = [
+        1e6 * row["ms_median"] / (row["fragments_per_pixel"] * row["width"] * row["height"])
+        for row in plain
+    ]
+    assert [row["ns_per_fragment"] for row in plain] == pytest.approx(prices)
+    assert found["scaling"]["ratio"] == pytest.approx(max(prices) / min(prices))
 
 
 def test_the_text_says_what_was_saved_and_how_busy_the_machine_was() -> None:
