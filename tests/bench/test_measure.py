@@ -28,6 +28,7 @@ ROW = {
     "ms_median",
     "ms_min",
     "ms_se",
+    "ns_per_fragment",
     "stages",
     "peak_mb",
     "difference",
