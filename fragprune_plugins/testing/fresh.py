@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from multiprocessing.connection import Connection
+from types import ModuleType
 from typing import Any
 
 from fragprune_plugins.plugins import GROUP
@@ -110,3 +111,5 @@ def _import(name: str, file: str) -> None:
         assert spec.loader is not None
         sys.modules[name] = module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
+        for end in (at for at, letter in enumerate(name) if letter == "."):  # pickle asks for them
+            sys.modules.setdefault(name[:end], ModuleType(name[:end]))

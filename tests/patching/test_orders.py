@@ -103,6 +103,9 @@ def write_modules(folder, seams: tuple[Seam, ...]) -> None:
         path = folder.joinpath(*name.split("."))
         path.mkdir(parents=True, exist_ok=True)
         (path / "__init__.py").write_text("\n".join(lines) + "\n")
+    for name in modules:  # packages, or an installed host of that name would come first
+        for parent in folder.joinpath(*name.split(".")).relative_to(folder).parents[:-1]:
+            (folder / parent / "__init__.py").touch()
 
 
 @pytest.mark.parametrize("order", [o for o in ORDERS if len(o) <= 3])

@@ -11,7 +11,7 @@ from native.sanitize.building import MEMORY, Toolchain
 def test_any_bytes_are_survived(toolchain: Toolchain) -> None:
     before = building.wrapper(toolchain, MEMORY)
     program = toolchain.program("fuzz/fuzz_target.cpp", "baseline", MEMORY)
-    limits = ["--inputs", "4000", "--seconds", "2"]
+    limits = ["--inputs", "1000", "--seconds", "20"]
     tally = building.run([*before, str(program), *limits], toolchain.folder)
     for kind in ("calls", "drew", "backward", "refused"):
         assert tally[kind] > 20, kind
