@@ -10,7 +10,7 @@ import torch
 from mini_splatting_host import LPIPS
 from miniature import rewrite
 
-from fragprune_plugins.testing.host import Chance, Host
+from fragprune_plugins.testing.host import Chance, Host, densify_and_prune
 
 args = SimpleNamespace()  # the hosts' scripts hold their options under this name
 
@@ -122,6 +122,10 @@ LP = {
             '        "gaussians_count": count,\n        "important_score": score,\n',
         ),
     ],
+    "scene/gaussian_model.py": [
+        ("def oneupSHdegree(self):", "def oneupSHdegree(self, opt, iteration):"),
+        ("extent, max_screen_size):", "extent, max_screen_size, n_split, opt=None):"),
+    ],
     "scene/__init__.py": [
         (
             "from scene.gaussian_model import GaussianModel\n",
@@ -139,6 +143,8 @@ LP = {
         ("import torch\n", "import torch\nimport wandb\n"),
         ("from scene import GaussianModel, Scene\n", "from scene import ModelPool, Scene\n"),
         ("GaussianModel(dataset", "ModelPool[args.prune_method](dataset"),
+        ("gaussians.oneupSHdegree()", "gaussians.oneupSHdegree(opt, iteration)"),
+        ("scene.cameras_extent, largest)", "scene.cameras_extent, largest, 1, opt=opt)"),
         (STEP, "            gaussians.prune_after_render(iteration, scene, pipe, render)\n" + STEP),
         (
             PARSE,
@@ -160,8 +166,8 @@ POOLED = """from scene.gaussian_model import GaussianModel
 
 
 class {name}(GaussianModel):
-    def oneupSHdegree(self):
-        super().oneupSHdegree()
+    def oneupSHdegree(self, opt, iteration):
+        super().oneupSHdegree(opt, iteration)
 
     def prune_after_render(self, iteration, scene, pipe, render):
         if iteration == 12:
@@ -186,7 +192,8 @@ class LPHost(Host):
                 name="MiniSplatting", score="bw_score"
             ),
             "scene/gaussian_model_rad_splat.py": POOLED.format(name="RadSplat", score="mw_score"),
-            "render.py": "def render_sets(dataset, iteration, pipe, skip_train, skip_test):\n"
+            "render.py": "from gaussian_renderer import render  # noqa: F401\n\n\n"
+            "def render_sets(dataset, iteration, pipe, skip_train, skip_test):\n"
             '    return {"train": 1.0, "test": 1.0}\n',
             "metrics.py": "def evaluate(model_paths):\n    return {p: {} for p in model_paths}\n",
             "lpipsPyTorch/__init__.py": LPIPS,
@@ -194,3 +201,10 @@ class LPHost(Host):
         for name, text in files.items():
             (root / name).parent.mkdir(exist_ok=True)
             (root / name).write_text(text)
+
+    def actions(self):
+        return {
+            **super().actions(),
+            "densify and prune": lambda *given: densify_and_prune(*given, 1),
+            "another band": lambda model, arguments, chance: model.oneupSHdegree(arguments, 1000),
+        }

@@ -281,8 +281,8 @@ def _densify(method: Any, model: Any, all_rows: float, chance: Chance) -> None:
     method(grads, 1 - chance.share, all_rows if chance.seed % 3 else 3.0)
 
 
-def densify_and_prune(model: Any, arguments: Any, chance: Chance) -> None:
-    """What the training loop calls: clone, split, then prune the faint and the large."""
+def densify_and_prune(model: Any, arguments: Any, chance: Chance, *more: Any) -> None:
+    """What the training loop calls, with more arguments: clone, split, prune faint and large."""
     n = len(model.get_xyz)
     model.xyz_gradient_accum = chance.uniform(n, 1)
     model.denom = chance.rows(n, 0.8)[:, None].float()
@@ -291,7 +291,7 @@ def densify_and_prune(model: Any, arguments: Any, chance: Chance) -> None:
     model.max_radii2D = 40 * chance.uniform(n)
     largest = 20 if chance.heads else None
     radii = [torch.ones(n)] if _takes_radii(model.densify_and_prune) else []
-    model.densify_and_prune(1 - chance.share, 0.005, 3.0, largest, *radii)
+    model.densify_and_prune(1 - chance.share, 0.005, 3.0, largest, *radii, *more)
 
 
 def _takes_radii(method: Any) -> bool:

@@ -13,7 +13,7 @@ import wrapt
 
 from fragprune_plugins import session as sessions
 from fragprune_plugins.device import cpu_only
-from fragprune_plugins.errors import SessionError
+from fragprune_plugins.errors import LateImportError, SessionError
 from fragprune_plugins.plugins import load_plugins
 from fragprune_plugins.seams import Seam
 from fragprune_plugins.session import Session
@@ -57,7 +57,7 @@ def off_is_off(case: Case, order: str) -> str:
                     import_module(seam.module)
                 originals = {seam: _pure(seam, active) for seam in case.seams}
             elif event == "A" and not active:
-                session.activate()
+                _activate(session, originals)
             elif event == "D":
                 findings = session.deactivate()  # harmless when inactive
                 require(not findings, f"{where}: {[str(f) for f in findings]}")
@@ -66,6 +66,23 @@ def off_is_off(case: Case, order: str) -> str:
                 ours = _found(seam) is not original
                 require(ours == active, f"{where}: {seam} is {'ours' if ours else 'its own'}")
     return f"{len(originals)} seams"
+
+
+def _activate(session: Session, originals: dict[Seam, Any]) -> bool:
+    """Whether it took hold: not where a seam's module holds another's function by name already."""
+    try:
+        session.activate()
+    except LateImportError as error:
+        modules = [sys.modules[seam.module] for seam in originals if not seam.external]
+        held = any(
+            vars(module).get(seam.attribute) is original
+            for seam, original in originals.items()
+            for module in modules
+            if module is not sys.modules[seam.module]
+        )
+        require(held, f"refused without cause: {error}")
+        return False
+    return True
 
 
 def _never_drawn(call: Any) -> Any:
@@ -120,7 +137,8 @@ def nothing_stays(case: Case) -> str:
                 torch.equal(host.render(camera, model)["render"], alone),
                 "deactivated, the host's picture is not its own",
             )
-        host.session.activate()
+        if not _activate(host.session, originals):
+            return f"{len(names)} stand-ins, activated once"
         try:
             host.session.activate()
         except SessionError:
