@@ -1,7 +1,9 @@
 """Fragment pressure: the weight lambda of drawn fragments per pixel in the loss.
 
-A fixed lambda transfers between scenes (1e-4 gave 1.6x fewer fragments on every set tried). To hit
-a target, a slow controller corrects lambda in the log domain; thresholds are a slow plant, so it
+A fixed lambda transfers between well trained scenes (1e-4 gave 1.6x fewer fragments on every set
+tried), not between losses: where a loss is several times larger, or shared by few fragments, it
+hardly cuts. The default therefore follows the loss per fragment, from that value up. To hit a
+target, a slow controller corrects lambda in the log domain; thresholds are a slow plant, so it
 starts from the known curve, waits before it trusts an error, and never integrates past its limits.
 """
 
@@ -15,7 +17,12 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from fragprune_plugins.thresholds import ThresholdStore
 
-DEFAULT_PRESSURE = 1e-4
+LEAST_PRESSURE = 1e-4
+"""What a loss per fragment too small to matter (an overfitted model's) gets by default."""
+
+ELASTICITY = 0.07
+"""By default a per cent of the fragments is worth this many per cent of the loss."""
+
 TARGET_TOLERANCE = 0.05
 """Relative distance from the target, in fragments per pixel, that counts as reached."""
 
@@ -25,8 +32,25 @@ CALIBRATE_AT = 0.85
 CALIBRATION_VIEWS = 24
 """Most training views that a calibration measures."""
 
-_CURVE_SPEEDUP = 1.62  # fragments before / after that DEFAULT_PRESSURE gives
+_CURVE_SPEEDUP = 1.62  # fragments before / after that LEAST_PRESSURE gives
 _CURVE_SLOPE = 0.22  # d ln(speedup) / d ln(lambda), measured between 1.45x and 2.6x
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A step that learned.
+
+    Attributes:
+        progress: share of the run that was over, 0 to 1.
+        fragments: drawn per pixel, mean over the step's views.
+        untruncated: the same views' before learning began.
+        loss: the photometric loss, without the pressure; NaN when not known.
+    """
+
+    progress: float
+    fragments: float
+    untruncated: float
+    loss: float
 
 
 class Pressure(Protocol):
@@ -34,23 +58,51 @@ class Pressure(Protocol):
 
     value: float
 
-    def observe(self, progress: float, ratio: float) -> None:
-        """Learn of one step.
-
-        Args:
-            progress: share of the run that is over, 0 to 1.
-            ratio: this view's drawn fragments, over those of the same view untruncated.
-        """
+    def observe(self, step: Observation) -> None:
+        """Learn of a step that is over."""
 
 
 @dataclass
 class FixedPressure:
     """The same lambda throughout."""
 
-    value: float = DEFAULT_PRESSURE
+    value: float
 
-    def observe(self, progress: float, ratio: float) -> None:
+    def observe(self, step: Observation) -> None:
         """A fixed pressure learns nothing."""
+
+
+@dataclass
+class ElasticPressure:
+    """A share of the loss per fragment: lambda = max(least, elasticity x loss / fragments).
+
+    Following it descends on ln(loss) + elasticity ln(fragments): the same pressure for a loss of
+    any scale, of pictures of any size, over any number of fragments.
+
+    Attributes:
+        value: lambda.
+        elasticity: per cents of the loss that a per cent of the fragments is worth.
+        least: lambda's lower end, and its value until a loss is known.
+        memory: steps over which loss and fragments are averaged, about a pass of the views.
+    """
+
+    value: float = LEAST_PRESSURE
+    elasticity: float = ELASTICITY
+    least: float = LEAST_PRESSURE
+    memory: int = 100
+    _steps: int = 0
+    _loss: float = 0.0
+    _fragments: float = 0.0
+
+    def observe(self, step: Observation) -> None:
+        """Average, over all steps at first; a loss that is not known, or not positive, is none."""
+        if not 0 < step.loss < math.inf:
+            return
+        self._steps += 1
+        weight = 1 / min(self._steps, self.memory)
+        self._loss += weight * (step.loss - self._loss)
+        self._fragments += weight * (step.fragments - self._fragments)
+        self.value = max(self.least, self.elasticity * self._loss / max(self._fragments, 1.0))
 
 
 @dataclass
@@ -66,16 +118,18 @@ class StepViews:
 
     expected: int = 1
     _fragments: list[float] = field(default_factory=list)
+    _untruncated: list[float] = field(default_factory=list)
     _losses: list[float] = field(default_factory=list)
 
     def begin(self) -> None:
         """A new step."""
-        self.expected = len(self._fragments) or self.expected
-        self._fragments, self._losses = [], []
+        self.expected = self.drawn or self.expected
+        self._fragments, self._untruncated, self._losses = [], [], []
 
-    def draw(self, fragments: float) -> None:
-        """A view was drawn with gradients, so many fragments per pixel."""
+    def draw(self, fragments: float, untruncated: float) -> None:
+        """A view was drawn with gradients: fragments per pixel, and those before learning."""
         self._fragments.append(fragments)
+        self._untruncated.append(untruncated)
         self._losses.append(math.nan)
 
     def lose(self, loss: float) -> None:
@@ -83,9 +137,19 @@ class StepViews:
         self._losses[-1:] = [loss]
 
     @property
+    def drawn(self) -> int:
+        """Views so far."""
+        return len(self._fragments)
+
+    @property
     def fragments(self) -> float:
         """Per pixel, the mean over the views so far."""
         return sum(self._fragments) / len(self._fragments)
+
+    @property
+    def untruncated(self) -> float:
+        """Per pixel before learning, likewise."""
+        return sum(self._untruncated) / len(self._untruncated)
 
     @property
     def loss(self) -> float:
@@ -116,24 +180,24 @@ class PressureController:
     ) -> None:
         self.target = target
         self.warmup, self.period, self.gain = warmup, period, gain
-        start = DEFAULT_PRESSURE * (target / _CURVE_SPEEDUP) ** (1 / _CURVE_SLOPE)
+        start = LEAST_PRESSURE * (target / _CURVE_SPEEDUP) ** (1 / _CURVE_SLOPE)
         self._log_range = (math.log(start / reach), math.log(start * reach))
         self.value = start
         self._next = warmup
         self._sum = 0.0
         self._count = 0
 
-    def observe(self, progress: float, ratio: float) -> None:
+    def observe(self, step: Observation) -> None:
         """Average log ratios over one period, then correct lambda once."""
-        self._sum += math.log(max(ratio, 1e-6))
+        self._sum += math.log(max(step.fragments / max(step.untruncated, 1e-9), 1e-6))
         self._count += 1
-        if progress < self._next:
+        if step.progress < self._next:
             return
         error = math.log(self.target) + self._sum / self._count  # > 0: not enough truncated yet
-        step = max(-math.log(2), min(math.log(2), self.gain * error / _CURVE_SLOPE))
+        change = max(-math.log(2), min(math.log(2), self.gain * error / _CURVE_SLOPE))
         low, high = self._log_range
-        self.value = math.exp(max(low, min(high, math.log(self.value) + step)))
-        self._next = progress + self.period
+        self.value = math.exp(max(low, min(high, math.log(self.value) + change)))
+        self._next = step.progress + self.period
         self._sum, self._count = 0.0, 0
 
 

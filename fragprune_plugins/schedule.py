@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.pressure import (
-    DEFAULT_PRESSURE,
+    ElasticPressure,
     FixedPressure,
     Pressure,
     PressureController,
@@ -27,7 +27,8 @@ class Settings:
     Attributes:
         iterations: optimizer steps of stage 2.
         train: what moves beside the thresholds: "opacity", "appearance" (opacity and SH) or "all".
-        pressure: lambda, weight of drawn fragments per pixel in the loss.
+        pressure: lambda, weight of drawn fragments per pixel in the loss; None for one that
+            follows the loss per fragment.
         target_speedup: fragments before over after to steer for; overrides pressure.
         threshold_lr: initial learning rate of threshold logits.
         opacity_lr: initial learning rate of opacity logits in stage 2.
@@ -37,7 +38,7 @@ class Settings:
 
     iterations: int = FINETUNE_ITERATIONS
     train: Train = "opacity"
-    pressure: float = DEFAULT_PRESSURE
+    pressure: float | None = None
     target_speedup: float | None = None
     threshold_lr: float = 0.05
     opacity_lr: float = 0.01
@@ -47,7 +48,7 @@ class Settings:
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise UsageError("iterations", str(self.iterations), "1 or more", "Raise --iters.")
-        if not 0 <= self.pressure < 1:
+        if self.pressure is not None and not 0 <= self.pressure < 1:
             raise UsageError(
                 "pressure", f"{self.pressure:g}", "0 <= X < 1 (1e-4 is usual)", "Change --pressure."
             )
@@ -69,7 +70,7 @@ class Settings:
             return FixedPressure(0.0)
         if self.target_speedup is not None:
             return PressureController(self.target_speedup)
-        return FixedPressure(self.pressure)
+        return ElasticPressure() if self.pressure is None else FixedPressure(self.pressure)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.pressure import DEFAULT_PRESSURE
+from fragprune_plugins.pressure import ELASTICITY, LEAST_PRESSURE
 from fragprune_plugins.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
 
 _OPTIONS = (
@@ -28,7 +28,8 @@ _OPTIONS = (
     click.option(
         "--pressure",
         type=float,
-        help=f"Weight of drawn fragments per pixel in the loss; default {DEFAULT_PRESSURE:g}.",
+        help=f"Weight of drawn fragments per pixel in the loss; default {ELASTICITY:g} of the loss "
+        f"per fragment, {LEAST_PRESSURE:g} or more.",
     ),
     click.option("--target-speedup", type=float, help="Steer for this many times fewer fragments."),
     click.option(
@@ -76,7 +77,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
         settings = Settings(
             iterations=default if iters is None else iters,
             train=train,
-            pressure=DEFAULT_PRESSURE if pressure is None else pressure,
+            pressure=pressure,
             target_speedup=target_speedup,
             truncate=not control,
             seed=kwargs.get("seed", 0),

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import replacing, writable_folder
-from fragprune_plugins.pressure import DEFAULT_PRESSURE
 
 if TYPE_CHECKING:
     from fragprune_plugins.launch import RunOptions, RunSummary
@@ -39,7 +38,7 @@ class DemoSettings:
     Attributes:
         iterations: of the host's own training.
         finetune: iterations of stage 2.
-        pressure: weight of drawn fragments per pixel.
+        pressure: weight of drawn fragments per pixel; None for the default.
         seed: of the scene and of the training.
         engine: what rasterizes.
         scene: the photographs.
@@ -47,7 +46,7 @@ class DemoSettings:
 
     iterations: int = 2000
     finetune: int = 1000
-    pressure: float = DEFAULT_PRESSURE
+    pressure: float | None = None
     seed: int = 0
     engine: str = "auto"
     scene: SceneSettings = field(default_factory=SceneSettings)

@@ -20,15 +20,17 @@ from fragprune_plugins.files import replacing, writable_folder
 from fragprune_plugins.finetuning.dataset import Dataset, Shot
 from fragprune_plugins.finetuning.losses import photometric_loss
 from fragprune_plugins.ply import SplatFile, write_ply
-from fragprune_plugins.pressure import TARGET_TOLERANCE, calibrate
+from fragprune_plugins.pressure import (
+    CALIBRATE_AT,
+    CALIBRATION_VIEWS,
+    TARGET_TOLERANCE,
+    Observation,
+    calibrate,
+)
 from fragprune_plugins.schedule import Schedule, Settings
 from fragprune_plugins.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 
-CALIBRATE_AT = 0.85
-"""Share of the run after which a target is met by a uniform shift; then opacities alone adapt."""
-
-CALIBRATION_VIEWS = 24
 RECORDS = 100
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
@@ -292,7 +294,9 @@ class _Run:
         self.optimizer.zero_grad(set_to_none=True)
         if learn:
             self.store.step(plan.threshold_lr)
-            self.pressure.observe(plan.progress, drawn / max(self._baseline(shot), 1e-9))
+            self.pressure.observe(
+                Observation(plan.progress, drawn, self._baseline(shot), float(loss.detach()))
+            )
         self.step += 1
         self._recent.append((float(loss.detach()), drawn))
 

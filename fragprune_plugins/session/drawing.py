@@ -142,8 +142,7 @@ def press(session: Session, state: ModelState, view: int, outputs: RasterOutputs
     plan = state.plan
     assert plan is not None
     fragments = state.drawn[view] = state.last_drawn
-    state.step_views.draw(fragments)
-    session.pressure.observe(plan.progress, fragments / max(state.baseline[view], 1e-9))
+    state.step_views.draw(fragments, state.baseline[view])
     state.stats = StepStats(
         step=state.steps - session.from_step,
         fragments_per_pixel=state.step_views.fragments,

@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from fragprune_plugins.pressure import CALIBRATE_AT, CALIBRATION_VIEWS, calibrate
+from fragprune_plugins.pressure import (
+    CALIBRATE_AT,
+    CALIBRATION_VIEWS,
+    Observation,
+    calibrate,
+)
 from fragprune_plugins.seams import Role, Seam
 from fragprune_plugins.session.state import ModelState, named
 from fragprune_plugins.thresholds import ThresholdStore
@@ -123,6 +128,7 @@ def on_step(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, k
 def begin_step(session: Session, model: Any, state: ModelState) -> None:
     """Count a step; freeze, open or calibrate as the schedule has it."""
     session.report(state)
+    observe_step(session, state)
     state.step_views.begin()
     state.begun = True
     state.steps += 1
@@ -136,6 +142,15 @@ def begin_step(session: Session, model: Any, state: ModelState) -> None:
     if state.plan and state.plan.learn and session.settings.truncate:
         state.store.open(session.adapter.opacities(model))
         meet_target(session, state)
+
+
+def observe_step(session: Session, state: ModelState) -> None:
+    """The pressure learns of the step that is over, once it is known whole."""
+    views = state.step_views
+    if state.plan is not None and views.drawn:
+        session.pressure.observe(
+            Observation(state.plan.progress, views.fragments, views.untruncated, views.loss)
+        )
 
 
 def meet_target(session: Session, state: ModelState) -> None:

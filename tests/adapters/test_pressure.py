@@ -7,6 +7,7 @@ import torch
 from miniature import joint, running
 
 from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.pressure import ELASTICITY, LEAST_PRESSURE
 from fragprune_plugins.schedule import Settings
 
 
@@ -102,3 +103,17 @@ def test_a_step_of_several_views_feels_the_mean_of_their_pressures():
             sum(host.curves[i]["loss"] for i in (1, 3, 5)) / 3, rel=1e-5
         )
         assert len(single) == 2
+
+
+def test_the_default_pressure_follows_the_hosts_loss_per_fragment():
+    with joint(Settings(iterations=9)) as host:
+        model, camera = host.model(40), host.camera()
+        for iteration in range(1, 6):
+            host.step(model, camera, iteration)
+        host.finish()
+        before, now = host.curves[:-1], host.curves[-1]
+    loss = sum(step["loss"] for step in before) / len(before)
+    fragments = sum(step["fragments_per_pixel"] for step in before) / len(before)
+    assert len(before) == 4
+    assert now["pressure"] == pytest.approx(ELASTICITY * loss / max(fragments, 1.0))
+    assert now["pressure"] > LEAST_PRESSURE

@@ -5,7 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.pressure import FixedPressure, PressureController
+from fragprune_plugins.pressure import (
+    ELASTICITY,
+    LEAST_PRESSURE,
+    ElasticPressure,
+    FixedPressure,
+    Observation,
+    PressureController,
+)
 from fragprune_plugins.schedule import JointSchedule, Schedule, Settings
 
 
@@ -60,6 +67,7 @@ def test_settings_out_of_range_are_usage_errors(wrong):
 
 
 def test_settings_choose_their_pressure():
+    assert Settings().make_pressure() == ElasticPressure()
     assert Settings(pressure=3e-4).make_pressure() == FixedPressure(3e-4)
     assert isinstance(Settings(target_speedup=1.8).make_pressure(), PressureController)
     assert Settings(truncate=False, target_speedup=1.8).make_pressure() == FixedPressure(0.0)
@@ -68,8 +76,38 @@ def test_settings_choose_their_pressure():
 def test_a_fixed_pressure_stays():
     pressure = FixedPressure(2e-4)
     for step in range(10):
-        pressure.observe(step / 10, 0.5)
+        pressure.observe(Observation(step / 10, fragments=10, untruncated=20, loss=0.5))
     assert pressure.value == 2e-4
+
+
+def observed(losses, fragments):
+    """The default pressure after steps of these losses and fragments."""
+    pressure = ElasticPressure()
+    for loss, drawn in zip(losses, fragments, strict=True):
+        pressure.observe(Observation(0.5, drawn, 99.0, loss))
+    return pressure.value
+
+
+@given(st.floats(1e-3, 10), st.floats(1, 200), st.floats(0.1, 10))
+def test_the_default_pressure_is_a_share_of_the_loss_per_fragment(loss, fragments, scale):
+    value = observed([loss] * 3, [fragments] * 3)
+    assert value == pytest.approx(max(LEAST_PRESSURE, ELASTICITY * loss / fragments))
+    if value > LEAST_PRESSURE < scale * value:
+        assert observed([loss * scale] * 3, [fragments] * 3) == pytest.approx(value * scale)
+
+
+def test_the_default_pressure_averages_views_and_skips_losses_that_are_none():
+    expected = ELASTICITY * (0.2 + 0.4) / (10 + 30)
+    assert observed([0.2, 0.4], [10.0, 30.0]) == pytest.approx(expected)
+    none = [float("nan"), float("inf"), 0.0, -1.0]
+    assert observed([0.2, *none, 0.4], [10.0, 1, 1, 1, 1, 30.0]) == pytest.approx(expected)
+    assert observed(none, [9.0] * 4) == LEAST_PRESSURE
+
+
+def test_the_default_pressure_follows_a_loss_that_falls():
+    assert observed([1.0] * 100 + [0.1] * 600, [20.0] * 700) == pytest.approx(
+        ELASTICITY * 0.1 / 20, rel=0.05
+    )
 
 
 @pytest.mark.parametrize(("ratio", "direction"), [(1.0, 1), (0.1, -1)])
@@ -77,9 +115,9 @@ def test_a_controller_waits_then_moves_the_right_way_and_within_its_reach(ratio,
     pressure = PressureController(1.8)
     start = pressure.value
     for step in range(15):
-        pressure.observe(step / 100, ratio)
+        pressure.observe(Observation(step / 100, 40 * ratio, 40, loss=0.1))
     assert pressure.value == start  # warm-up
     for step in range(15, 100):
-        pressure.observe(step / 100, ratio)
+        pressure.observe(Observation(step / 100, 40 * ratio, 40, loss=0.1))
     assert (pressure.value > start) == (direction > 0)
     assert start / 60.0001 <= pressure.value <= start * 60.0001
