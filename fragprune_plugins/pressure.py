@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 LEAST_PRESSURE = 1e-4
 """What a loss per fragment too small to matter (an overfitted model's) gets by default."""
 
-ELASTICITY = 0.07
+ELASTICITY = 0.1
 """By default a per cent of the fragments is worth this many per cent of the loss."""
 
 TARGET_TOLERANCE = 0.05
