@@ -17,7 +17,7 @@ from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.seams import Role, Seam
 from fragprune_plugins.session.files import adopt
 from fragprune_plugins.session.learning import begin_step
-from fragprune_plugins.session.state import ModelState, StepStats, named
+from fragprune_plugins.session.state import ModelState, Picture, StepStats, named
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 if TYPE_CHECKING:
@@ -124,25 +124,26 @@ def rasterize(
     part: int = 0,
 ) -> RasterOutputs:
     """With thresholds; learning, with the fragment pressure in the loss."""
-    view = hash((view, part)) if part else view
+    picture = view, part
     engine = session.engine(inputs.splats.device)
     outputs = engine.rasterize(inputs, thresholds)
-    state.last_drawn = float(outputs.fragments_per_pixel.detach())
-    if torch.is_grad_enabled() and state.plan is not None and state.plan.learn:
-        if view not in state.baseline:
-            with torch.no_grad():
-                untruncated = engine.rasterize(inputs, None)
-            state.baseline[view] = float(untruncated.fragments_per_pixel)
-        outputs = press(session, state, view, outputs)
-    return outputs
+    learns = torch.is_grad_enabled() and state.plan is not None and state.plan.learn
+    if learns and picture not in state.baseline:
+        with torch.no_grad():
+            untruncated = engine.rasterize(inputs, None)
+        state.baseline[picture] = float(untruncated.fragments_per_pixel)
+    if picture in state.baseline:
+        state.drawn[picture] = float(outputs.fragments_per_pixel.detach())
+    return press(session, state, picture, outputs) if learns else outputs
 
 
-def press(session: Session, state: ModelState, view: int, outputs: RasterOutputs) -> RasterOutputs:
+def press(
+    session: Session, state: ModelState, picture: Picture, outputs: RasterOutputs
+) -> RasterOutputs:
     """Put the fragment pressure into the host's loss and keep this step's figures."""
     plan = state.plan
     assert plan is not None
-    fragments = state.drawn[view] = state.last_drawn
-    state.step_views.draw(fragments, state.baseline[view])
+    state.step_views.draw(state.drawn[picture], state.baseline[picture])
     state.stats = StepStats(
         step=state.steps - session.from_step,
         fragments_per_pixel=state.step_views.fragments,

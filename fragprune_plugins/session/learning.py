@@ -159,17 +159,16 @@ def meet_target(session: Session, state: ModelState) -> None:
     due = progress >= 1.0 or (progress >= CALIBRATE_AT and not state.held)
     if target is None or not due or not state.baseline:
         return
-    views = sorted(state.baseline.keys() & state.views.keys())
+    views = sorted({view for view, _ in state.baseline} & state.views.keys())
     views = views[:: -(-len(views) // CALIBRATION_VIEWS)]
-    before = sum(state.baseline[view] for view in views)
+    pictures = [picture for picture in state.baseline if picture[0] in views]
+    before = sum(state.baseline[picture] for picture in pictures)
 
     @torch.no_grad()
     def speedup() -> float:
-        drawn = 0.0
         for view in views:
             state.views[view]()
-            drawn += state.last_drawn
-        return before / max(drawn, 1e-9)
+        return before / max(sum(state.drawn[picture] for picture in pictures), 1e-9)
 
     calibrate(state.store, speedup, target)
     state.held = True

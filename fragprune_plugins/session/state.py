@@ -15,6 +15,9 @@ from fragprune_plugins.pressure import StepViews
 from fragprune_plugins.schedule import StepPlan
 from fragprune_plugins.thresholds import ThresholdStore
 
+Picture = tuple[int, int]
+"""A view, and which of its cameras: some hosts draw several in one call."""
+
 
 @dataclass(frozen=True)
 class PopulationChange:
@@ -80,10 +83,9 @@ class ModelState:
     pending_parents: Tensor | None = None
     prepared: bool = False
     base_rates: dict[str, float] = field(default_factory=dict)
-    baseline: dict[int, float] = field(default_factory=dict)  # view -> untruncated fragments/px
-    drawn: dict[int, float] = field(default_factory=dict)  # view -> fragments/px, last visit
+    baseline: dict[Picture, float] = field(default_factory=dict)  # untruncated fragments/px
+    drawn: dict[Picture, float] = field(default_factory=dict)  # fragments/px, last visit
     views: dict[int, Callable[[], Any]] = field(default_factory=dict)  # view -> its last render
-    last_drawn: float = 0.0
     step_views: StepViews = field(default_factory=StepViews)
     held: bool = False  # thresholds met their target and stay
     loaded: weakref.ReferenceType[Any] | None = None  # the means a sidecar's thresholds came with
@@ -100,6 +102,6 @@ def named(function: Any, args: Any, kwargs: Any) -> dict[str, Any]:
     return {"self": getattr(function, "__self__", None), **bound.arguments}
 
 
-def mean(figures: dict[int, float]) -> float | None:
+def mean(figures: dict[Picture, float]) -> float | None:
     """Of the figures, or None."""
     return sum(figures.values()) / len(figures) if figures else None

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from miniature import joint, running
 
 from fragprune_plugins.hookspecs import hookimpl
+from fragprune_plugins.lineage import GraphdecoDialect
 from fragprune_plugins.pressure import ELASTICITY, LEAST_PRESSURE
 from fragprune_plugins.schedule import Settings
+from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
 class Notes:
@@ -64,6 +68,54 @@ def test_more_pressure_means_fewer_fragments():
                 host.step(model, camera, iteration)
             drawn.append(host.finish().fragments_after)
     assert drawn[1] < 0.8 * drawn[0]
+
+
+class Enlarging(GraphdecoDialect):
+    """Every call draws its view three times, ever closer, and answers with their mean."""
+
+    def answer(self, call, inputs, draw):
+        views = [
+            replace(inputs.view, tan_fov_x=inputs.view.tan_fov_x / n, projmatrix=zoom(inputs, n))
+            for n in (1, 2, 4)
+        ]
+        drawn = [draw(replace(inputs, view=view), part) for part, view in enumerate(views)]
+        picture = torch.stack([each.image for each in drawn]).mean(dim=0)
+        return self.pack(replace(drawn[0], image=picture), call)
+
+
+def zoom(inputs, times):
+    return inputs.view.projmatrix @ torch.diag(torch.tensor([float(times), 1.0, 1.0, 1.0]))
+
+
+class EnlargingHost(Vanilla3DGS):
+    def dialect(self, repo):
+        return Enlarging(**vars(super().dialect(repo)))
+
+
+@pytest.mark.parametrize("adapter", [Vanilla3DGS(), EnlargingHost()], ids=["one", "three"])
+def test_a_target_is_met_over_all_pictures_of_all_views(adapter):
+    settings = Settings(iterations=12, target_speedup=1.6, threshold_lr=0.3, opacity_lr=1e-6)
+    with running(settings, adapter=adapter) as host:
+        model, cameras = host.model(40), [host.camera(), host.camera(side=0.5)]
+        for iteration in range(1, 13):
+            host.step(model, cameras[iteration % 2], iteration)
+        counts = []
+        engine = host.engine(torch.device("cpu"))
+        rasterize, store = engine.rasterize, host.store(model)
+
+        def counting(inputs, thresholds):
+            pair = [rasterize(inputs, each).fragments_per_pixel for each in (None, store.values)]
+            counts.append(torch.stack(pair).detach())
+            return rasterize(inputs, thresholds)
+
+        engine.rasterize = counting
+        with torch.no_grad():
+            for camera in cameras:
+                host.render(camera, model)
+        summary = host.finish()
+    before, after = torch.stack(counts).sum(dim=0).tolist()
+    assert before / after == pytest.approx(1.6, rel=0.015)  # a calibration ends within 0.01
+    assert summary.target_reached
 
 
 def gradients(host, model, cameras, iteration):

@@ -52,7 +52,10 @@ def cameras(count: int = 1):
 def draw(params, count: int = 1, **options):
     import gsplat
 
+    viewmats, Ks = cameras(count)
     given = {
+        "viewmats": viewmats,
+        "Ks": Ks,
         "means": params["means"],
         "quats": params["quats"],
         "scales": params["scales"].exp(),
@@ -61,10 +64,7 @@ def draw(params, count: int = 1, **options):
         "sh_degree": 1,
         "packed": False,
     }
-    viewmats, Ks = cameras(count)
-    return gsplat.rasterization(
-        viewmats=viewmats, Ks=Ks, width=WIDTH, height=HEIGHT, **{**given, **options}
-    )
+    return gsplat.rasterization(width=WIDTH, height=HEIGHT, **{**given, **options})
 
 
 def brute(params, K, viewmat, *, antialiased: bool = False):
@@ -268,6 +268,44 @@ def test_stage_2_moves_opacities_and_thresholds_alone(session_on, kind):
         summary = session.finish()
         assert (summary.steps, summary.gaussians) == (8, 40)
         assert summary.fragments_after < summary.fragments_before
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
+    """The cameras see ever less, so that no one of them could speak for all."""
+    settings = Settings(iterations=8, threshold_lr=0.3, target_speedup=1.5)
+    with session_on(Gsplat(), settings=settings) as session:
+        from gsplat import DefaultStrategy
+
+        params, optimizers = model()
+        DefaultStrategy().check_sanity(params, optimizers)
+        viewmats, Ks = cameras(count)
+        viewmats[:, 2, 3] *= torch.arange(count) * 4 + 1
+
+        def picture():
+            return draw(params, viewmats=viewmats, Ks=Ks)[0]
+
+        engine, counts = session.engine(torch.device("cpu")), []
+        for _ in range(8):
+            picture().mean().backward()
+            optimizers["opacities"].step()
+            params["opacities"].grad = None
+        rasterize = engine.rasterize
+
+        def counting(inputs, thresholds):
+            pair = [rasterize(inputs, each).fragments_per_pixel for each in (None, thresholds)]
+            counts.append(torch.stack(pair).detach())
+            return rasterize(inputs, thresholds)
+
+        engine.rasterize = counting
+        with torch.no_grad():
+            picture()
+        assert len(counts) == count
+        before, after = torch.stack(counts).sum(dim=0).tolist()
+        summary = session.finish()
+    assert before / after == pytest.approx(1.5, rel=0.03)  # 0.01, and opacities moved since
+    assert summary.target_reached
+    assert summary.fragments_before / summary.fragments_after == pytest.approx(1.5, rel=0.01)
 
 
 def test_thresholds_go_through_a_file_beside_ones_own_checkpoint(unmoved, tmp_path):
