@@ -207,16 +207,15 @@ class _Runner:
 
     def joint(self) -> None:
         """Thresholds learn beside everything else."""
-        total = self._iterations()
-        start = self.options.from_iter if self.options.from_iter is not None else total // 2
-        settings = _with_iterations(self.options.settings, total - self.host.line.skipped)
-        schedule = JointSchedule(settings, start, self.options.alternate)
-        resumed = self.host.flags.resume
+        resumed, start, total = self._learning(self.options.from_iter)
+        steps = total - resumed - self.host.line.skipped
+        settings = _with_iterations(self.options.settings, steps)
+        schedule = JointSchedule(settings, max(1, start - resumed), self.options.alternate)
         self._execute(
             self._saving(total),
             learn=True,
             freeze=False,
-            start=self._iteration_of(Path(resumed)) if resumed else 0,
+            start=resumed,
             schedule=schedule,
             settings=settings,
         )
@@ -246,14 +245,16 @@ class _Runner:
         """Stage 2: resume, or wait for ``from_iter`` inside one run."""
         settings = self.options.settings
         if self.options.from_iter is not None:
-            start, total = self.options.from_iter, self._iterations()
-            learned = max(1, total - start - self.host.line.skipped)
-            settings = _with_iterations(settings, learned)
-            self._execute(self._saving(total), learn=True, from_step=start, settings=settings)
+            resumed, after, total = self._learning(self.options.from_iter)
+            settings = _with_iterations(settings, total - after - self.host.line.skipped)
+            passed = after - resumed
+            self._execute(
+                self._saving(total), learn=True, from_step=passed, start=resumed, settings=settings
+            )
             self._note_after(total)
             return
-        resumed = self.adapter.resumed_by(self.host.script, self.host.arguments)
-        self.host = _parse(*resumed, self.host.line, self.host.module)
+        again = self.adapter.resumed_by(self.host.script, self.host.arguments)
+        self.host = _parse(*again, self.host.line, self.host.module)
         if self.output is None and self.host.flags.output:
             self.output = Path(self.host.flags.output)
         with self._checkpoint() as (iteration, checkpoint):
@@ -384,6 +385,28 @@ class _Runner:
     def _iteration_of(self, resumed: Path) -> int:
         """The iteration that a run from this file goes on after."""
         return 0 if self.host.line.restarts else _iteration_of(resumed)
+
+    def _learning(self, from_iter: int | None) -> tuple[int, int, int]:
+        """Iterations of the host: the one this run goes on after, where learning begins, the last.
+
+        Args:
+            from_iter: as asked for; half of the training where it is not.
+
+        Raises:
+            UsageError: nothing would be learned.
+        """
+        total, file = self._iterations(), self.host.flags.resume
+        resumed = self._iteration_of(Path(file)) if file else 0
+        start = max(resumed, total // 2 if from_iter is None else from_iter)
+        if start < total - self.host.line.skipped:
+            return resumed, start, total
+        flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
+        raise UsageError(
+            f"--stage {self.options.stage}",
+            f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
+            f"some after {start}, where learning begins",
+            f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
+        )
 
     def _checkpoints(self, total: int) -> list[int]:
         """Iterations to write a checkpoint at: the command's, and the last."""

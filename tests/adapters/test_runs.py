@@ -17,7 +17,7 @@ from miniature import HOST, TINY, running
 
 from fragprune_plugins import launch, sidecar
 from fragprune_plugins.detect import HostRepo
-from fragprune_plugins.errors import Interrupted
+from fragprune_plugins.errors import Interrupted, UsageError
 from fragprune_plugins.hookspecs import hookimpl
 from fragprune_plugins.launch import RunOptions, _forget_modules, _host_process, run
 from fragprune_plugins.plugins import load_plugins
@@ -213,6 +213,49 @@ def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path)
     assert torch.equal(capture[4].detach(), final.scaling)
     assert len(final.xyz) != 150
     assert summary.iterations == 8
+
+
+@pytest.fixture(scope="module")
+def checkpoint(photographs, tmp_path_factory):
+    """Of iteration 12."""
+    out = tmp_path_factory.mktemp("trained")
+    words = command(photographs, out, 12, "--checkpoint_iterations", 12)
+    run(words, RunOptions(stage="off", device="cpu"))
+    return out / "chkpnt12.pth"
+
+
+@pytest.mark.parametrize(
+    ("stage", "from_iter", "learned"),
+    [("joint", None, 7), ("joint", 3, 7), ("joint", 15, 5), ("finetune", 15, 4)],
+)
+def test_a_resumed_run_learns_from_an_iteration_of_the_host(
+    photographs, tmp_path, checkpoint, stage, from_iter, learned
+):
+    """Of 13 to 20, in the last of which the host takes no step; half of 20 is past already."""
+    words = command(photographs, tmp_path / "out", 20, "--start_checkpoint", checkpoint)
+    options = RunOptions(stage=stage, from_iter=from_iter, device="cpu")
+    store, _ = sidecar.load(run(words, options).model_after)
+    assert store.steps == learned
+
+
+@pytest.mark.parametrize("stage", ["joint", "finetune"])
+@pytest.mark.parametrize(
+    ("iterations", "from_iter", "resumed", "words"),
+    [
+        (20, 20, False, "iterations 1 to 20; expected some after 20.*or lower --from-iter"),
+        (20, 25, True, "iterations 13 to 20; expected some after 25.*or lower --from-iter"),
+        (12, 0, True, r"no iterations; expected some after 12.*Raise --iterations\.$"),
+    ],
+    ids=["never", "never, resumed", "resumed at its end"],
+)
+def test_a_run_that_could_not_learn_is_refused_before_it_begins(
+    photographs, tmp_path, checkpoint, stage, iterations, from_iter, resumed, words
+):
+    more = ["--start_checkpoint", checkpoint] if resumed else []
+    options = RunOptions(stage=stage, from_iter=from_iter, device="cpu")
+    with pytest.raises(UsageError, match=words):
+        run(command(photographs, tmp_path / "out", iterations, *more), options)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_model_that_the_host_drops_is_not_kept_alive():
