@@ -92,9 +92,10 @@ def command(
         dataset.test,
         engine=rasterizer,
     )
+    pressure = f" at pressure {result.records[-1].pressure:.2g}" if result.records else ""
     quote = (
         f"{gain(before, after)} that were held out ({after['engine']} engine, "
-        f"{result.iterations} iterations in {result.train_seconds:.0f} s)."
+        f"{result.iterations} iterations{pressure} in {result.train_seconds:.0f} s)."
     )
     lines = [describe({"before": before, "after": after}), "", quote]
     if result.target_reached is False:
@@ -114,6 +115,7 @@ def command(
         "target_reached": result.target_reached,
         "interrupted": result.interrupted,
         "iterations": result.iterations,
+        "pressure": result.records[-1].pressure if result.records else None,
         "train_seconds": result.train_seconds,
         "engine": result.engine,
         "device": after["device"],

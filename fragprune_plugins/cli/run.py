@@ -121,6 +121,7 @@ def command(
         "after": measured[1] if measured else None,
         "model_before": _text(summary.model_before),
         "model_after": _text(summary.model_after),
+        "pressure": summary.curves[-1]["pressure"] if summary.curves else None,
         "train_seconds": summary.train_seconds,
         "target_reached": summary.target_reached,
         "seed": settings.seed,
@@ -208,9 +209,11 @@ def _describe(summary: Any, measured: list[dict[str, Any]] | None) -> str:
             )
     if summary.target_reached is False:
         lines.append("The target speed-up was missed by more than 5%; see --help of finetune.")
+    pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
-        f"{summary.iterations} iterations of stage 2, {summary.train_seconds:.0f} s in all. "
+        f"{summary.iterations} iterations of stage 2{pressure}, {summary.train_seconds:.0f} s in "
+        "all. "
         f"Model: {summary.model_after or 'not saved by the host'}."
     )
     return "\n".join(lines)

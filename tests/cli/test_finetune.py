@@ -16,6 +16,7 @@ from finetune import tiny
 from fragprune_plugins import sidecar
 from fragprune_plugins.finetuning import loop
 from fragprune_plugins.ply import read_ply, write_ply
+from fragprune_plugins.pressure import LEAST_PRESSURE
 
 
 @pytest.fixture
@@ -52,6 +53,7 @@ def test_json_is_one_object_with_the_house_names(scene, tmp_path):
         assert report[part]["lpips"] is None
         assert report[part]["psnr"] > 10
     assert {"train_seconds", "engine", "device", "target_reached"} <= report.keys()
+    assert report["pressure"] >= LEAST_PRESSURE
 
 
 def test_target_control_and_curves(scene, tmp_path):
