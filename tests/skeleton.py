@@ -28,21 +28,23 @@ MODEL = {
     "densify_and_prune": "max_grad, min_opacity, extent, max_screen_size",
 }
 
-STATES = ("2023", "August 2024", "October 2024")
+STATES = ("mid-July 2023", "late July 2023", "October 2023", "August 2024", "October 2024")
 
 
-def skeleton(root: Path, state: str = "2023", **methods: str | None) -> HostRepo:
+def skeleton(root: Path, state: str = "October 2023", **methods: str | None) -> HostRepo:
     """One public state of vanilla 3DGS; ``methods`` add to the model's, change or (None) drop."""
-    model = MODEL | {"load_ply": "path, use_train_test_exp=False"} if state != "2023" else MODEL
+    late, early = "2024" in state, state in STATES[:2]
+    model = MODEL | {"load_ply": "path, use_train_test_exp=False"} if late else MODEL
     model = {name: args for name, args in (model | methods).items() if args is not None}
-    settings = SETTINGS + (["antialiasing"] if state != "2023" else [])
+    settings = SETTINGS[: -1 if state == "mid-July 2023" else None] + ["antialiasing"] * late
     parameters = "viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0"
     if state == "October 2024":
         parameters += ", separate_sh=False"
-    outputs = "image, radii" if state == "2023" else "image, radii, depth"
+    outputs = "image, radii, depth" if late else "image, radii"
     files = {
         "arguments/__init__.py": "class OptimizationParams:\n"
-        "    def __init__(self, parser):\n        self.iterations = 12_345\n",
+        "    def __init__(self, parser):\n        self.iterations = 12_345\n"
+        + ("" if early else "        self.random_background = False\n"),
         "scene/__init__.py": "class Scene:\n    def __init__(self, args, gaussians): ...\n",
         "scene/gaussian_model.py": "class GaussianModel:\n"
         + "\n".join(

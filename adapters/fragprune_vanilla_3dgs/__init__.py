@@ -1,8 +1,9 @@
 """graphdeco-inria/gaussian-splatting: 3D Gaussian Splatting, the host the others descend from.
 
-Its states are told apart by their source alone: the first (2023, two rasterizer outputs), the one
-of August 2024 (exposure, depth, antialiasing) and the one of October 2024 (``separate_sh``,
-sparse Adam).
+Its states are told apart by their source alone. Those of 2023 have two rasterizer outputs: the one
+of mid-July no ``debug`` among the settings, that of late July no random background, that of October
+both. That of August 2024 has exposure, depth and antialiasing, that of October 2024 ``separate_sh``
+and sparse Adam. The first ten days of July 2023 knew no checkpoints, and so know no stage 2.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from fragprune_plugins.adapter import HostAdapter, HostInfo
 from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.hookspecs import hookimpl
 from fragprune_plugins.lineage import Contract, GraphdecoAdapter
+from fragprune_plugins.lineage.graphdeco import MODEL
 
 OUTPUTS = 3
 """Colour, radii and, since August 2024, inverse depth."""
@@ -45,7 +47,8 @@ class Vanilla3DGS(GraphdecoAdapter):
     info = HostInfo(
         "3D Gaussian Splatting",
         repo="graphdeco-inria/gaussian-splatting",
-        states="2023 (2-tuple), August 2024 (3-tuple), October 2024 (separate_sh, sparse Adam)",
+        states="mid-July, late July, October 2023 (2-tuple), August 2024 (3-tuple), October 2024 "
+        "(separate_sh, sparse Adam)",
         limits=("With --antialiasing or --train_test_exp run does not compare before and after.",),
     )
     contracts = (Contract(), Contract(frozenset({"antialiasing"}), OUTPUTS))
@@ -67,13 +70,33 @@ class Vanilla3DGS(GraphdecoAdapter):
             for name, where in mentioned.items()
         ]
         missing = super().fingerprint(repo)
-        revision = Finding("info", "revision", str(repo.root), self.revision(repo))
-        return [*findings, *(missing or [revision])]
+        if not missing:
+            findings.append(self._state(repo))
+        return [*findings, *missing]
+
+    def _state(self, repo: HostRepo) -> Finding:
+        """The revision, for people; an error where it has no checkpoints to resume."""
+        names = ("training_setup", "capture", "restore")
+        there = [name for name in names if repo.function(MODEL, f"GaussianModel.{name}")]
+        if there != ["training_setup"]:
+            return Finding("info", "revision", str(repo.root), self.revision(repo))
+        return Finding(
+            "error",
+            "revision",
+            repo.place(MODEL, "GaussianModel"),
+            "neither capture nor restore, as vanilla 3DGS was until 14 July 2023",
+            "checkpoints, which stage 2 resumes",
+            "Bring the fork to a later state, or give its PLY to fragprune finetune.",
+        )
 
     def revision(self, repo: HostRepo) -> str:
         """Which of the public states the source is."""
-        if self.dialect(repo).outputs < OUTPUTS:
-            return "2023"
+        dialect = self.dialect(repo)
+        if dialect.outputs < OUTPUTS:
+            if "debug" not in dialect.settings:
+                return "mid-July 2023"
+            later = repo.mentions(["arguments"], ["random_background"])
+            return "October 2023" if later else "late July 2023"
         has_separate_sh = "separate_sh" in (repo.parameters("gaussian_renderer", "render") or ())
         return "October 2024" if has_separate_sh else "August 2024"
 

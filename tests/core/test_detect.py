@@ -21,12 +21,23 @@ def test_each_public_state_is_recognised_and_its_dialect_read(tmp_path, state):
     assert adapter.match(repo).fits, errors(repo)
     assert adapter.revision(repo) == state
     dialect = adapter.dialect(repo)
-    assert dialect.outputs == (2 if state == "2023" else 3)
-    assert dialect.settings[:12] == tuple(SETTINGS)
-    assert ("antialiasing" in dialect.settings) == (state != "2023")
+    assert dialect.outputs == (3 if "2024" in state else 2)
+    assert dialect.settings[:12] == tuple(SETTINGS[: 11 if state == "mid-July 2023" else 12])
+    assert ("antialiasing" in dialect.settings) == ("2024" in state)
     assert dialect.sparse_adam == (state == "October 2024")
     assert adapter.command_line(repo).default_iterations == 12_345
     assert choose(repo, [adapter]) is adapter
+
+
+def test_a_state_from_before_there_were_checkpoints_is_refused_by_its_date(tmp_path):
+    repo = skeleton(tmp_path, "mid-July 2023", capture=None, restore=None)
+    first, *seams = errors(repo)
+    assert first.code == "revision"
+    assert "until 14 July 2023" in first.found
+    assert "fragprune finetune" in first.remedy
+    assert [finding.code for finding in seams] == ["seam-missing"] * 2
+    with pytest.raises(UnknownHostError, match="until 14 July 2023"):
+        choose(repo, [Vanilla3DGS()])
 
 
 @pytest.mark.parametrize("marker", OTHER_HOSTS)
