@@ -20,7 +20,7 @@ def freeze(case: Case) -> str:
     for train, named in moving.items():
         with running(Settings(iterations=9, train=train), from_step=2, **case.options()) as host:  # type: ignore[arg-type]
             model, camera = host.model(20), host.camera()
-            model.active_sh_degree = 1  # every band takes part
+            model.active_sh_degree = min(1, model.max_sh_degree)  # every band takes part
             for iteration in (1, 2):
                 host.step(model, camera, iteration)
             before, thresholds = tensors(driver, model), host.store(model).logits.detach().clone()
