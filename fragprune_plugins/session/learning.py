@@ -157,9 +157,9 @@ def meet_target(session: Session, state: ModelState) -> None:
     """Late in the run, and once more at its end, shift all thresholds onto the target."""
     target, progress = session.settings.target_speedup, state.plan.progress if state.plan else 0.0
     due = progress >= 1.0 or (progress >= CALIBRATE_AT and not state.held)
-    if target is None or not due or not state.baseline:
-        return
     views = sorted({view for view, _ in state.baseline} & state.views.keys())
+    if target is None or not due or not views:
+        return
     views = views[:: -(-len(views) // CALIBRATION_VIEWS)]
     pictures = [picture for picture in state.baseline if picture[0] in views]
     before = sum(state.baseline[picture] for picture in pictures)

@@ -148,6 +148,7 @@ def on_rearrange(
     if trace.origins is not None and trace.fresh is not None:
         before = len(state.store)
         state.store.rearrange(trace.origins, trace.fresh)
+        state.views.clear()  # their calls may hold tensors of the rows before
         session.changed(state.store, "rearrange", before)
     session.expect_rows(model, state, str(seam))
     return result

@@ -19,7 +19,7 @@ from fragprune_plugins.cli import cli
 from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.errors import AlignmentError, InputError, SessionError, UsageError
 from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.schedule import JointSchedule, Settings
 
 WIDTH, HEIGHT = 48, 32
 LOOP = Path(__file__).parents[2] / "docs" / "how-to" / "gsplat_loop.py"
@@ -306,6 +306,27 @@ def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
     assert before / after == pytest.approx(1.5, rel=0.03)  # 0.01, and opacities moved since
     assert summary.target_reached
     assert summary.fragments_before / summary.fragments_after == pytest.approx(1.5, rel=0.01)
+
+
+def test_a_target_is_met_without_views_drawn_before_rows_changed(session_on):
+    """Their calls hold tensors of rows that are no more."""
+    settings = Settings(iterations=8, target_speedup=1.5)
+    schedule = JointSchedule(settings, 1)
+    with session_on(Gsplat(), settings=settings, schedule=schedule, freeze=False) as session:
+        from gsplat import DefaultStrategy
+        from gsplat.strategy.ops import remove
+
+        params, optimizers = model()
+        DefaultStrategy().check_sanity(params, optimizers)
+        for step in range(8):
+            draw(params, 2 if step < 3 else 1)[0].mean().backward()
+            for parameter in params.values():
+                parameter.grad = None
+            if step == 3:
+                remove(params, optimizers, {}, torch.arange(40) < 5)
+        summary = session.finish()
+    assert summary.gaussians == 35
+    assert session.last_state.held
 
 
 def test_thresholds_go_through_a_file_beside_ones_own_checkpoint(unmoved, tmp_path):
