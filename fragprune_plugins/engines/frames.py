@@ -113,6 +113,7 @@ def unblend_macros(
     sh_turns: bool,
     invdepth: bool = False,
     absolute: bool = False,
+    offsets: bool = False,
     features: int = 0,
 ) -> dict[str, int]:
     """What native/cuda/unblend.cu is compiled with.
@@ -122,6 +123,7 @@ def unblend_macros(
         sh_turns: colours depend on where the mean is seen from.
         invdepth: a gradient of inverse depth came.
         absolute: the hook's third column is filled.
+        offsets: pixels are sampled off their places.
         features: channels of which a gradient came.
     """
     colour = bool(wanted & {"colors", "sh"}) or ("means" in wanted and sh_turns)
@@ -131,6 +133,7 @@ def unblend_macros(
         "FP_THRESHOLD": int("thresholds" in wanted),
         "FP_DEPTH": int(invdepth),
         "FP_ABSOLUTE": int("hook" in wanted and absolute),
+        "FP_OFFSETS": int(offsets),
         "FP_FEATURES": features,
     }
 
@@ -514,6 +517,7 @@ class Drawing:
             sh_turns="sh" in self._arrays and frame.inputs.sh_degree > 0,
             invdepth="invdepth" in by,
             absolute=self._inputs.absolute_gradient,
+            offsets=self._spread is not None,
             features=self._channels if "features" in by else 0,
         )
         sums = 1 + sum(macros[f"FP_{k}"] for k in ("THRESHOLD", "DEPTH", "ABSOLUTE", "FEATURES"))

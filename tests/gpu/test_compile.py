@@ -27,7 +27,7 @@ OTHERS = 128
 EVERYTHING = {
     "FP_FEATURES": 8,
     **dict.fromkeys(("FP_COUNTS", "FP_SCORES", "FP_GEOMETRY", "FP_COLOUR"), 1),
-    **dict.fromkeys(("FP_THRESHOLD", "FP_DEPTH", "FP_ABSOLUTE"), 1),
+    **dict.fromkeys(("FP_THRESHOLD", "FP_DEPTH", "FP_ABSOLUTE", "FP_OFFSETS"), 1),
 }
 
 

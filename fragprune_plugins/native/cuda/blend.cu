@@ -32,9 +32,8 @@ FP_KERNEL(fp_blend, Frame, 2) {
     const uint32_t mine = first + threadIdx.x;
     staged.reached[threadIdx.x] = 0;
     if (mine < range.end) {
-      const uint32_t value = f.entry_values[mine];
-      const uint32_t row = f.owners ? f.owners[value] : value;
-      staged.put(f, threadIdx.x, load_brush(f.brushes, row), row, p);
+      const uint32_t row = row_of(f, f.entry_values[mine]);
+      staged.put(threadIdx.x, load_brush(f.brushes, row), row, p);
     }
     __syncthreads();
     for (int base = 0; base < kThreads; base += 32) {
@@ -59,7 +58,7 @@ FP_KERNEL(fp_blend, Frame, 2) {
 #if FP_FEATURES
 #pragma unroll
             for (int k = 0; k < FP_FEATURES; k++)
-              features[k] = fma(weight, staged.features[j][k], features[k]);
+              features[k] = fma(weight, f.in.features[size_t{FP_FEATURES} * staged.row[j] + k], features[k]);
 #endif
 #if FP_SCORES
             if (weight > best) best = weight, winner = static_cast<int32_t>(staged.row[j]);

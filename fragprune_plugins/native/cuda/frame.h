@@ -145,6 +145,11 @@ __device__ inline Brush<float> load_brush(const float* brushes, size_t row) {
 #endif
 }
 
+// Whose entry it is, from entry_values.
+__device__ inline uint32_t row_of(const Frame& f, uint32_t entry) {
+  return f.owners ? f.owners[entry] : entry;
+}
+
 }  // namespace fp
 
 // Kernels are named, not mangled, and take one struct. A multiprocessor shall have room for so many

@@ -62,25 +62,16 @@ struct Staged {
   float4 a[kThreads];  // scale, skew, u0, down
   float4 b[kThreads];  // v0, log_opacity, cut, inv_z
   float4 c[kThreads];  // r, g, b, list_cut
-  uint32_t row[kThreads];
-#if FP_FEATURES
-  float features[kThreads][FP_FEATURES];
-#endif
+  uint32_t row[kThreads];  // or entry
   uint8_t reached[kThreads];
 
-  __device__ void put(const Frame& f, int j, const Brush<float>& brush, uint32_t its_row,
-                      const Pixel& tile) {
+  __device__ void put(int j, const Brush<float>& brush, uint32_t its_row, const Pixel& tile) {
     const LocalBrush<float> l = localize(brush, static_cast<float>(tile.tile_x),
                                          static_cast<float>(tile.tile_y));
     a[j] = make_float4(l.scale, l.skew, l.u0, l.down);
     b[j] = make_float4(l.v0, l.log_opacity, l.cut, l.inv_z);
     c[j] = make_float4(l.r, l.g, l.b, brush.list_cut);
     row[j] = its_row;
-#if FP_FEATURES
-#pragma unroll
-    for (int k = 0; k < FP_FEATURES; k++)
-      features[j][k] = f.in.features[size_t{FP_FEATURES} * its_row + k];
-#endif
     reached[j] = static_cast<uint8_t>(sub_tiles_of(brush, tile));
   }
   __device__ LocalBrush<float> get(int j) const {

@@ -1,11 +1,13 @@
 // The way back: from gradients of the image to sums over each Gaussian's fragments, then through
 // projection to the inputs.
 //
-// A block takes a tile, a warp its sub-tile, back to front. The sums of one Gaussian over a warp's
-// pixels are folded by a butterfly that halves how many there are at each step; those of the block's
-// warps are added in shared memory, in order, and leave it as one number each. What becomes of them
-// is the caller's choice: added up where they belong (fast), or put in the slot of the Gaussian's
-// entry, to be added up in order later on (the same to the bit in each run).
+// A block takes a tile, a warp its sub-tile, back to front, in buckets of a few Gaussians. First a
+// lane is a pixel: it walks through the bucket and leaves two or three numbers of each fragment in
+// shared memory. Then a lane is a Gaussian, or a part of one: it runs over pixels and keeps the
+// Gaussian's sums in registers, so that nothing is folded but what the Gaussian's few lanes have.
+// The sums leave once per bucket. What becomes of them is the caller's choice: added up where they
+// belong (fast), or in the slot of the Gaussian's entry, warp after warp, to be added up in order
+// later on (the same to the bit in each run).
 
 #include "tile.cuh"
 
@@ -25,6 +27,9 @@
 #ifndef FP_ABSOLUTE
 #define FP_ABSOLUTE 0
 #endif
+#ifndef FP_OFFSETS  // pixels are sampled off their places
+#define FP_OFFSETS 0
+#endif
 
 namespace fp {
 
@@ -34,12 +39,14 @@ constexpr int kThresholdAt = 1, kGeometryAt = kThresholdAt + FP_THRESHOLD,
               kAbsoluteAt = kDepthAt + FP_DEPTH, kFeaturesAt = kAbsoluteAt + FP_ABSOLUTE,
               kSums = kFeaturesAt + FP_FEATURES;
 
-constexpr int padded(int n) {
-  int p = 1;
-  while (p < n) p *= 2;
-  return p;
-}
-constexpr int kPadded = padded(kSums);
+// What a lane leaves of a fragment: dL/d(log alpha), its rim's part of dL/d(threshold), its weight.
+constexpr int kRimAt = 1, kWeightAt = kRimAt + FP_THRESHOLD,
+              kParts = kWeightAt + (FP_COLOUR || FP_DEPTH || FP_FEATURES);
+// What the sums read of a pixel.
+constexpr int kInvDepthOf = 3 * FP_COLOUR, kFeaturesOf = kInvDepthOf + FP_DEPTH,
+              kPlaceOf = kFeaturesOf + FP_FEATURES, kPlanes = kPlaceOf + 2 * FP_OFFSETS;
+
+constexpr float kEndless = 3e38f;
 
 struct Undraw {
   Frame frame;
@@ -54,27 +61,39 @@ struct Undraw {
 static_assert(sizeof(Undraw) == FP_UNDRAW_SIZE, "engines/cuda.py has other fields in Undraw");
 #endif
 
-// Folds the first 2 kHalf numbers of each of 32 lanes to kHalf, then those, and so on.
-template <int kHalf>
-__device__ inline void halve(float (&v)[kPadded]) {
-  constexpr int width = 32 * kHalf / kPadded;
-  const bool upper = (lane_of() & width) != 0;
-#pragma unroll
-  for (int i = 0; i < kHalf; i++) {
-    const float low = v[i], high = v[i + kHalf];
-    v[i] = (upper ? high : low) + __shfl_xor_sync(kAll, upper ? low : high, width);
-  }
-  if constexpr (kHalf > 1) halve<kHalf / 2>(v);
-}
+struct Rim {
+  float threshold, inv_opacity;
+};
 
-// Returns the sum over all lanes of number lane / (32 / kPadded).
-__device__ inline float fold(float (&v)[kPadded]) {
-  if constexpr (kPadded > 1) halve<kPadded / 2>(v);
-  float sum = v[0];
+// What a block shares, with buckets of so many Gaussians.
+template <int kBucket>
+struct RoomFor {
+  static constexpr int kPitch = 32 * kParts + 4;  // lanes of two Gaussians meet in no bank
+  Staged staged;
+  Rim rims[FP_THRESHOLD ? kThreads : 1];
+  alignas(16) float pixels[kPlanes ? kPlanes : 1][kThreads];
+  alignas(16) float parts[kWarps][kBucket][kPitch];
+  uint8_t met[kWarps][kThreads];  // those staged that reach the warp's sub-tile, back to front
+  float light_by[kWarps][3];
+  int32_t last[kWarps];
+};
+constexpr int kBucket = sizeof(RoomFor<8>) <= 48 << 10 ? 8 : 4;
+using Room = RoomFor<kBucket>;
+
+constexpr int kLanes = 32 / kBucket;  // that a Gaussian's pixels are shared out to, kBucket to each
+constexpr int kEach = (kSums + kLanes - 1) / kLanes, kPadded = kEach * kLanes;
+
+// Folds the first kCount numbers over the lanes of a Gaussian: then v[i] is the sum over them of
+// number i kLanes + lane % kLanes.
+template <int kCount, int kWidth>
+__device__ inline void fold(float (&v)[kPadded]) {
+  const bool upper = (lane_of() & kWidth) != 0;
 #pragma unroll
-  for (int width = 16 / kPadded; width >= 1; width /= 2)
-    sum += __shfl_xor_sync(kAll, sum, width);
-  return sum;
+  for (int i = 0; i < kCount / 2; i++) {
+    const float low = v[2 * i], high = v[2 * i + 1];
+    v[i] = (upper ? high : low) + __shfl_xor_sync(kAll, upper ? low : high, kWidth);
+  }
+  if constexpr (2 * kWidth < kLanes) fold<kCount / 2, 2 * kWidth>(v);
 }
 
 // A pixel's gradients, and its place on the way from its last fragment to its first.
@@ -87,14 +106,23 @@ struct LossPixel {
   float behind;  // gradient of all that lies behind it, weighted
 };
 
-struct Rim {
-  float threshold, inv_opacity;
+// The same for all fragments.
+struct Terms {
+  float per_fragment;  // gradient of a fragment's being there at all
+  float ceiling;       // alphas above have no gradient
 };
 
-// Adds nothing to `v`: fills it in, for one fragment before its pixel's stop.
+__device__ inline Terms terms_of(const Undraw& u) {
+  const fragprune_inputs& in = u.frame.in;
+  const float pixels = static_cast<float>(in.width) * static_cast<float>(in.height);
+  return {u.by_fragments ? *u.by_fragments / pixels : 0.f,
+          in.cap_gradient ? kEndless : in.alpha_max};
+}
+
+// Takes a pixel from behind a fragment before its stop to before it; what is left of the fragment.
 __device__ inline void unblend(const Frame& f, const LocalBrush<float>& b, const Rim& rim,
-                               const float* features, float per_fragment, const Meeting<float>& m,
-                               LossPixel& p, float (&v)[kPadded]) {
+                               uint32_t entry, const Terms& t, const Meeting<float>& m,
+                               LossPixel& p, float (&parts)[kParts]) {
   const bool drawn = m.exponent >= b.cut;
   const float uncapped = exp2(m.exponent), full = min(uncapped, f.in.alpha_max);
   const float alpha = drawn ? full : 0.f;
@@ -105,6 +133,7 @@ __device__ inline void unblend(const Frame& f, const LocalBrush<float>& b, const
   shade = fma(p.inv_z, b.inv_z, shade);
 #endif
 #if FP_FEATURES
+  const float* features = f.in.features + size_t{FP_FEATURES} * row_of(f, entry);
 #pragma unroll
   for (int k = 0; k < FP_FEATURES; k++) shade = fma(p.features[k], features[k], shade);
 #endif
@@ -112,40 +141,95 @@ __device__ inline void unblend(const Frame& f, const LocalBrush<float>& b, const
   const float by_alpha = fnma(p.behind, inv, light * shade);
   p.light = light;
   p.behind = fma(weight, shade, p.behind);
-  const bool passes = drawn && (f.in.cap_gradient || uncapped <= f.in.alpha_max);
-  const float w = passes ? uncapped * by_alpha : 0.f;
-  v[0] = w;
+  parts[0] = drawn && uncapped <= t.ceiling ? uncapped * by_alpha : 0.f;
 #if FP_THRESHOLD
   const float away = abs(uncapped * rim.inv_opacity - rim.threshold);
   if (away <= kRimHorizon)
-    v[kThresholdAt] = -fma(full, by_alpha, per_fragment) * rim_density(away);
+    parts[kRimAt] = -fma(full, by_alpha, t.per_fragment) * rim_density(away);
+#endif
+  if constexpr (kParts > kWeightAt) parts[kWeightAt] = weight;
+}
+
+// Four numbers that lie side by side.
+struct Four {
+  float at[4];
+};
+__device__ inline Four load4(const float* from) {
+  const float4 v = *reinterpret_cast<const float4*>(from);
+  return {{v.x, v.y, v.z, v.w}};
+}
+
+// The sums of the Gaussian staged[j], this lane's in the bucket, over the lane's pixels.
+__device__ inline void gather(const Frame& f, const Room& room, int j, float (&v)[kPadded]) {
+  const int its = lane_of() / kLanes, first = lane_of() % kLanes * kBucket;  // pixel
+#pragma unroll
+  for (int k = 0; k < kPadded; k++) v[k] = 0.f;
+#if FP_GEOMETRY
+  const LocalBrush<float> b = room.staged.get(j);
+  const int x = (warp_of() & 1) * kSubWidth + first % kSubWidth;
+  const int y = (warp_of() >> 1) * kSubHeight + first / kSubWidth;
+  const Meeting<float> start = meet(b, static_cast<float>(x), static_cast<float>(y));
+#endif
+#pragma unroll
+  for (int i = 0; i < kBucket; i += 4) {
+    const auto part = [&](int k) { return load4(&room.parts[warp_of()][its][32 * k + first + i]); };
+    const auto pixel = [&](int k) { return load4(&room.pixels[k][32 * warp_of() + first + i]); };
+    const auto add = [&](int to, const Four& of) {
+#pragma unroll
+      for (int k = 0; k < 4; k++) v[to] += of.at[k];
+    };
+    const auto weigh = [&](int to, const Four& of, const Four& by) {
+#pragma unroll
+      for (int k = 0; k < 4; k++) v[to] = fma(of.at[k], by.at[k], v[to]);
+    };
+    const Four w = part(0);
+    add(0, w);
+#if FP_THRESHOLD
+    add(kThresholdAt, part(kRimAt));
 #endif
 #if FP_GEOMETRY
-  const float wu = w * m.u, wv = w * m.v;
-  v[kGeometryAt] = wu;
-  v[kGeometryAt + 1] = wv;
-  v[kGeometryAt + 2] = wu * m.u;
-  v[kGeometryAt + 3] = wu * m.v;
-  v[kGeometryAt + 4] = wv * m.v;
+    Four us, vs, wu, wv;
+#if FP_OFFSETS
+    const Four px = pixel(kPlaceOf), py = pixel(kPlaceOf + 1);
 #endif
-#if FP_ABSOLUTE
-  // the exponent by the mean: 2 u scale, 2 (u skew + v down)
-  constexpr float ln2 = 0.69314718f;
-  v[kAbsoluteAt] =
-      ln2 * (static_cast<float>(f.in.width) * abs(w * m.u * b.scale) +
-             static_cast<float>(f.in.height) * abs(w * (m.u * b.skew + m.v * b.down)));
-#endif
-#if FP_COLOUR
-  v[kColourAt] = weight * p.r;
-  v[kColourAt + 1] = weight * p.g;
-  v[kColourAt + 2] = weight * p.b;
-#endif
-#if FP_DEPTH
-  v[kDepthAt] = weight * p.inv_z;
-#endif
-#if FP_FEATURES
 #pragma unroll
-  for (int k = 0; k < FP_FEATURES; k++) v[kFeaturesAt + k] = weight * p.features[k];
+    for (int k = 0; k < 4; k++) {
+#if FP_OFFSETS
+      const Meeting<float> m = meet(b, px.at[k], py.at[k]);
+      us.at[k] = m.u, vs.at[k] = m.v;
+#else
+      us.at[k] = fma(b.scale, static_cast<float>(i + k), start.u), vs.at[k] = start.v;
+#endif
+      wu.at[k] = w.at[k] * us.at[k], wv.at[k] = w.at[k] * vs.at[k];
+#if FP_ABSOLUTE
+      // the exponent by the mean: 2 u scale, 2 (u skew + v down)
+      constexpr float ln2 = 0.69314718f;
+      v[kAbsoluteAt] +=
+          ln2 * (static_cast<float>(f.in.width) * abs(wu.at[k] * b.scale) +
+                 static_cast<float>(f.in.height) * abs(wu.at[k] * b.skew + wv.at[k] * b.down));
+#endif
+    }
+    add(kGeometryAt, wu);
+    weigh(kGeometryAt + 2, wu, us);
+#if FP_OFFSETS
+    add(kGeometryAt + 1, wv);
+    weigh(kGeometryAt + 3, wu, vs);
+    weigh(kGeometryAt + 4, wv, vs);
+#endif
+#endif
+    if constexpr (kParts > kWeightAt) {
+      const Four weight = part(kWeightAt);
+#pragma unroll
+      for (int k = 0; k < 3 * FP_COLOUR; k++) weigh(kColourAt + k, weight, pixel(k));
+      if constexpr (FP_DEPTH) weigh(kDepthAt, weight, pixel(kInvDepthOf));
+#pragma unroll
+      for (int k = 0; k < FP_FEATURES; k++) weigh(kFeaturesAt + k, weight, pixel(kFeaturesOf + k));
+    }
+  }
+#if FP_GEOMETRY && !FP_OFFSETS  // the lane's pixels lie in one row: their v is one
+  v[kGeometryAt + 1] = start.v * v[0];
+  v[kGeometryAt + 3] = start.v * v[kGeometryAt];
+  v[kGeometryAt + 4] = start.v * v[kGeometryAt + 1];
 #endif
 }
 
@@ -166,6 +250,24 @@ __device__ inline LossPixel load_loss(const Undraw& u, const Pixel& p) {
   const float* back = f.in.background;
   l.behind = l.light * (l.r * back[0] + l.g * back[1] + l.b * back[2] - at(u.by.alpha, 0));
   return l;
+}
+
+// What the sums will read of a pixel.
+__device__ inline void share(Room& room, const Pixel& p, const LossPixel& l) {
+  const auto put = [&](int plane, float v) { room.pixels[plane][threadIdx.x] = v; };
+#if FP_COLOUR
+  put(0, l.r), put(1, l.g), put(2, l.b);
+#endif
+#if FP_DEPTH
+  put(kInvDepthOf, l.inv_z);
+#endif
+#if FP_FEATURES
+#pragma unroll
+  for (int k = 0; k < FP_FEATURES; k++) put(kFeaturesOf + k, l.features[k]);
+#endif
+#if FP_OFFSETS
+  put(kPlaceOf, p.px), put(kPlaceOf + 1, p.py);
+#endif
 }
 
 // ---- the chain -------------------------------------------------------------------------------
@@ -260,99 +362,116 @@ __device__ inline void write_zeros(const Undraw& u, size_t i) {
   clear(u.to.features, FP_FEATURES);
 }
 
+// Lists those of the staged before `end` that reach the warp's sub-tile, back to front; how many.
+__device__ inline int meet_those(const Staged& staged, int32_t end, uint8_t (&met)[kThreads]) {
+  int count = 0;
+#pragma unroll 1
+  for (int base = kThreads - 32; base >= 0; base -= 32) {
+    if (base >= end) continue;
+    const uint32_t word = staged.word(base), from_here = word >> lane_of();
+    if (from_here & 1)
+      met[count + __popc(from_here >> 1)] = static_cast<uint8_t>(base + lane_of());
+    count += __popc(word);
+  }
+  __syncwarp();
+  return count;
+}
+
 // ---- kernels ---------------------------------------------------------------------------------
 
 FP_KERNEL(fp_unblend, Undraw, 2) {
   const Frame& frame = f.frame;
-  __shared__ Staged staged;
-  __shared__ Rim rims[kThreads];
-  __shared__ uint32_t to[kThreads];
-  __shared__ float sums[kWarps][32][kSums];
-  __shared__ uint32_t written[kWarps];  // bit j: the warp has sums of the j-th
-  __shared__ float light_by[kWarps][3];
-  __shared__ int32_t last[kWarps];
+  __shared__ Room room;
+  const int warp = warp_of(), lane = lane_of();
   const Pixel p = pixel_of(frame);
   const Range range = frame.ranges[blockIdx.x];
   LossPixel loss = load_loss(f, p);
   const int32_t stop = p.inside ? frame.stop[p.at] : 0;
-  const float per_fragment =
-      f.by_fragments ? *f.by_fragments / (static_cast<float>(frame.in.width) *
-                                          static_cast<float>(frame.in.height))
-                     : 0.f;
+  const Terms terms = terms_of(f);
   const float seen = p.inside ? loss.light : 0.f;
   const float by[3] = {warp_sum(seen * loss.r), warp_sum(seen * loss.g), warp_sum(seen * loss.b)};
-  int32_t furthest = stop;
+  int32_t furthest = stop;  // of the warp's pixels
   for (int step = 16; step > 0; step >>= 1) {
     const int32_t other = __shfl_xor_sync(kAll, furthest, step);
     furthest = furthest > other ? furthest : other;
   }
-  if (lane_of() == 0) {
-    for (int k = 0; k < 3; k++) light_by[warp_of()][k] = by[k];
-    last[warp_of()] = furthest;
+  if (lane == 0) {
+    for (int k = 0; k < 3; k++) room.light_by[warp][k] = by[k];
+    room.last[warp] = furthest;
   }
+  share(room, p, loss);
   __syncthreads();
   if (f.background && threadIdx.x < 3) {
     float total = 0.f;
-    for (int w = 0; w < kWarps; w++) total += light_by[w][threadIdx.x];
+    for (int w = 0; w < kWarps; w++) total += room.light_by[w][threadIdx.x];
     f.background[size_t{3} * blockIdx.x + threadIdx.x] = total;
   }
   if (!f.sums) return;
   int32_t end = 0;
-  for (int w = 0; w < kWarps; w++) end = end > last[w] ? end : last[w];
+  for (int w = 0; w < kWarps; w++) end = end > room.last[w] ? end : room.last[w];
   for (int32_t first = (end - 1) / kThreads * kThreads; end > 0 && first >= 0; first -= kThreads) {
     const int32_t mine = first + static_cast<int32_t>(threadIdx.x);
-    staged.reached[threadIdx.x] = 0;
+    room.staged.reached[threadIdx.x] = 0;
     if (mine < end) {
       const uint32_t value = frame.entry_values[range.first + mine];
-      const uint32_t row = frame.owners ? frame.owners[value] : value;
+      const uint32_t row = row_of(frame, value);
       const Brush<float> brush = load_brush(frame.brushes, row);
-      staged.put(frame, threadIdx.x, brush, row, p);
-      rims[threadIdx.x] = {frame.in.thresholds ? frame.in.thresholds[row] : 0.f,
-                           exp2(-brush.log_opacity)};
-      to[threadIdx.x] = value;
+      room.staged.put(threadIdx.x, brush, value, p);
+#if FP_THRESHOLD
+      room.rims[threadIdx.x] = {frame.in.thresholds ? frame.in.thresholds[row] : 0.f,
+                                exp2(-brush.log_opacity)};
+#endif
     }
     __syncthreads();
-    for (int base = kThreads - 32; base >= 0; base -= 32) {
-      if (first + base >= end) continue;
-      uint32_t done = 0;
-      for (uint32_t todo = staged.word(base); todo;) {
-        const int bit = 31 - __clz(static_cast<int>(todo)), j = base + bit;
-        todo &= ~(1u << bit);
-        const LocalBrush<float> b = staged.get(j);
+    uint8_t(&met)[kThreads] = room.met[warp];
+    const int count = meet_those(room.staged, furthest - first, met);
+    int next = 0;
+    for (bool more = count > 0 || frame.owners; more;) {
+      int filled = 0, its = 0;  // Gaussians in the bucket; this lane's
+      float* slot = room.parts[warp][0] + lane;
+      while (filled < kBucket && next < count) {
+        const int j = met[next++];
+        const LocalBrush<float> b = room.staged.get(j);
         const Meeting<float> m = meet(b, p.px, p.py);
-        const bool reached = m.exponent >= staged.c[j].w && first + j < stop;
+        const bool reached = m.exponent >= room.staged.c[j].w && first + j < stop;
         if (!__any_sync(kAll, reached)) continue;
-        float v[kPadded];
+        float parts[kParts] = {};
+        if (reached)
+          unblend(frame, b, room.rims[FP_THRESHOLD ? j : 0], room.staged.row[j], terms, m,
+                  loss, parts);
 #pragma unroll
-        for (int k = 0; k < kPadded; k++) v[k] = 0.f;
-#if FP_FEATURES
-        const float* its_features = staged.features[j];
-#else
-        const float* its_features = nullptr;
-#endif
-        if (reached) unblend(frame, b, rims[j], its_features, per_fragment, m, loss, v);
-        const float total = fold(v);
-        constexpr int lanes = 32 / kPadded;  // that have the same sum
-        const int which = lane_of() / lanes;
-        if (lane_of() % lanes == 0 && which < kSums) sums[warp_of()][bit][which] = total;
-        done |= 1u << bit;
+        for (int k = 0; k < kParts; k++) slot[32 * k] = parts[k];
+        slot += Room::kPitch;
+        if (filled++ == lane / kLanes) its = j;
       }
-      if (lane_of() == 0) written[warp_of()] = done;
-      __syncthreads();
-      for (int k = threadIdx.x; k < 32 * kSums; k += kThreads) {
-        const int j = k / kSums, which = k % kSums;
-        float total = 0.f;
-        bool any = false;
-        for (int w = 0; w < kWarps; w++)
-          if (written[w] >> j & 1) total += sums[w][j][which], any = true;
-        if (!any) continue;
-        if (frame.owners)
-          f.sums[size_t{kSums} * to[base + j] + which] = total;
-        else
-          atomicAdd(f.sums + size_t{kSums} * to[base + j] + which, total);
+      __syncwarp();
+      float v[kPadded];
+      if (filled > 0) {
+        gather(frame, room, its, v);
+        fold<kPadded, 1>(v);
       }
-      __syncthreads();
+      const auto give = [&] {
+        if (lane / kLanes >= filled) return;
+        float* to = f.sums + (size_t{kSums} * room.staged.row[its] + lane % kLanes);
+#pragma unroll
+        for (int i = 0; i < kEach; i++)
+          if ((i + 1) * kLanes <= kSums || i * kLanes + lane % kLanes < kSums)
+            atomicAdd(to + i * kLanes, v[i]);
+      };
+      more = next < count;
+      if (frame.owners) {  // one warp after the other
+#pragma unroll 1
+        for (int turn = 0; turn < kWarps; turn++) {
+          if (turn == warp) give();
+          __syncthreads();
+        }
+        more = !__syncthreads_and(!more);
+      } else {
+        give();
+        __syncwarp();
+      }
     }
+    __syncthreads();
   }
 }
 
