@@ -61,7 +61,8 @@ class Frame(ctypes.Structure):
         *_fields(ctypes.c_void_p, "counters project_words emit_words depth_histogram"),
         *_fields(ctypes.c_void_p, "tile_histogram ranges"),
         *_fields(ctypes.c_void_p, "brushes rects tiles first_slot depth_keys depth_ids"),
-        *_fields(ctypes.c_void_p, "entry_keys entry_values owners transmittance stop weights"),
+        *_fields(ctypes.c_void_p, "entry_keys entry_values owners reached transmittance"),
+        *_fields(ctypes.c_void_p, "stop weights"),
     )
 
 
@@ -84,6 +85,7 @@ class Undraw(ctypes.Structure):
         ("by", loader.OutputGrads),
         ("to", loader.InputGrads),
         *_fields(ctypes.c_void_p, "by_fragments background sums"),
+        ("ceiling", ctypes.c_float),
     )
 
 
@@ -314,6 +316,7 @@ class Drawing:
             first_slot=4 * n * slots,
             entry_values=4 * capacity,
             owners=4 * capacity * slots,
+            reached=capacity * keep,
             transmittance=4 * pixels * keep,
             stop=4 * pixels * keep,
         )
@@ -346,6 +349,7 @@ class Drawing:
             entry_keys=keys[0],
             entry_values=values[0],
             owners=kept["owners"] if slots else None,
+            reached=kept["reached"] if keep else None,
             transmittance=kept["transmittance"] if keep else None,
             stop=kept["stop"] if keep else None,
             weights=_address(weights),
@@ -503,7 +507,7 @@ class Drawing:
     ) -> dict[str, Tensor]:
         """Run the backward pass for gradients by the outputs; gradients by the inputs, by name."""
         assert self._frame is not None
-        frame, n, where = self._frame, self._n, self._where
+        inputs, frame, n, where = self._inputs, self._frame, self._n, self._where
         upstream = {
             "image": by_image,
             "invdepth": by_invdepth,
@@ -516,7 +520,7 @@ class Drawing:
             wanted,
             sh_turns="sh" in self._arrays and frame.inputs.sh_degree > 0,
             invdepth="invdepth" in by,
-            absolute=self._inputs.absolute_gradient,
+            absolute=inputs.absolute_gradient,
             offsets=self._spread is not None,
             features=self._channels if "features" in by else 0,
         )
@@ -541,6 +545,7 @@ class Drawing:
             by_fragments=_address(by.get("fragments")),
             background=_address(by_tile),
             sums=_address(room),
+            ceiling=math.inf if inputs.cap_gradient else inputs.alpha_max,
         )
         self._launch("unblend", macros, "fp_unblend", tiles, arguments)
         if per_gaussian:

@@ -33,7 +33,11 @@ FP_KERNEL(fp_blend, Frame, 2) {
     staged.reached[threadIdx.x] = 0;
     if (mine < range.end) {
       const uint32_t row = row_of(f, f.entry_values[mine]);
-      staged.put(threadIdx.x, load_brush(f.brushes, row), row, p);
+      const Brush<float> brush = load_brush(f.brushes, row);
+      staged.put(threadIdx.x, brush, row, p);
+      const uint8_t reached = sub_tiles_of(brush, p);
+      staged.reached[threadIdx.x] = reached;
+      if (f.reached) f.reached[mine] = reached;
     }
     __syncthreads();
     for (int base = 0; base < kThreads; base += 32) {

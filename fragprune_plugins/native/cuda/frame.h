@@ -68,6 +68,7 @@ struct Frame {
   uint32_t* entry_keys;     // (E) tiles
   uint32_t* entry_values;   // (E) rows, or slots where slots are kept; sorted by tile later on
   uint32_t* owners;         // (E) rows by slot; or NULL: no slots
+  uint8_t* reached;         // (E) the sub-tiles that it reaches; or NULL, as transmittance
   float* transmittance;     // (H, W) final; or NULL: no backward pass will come
   int32_t* stop;            // (H, W) fragments at this place of the list or later are not alive
   uint64_t* weights;        // (N) sums of alpha T in units of 2^-32, zero when a frame begins

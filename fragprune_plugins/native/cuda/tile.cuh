@@ -37,7 +37,7 @@ __device__ inline Pixel pixel_of(const Frame& f) {
 }
 
 // Bit w: the brush reaches the sub-tile of warp w.
-__device__ inline uint32_t sub_tiles_of(const Brush<float>& b, const Pixel& tile) {
+__device__ inline uint8_t sub_tiles_of(const Brush<float>& b, const Pixel& tile) {
   const float x = b.x - static_cast<float>(tile.tile_x), y = b.y - static_cast<float>(tile.tile_y);
   const Ellipse<float> e = ellipse_of(b.scale, b.skew, b.down, b.log_opacity - b.list_cut, tile.spread);
   const float above = y - tile.spread, below = y + tile.spread;  // see Bounds
@@ -54,7 +54,7 @@ __device__ inline uint32_t sub_tiles_of(const Brush<float>& b, const Pixel& tile
     if (left <= kSubWidth - 1 && right >= 0.f) reached |= 1u << 2 * band;
     if (left <= kTile - 1 && right >= kSubWidth) reached |= 2u << 2 * band;
   }
-  return reached;
+  return static_cast<uint8_t>(reached);
 }
 
 // Up to kThreads Gaussians of the tile's list, one brought in by each thread, read by all.
@@ -63,7 +63,7 @@ struct Staged {
   float4 b[kThreads];  // v0, log_opacity, cut, inv_z
   float4 c[kThreads];  // r, g, b, list_cut
   uint32_t row[kThreads];  // or entry
-  uint8_t reached[kThreads];
+  uint8_t reached[kThreads];  // sub-tiles
 
   __device__ void put(int j, const Brush<float>& brush, uint32_t its_row, const Pixel& tile) {
     const LocalBrush<float> l = localize(brush, static_cast<float>(tile.tile_x),
@@ -72,7 +72,6 @@ struct Staged {
     b[j] = make_float4(l.v0, l.log_opacity, l.cut, l.inv_z);
     c[j] = make_float4(l.r, l.g, l.b, brush.list_cut);
     row[j] = its_row;
-    reached[j] = static_cast<uint8_t>(sub_tiles_of(brush, tile));
   }
   __device__ LocalBrush<float> get(int j) const {
     const float4 p = a[j], q = b[j], s = c[j];

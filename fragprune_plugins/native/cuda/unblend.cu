@@ -46,8 +46,6 @@ constexpr int kRimAt = 1, kWeightAt = kRimAt + FP_THRESHOLD,
 constexpr int kInvDepthOf = 3 * FP_COLOUR, kFeaturesOf = kInvDepthOf + FP_DEPTH,
               kPlaceOf = kFeaturesOf + FP_FEATURES, kPlanes = kPlaceOf + 2 * FP_OFFSETS;
 
-constexpr float kEndless = 3e38f;
-
 struct Undraw {
   Frame frame;
   fragprune_output_grads by;
@@ -55,6 +53,7 @@ struct Undraw {
   const float* by_fragments;  // (1) by fragments_per_pixel, which `by` has no use for; or NULL
   float* background;          // (T, 3) tile by tile; or NULL
   float* sums;                // (N, kSums), or by slot (E, kSums), zero at first; or NULL
+  float ceiling;              // alphas above have no gradient
 };
 
 #ifdef FP_UNDRAW_SIZE
@@ -106,23 +105,11 @@ struct LossPixel {
   float behind;  // gradient of all that lies behind it, weighted
 };
 
-// The same for all fragments.
-struct Terms {
-  float per_fragment;  // gradient of a fragment's being there at all
-  float ceiling;       // alphas above have no gradient
-};
-
-__device__ inline Terms terms_of(const Undraw& u) {
-  const fragprune_inputs& in = u.frame.in;
-  const float pixels = static_cast<float>(in.width) * static_cast<float>(in.height);
-  return {u.by_fragments ? *u.by_fragments / pixels : 0.f,
-          in.cap_gradient ? kEndless : in.alpha_max};
-}
-
 // Takes a pixel from behind a fragment before its stop to before it; what is left of the fragment.
-__device__ inline void unblend(const Frame& f, const LocalBrush<float>& b, const Rim& rim,
-                               uint32_t entry, const Terms& t, const Meeting<float>& m,
+__device__ inline void unblend(const Undraw& u, const LocalBrush<float>& b, const Rim& rim,
+                               uint32_t entry, float per_fragment, const Meeting<float>& m,
                                LossPixel& p, float (&parts)[kParts]) {
+  const Frame& f = u.frame;
   const bool drawn = m.exponent >= b.cut;
   const float uncapped = exp2(m.exponent), full = min(uncapped, f.in.alpha_max);
   const float alpha = drawn ? full : 0.f;
@@ -141,11 +128,11 @@ __device__ inline void unblend(const Frame& f, const LocalBrush<float>& b, const
   const float by_alpha = fnma(p.behind, inv, light * shade);
   p.light = light;
   p.behind = fma(weight, shade, p.behind);
-  parts[0] = drawn && uncapped <= t.ceiling ? uncapped * by_alpha : 0.f;
+  parts[0] = drawn && uncapped <= u.ceiling ? uncapped * by_alpha : 0.f;
 #if FP_THRESHOLD
   const float away = abs(uncapped * rim.inv_opacity - rim.threshold);
   if (away <= kRimHorizon)
-    parts[kRimAt] = -fma(full, by_alpha, t.per_fragment) * rim_density(away);
+    parts[kRimAt] = -fma(full, by_alpha, per_fragment) * rim_density(away);
 #endif
   if constexpr (kParts > kWeightAt) parts[kWeightAt] = weight;
 }
@@ -387,7 +374,10 @@ FP_KERNEL(fp_unblend, Undraw, 2) {
   const Range range = frame.ranges[blockIdx.x];
   LossPixel loss = load_loss(f, p);
   const int32_t stop = p.inside ? frame.stop[p.at] : 0;
-  const Terms terms = terms_of(f);
+  const float per_fragment =
+      f.by_fragments ? *f.by_fragments / (static_cast<float>(frame.in.width) *
+                                          static_cast<float>(frame.in.height))
+                     : 0.f;
   const float seen = p.inside ? loss.light : 0.f;
   const float by[3] = {warp_sum(seen * loss.r), warp_sum(seen * loss.g), warp_sum(seen * loss.b)};
   int32_t furthest = stop;  // of the warp's pixels
@@ -417,6 +407,7 @@ FP_KERNEL(fp_unblend, Undraw, 2) {
       const uint32_t row = row_of(frame, value);
       const Brush<float> brush = load_brush(frame.brushes, row);
       room.staged.put(threadIdx.x, brush, value, p);
+      room.staged.reached[threadIdx.x] = frame.reached[range.first + mine];
 #if FP_THRESHOLD
       room.rims[threadIdx.x] = {frame.in.thresholds ? frame.in.thresholds[row] : 0.f,
                                 exp2(-brush.log_opacity)};
@@ -427,24 +418,25 @@ FP_KERNEL(fp_unblend, Undraw, 2) {
     const int count = meet_those(room.staged, furthest - first, met);
     int next = 0;
     for (bool more = count > 0 || frame.owners; more;) {
-      int filled = 0, its = 0;  // Gaussians in the bucket; this lane's
+      int filled = 0;  // Gaussians in the bucket: met[0] and so on, which have been read by then
       float* slot = room.parts[warp][0] + lane;
       while (filled < kBucket && next < count) {
         const int j = met[next++];
         const LocalBrush<float> b = room.staged.get(j);
         const Meeting<float> m = meet(b, p.px, p.py);
-        const bool reached = m.exponent >= room.staged.c[j].w && first + j < stop;
+        const bool reached = m.exponent >= room.staged.c[j].w && j < stop - first;
         if (!__any_sync(kAll, reached)) continue;
         float parts[kParts] = {};
         if (reached)
-          unblend(frame, b, room.rims[FP_THRESHOLD ? j : 0], room.staged.row[j], terms, m,
-                  loss, parts);
+          unblend(f, b, room.rims[FP_THRESHOLD ? j : 0], room.staged.row[j], per_fragment, m, loss,
+                  parts);
 #pragma unroll
         for (int k = 0; k < kParts; k++) slot[32 * k] = parts[k];
         slot += Room::kPitch;
-        if (filled++ == lane / kLanes) its = j;
+        met[filled++] = static_cast<uint8_t>(j);
       }
       __syncwarp();
+      const int its = met[lane / kLanes];
       float v[kPadded];
       if (filled > 0) {
         gather(frame, room, its, v);
