@@ -30,6 +30,8 @@ EVERYTHING = {
     **dict.fromkeys(("FP_THRESHOLD", "FP_DEPTH", "FP_ABSOLUTE", "FP_OFFSETS"), 1),
 }
 
+TRAINED = unblend_macros(frozenset(("means", "opacities", "thresholds")), sh_turns=True)
+"""Training that asks for no depth: three blocks of it shall fit."""
 
 TUNED = unblend_macros(frozenset(("opacities", "thresholds")), sh_turns=True)
 """Fine-tuning."""
@@ -66,6 +68,7 @@ def test_all_kernels_compile_without_stack_or_spills(
             for source, macros in (
                 ("scene", {}),
                 ("unblend", {}),
+                ("unblend", TRAINED),
                 ("unblend", TUNED),
                 ("blend", {}),
             )

@@ -78,6 +78,7 @@ struct RoomFor {
 };
 constexpr int kBucket = sizeof(RoomFor<8>) <= 48 << 10 ? 8 : 4;
 using Room = RoomFor<kBucket>;
+constexpr int kResident = kSums <= 10 ? 3 : 2;  // blocks, as many as registers allow
 
 constexpr int kLanes = 32 / kBucket;  // that a Gaussian's pixels are shared out to, kBucket to each
 constexpr int kEach = (kSums + kLanes - 1) / kLanes, kPadded = kEach * kLanes;
@@ -366,7 +367,7 @@ __device__ inline int meet_those(const Staged& staged, int32_t end, uint8_t (&me
 
 // ---- kernels ---------------------------------------------------------------------------------
 
-FP_KERNEL(fp_unblend, Undraw, 2) {
+FP_KERNEL(fp_unblend, Undraw, kResident) {
   const Frame& frame = f.frame;
   __shared__ Room room;
   const int warp = warp_of(), lane = lane_of();
