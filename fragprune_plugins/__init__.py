@@ -10,19 +10,31 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fragprune_plugins.api import activate, deactivate, paused
-    from fragprune_plugins.engines import rasterize
+    from fragprune_plugins.engines import rasterize, slice_at
     from fragprune_plugins.finetuning import finetune
     from fragprune_plugins.schedule import Settings
     from fragprune_plugins.thresholds import ThresholdStore
-    from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats, View
+    from fragprune_plugins.types import (
+        Footprints,
+        Moment,
+        RasterInputs,
+        RasterOutputs,
+        Sliced,
+        SpacetimeSplats,
+        Splats,
+        View,
+    )
 
 __version__ = "0.1.0"
 
 _HOME = {
     "Footprints": "types",
+    "Moment": "types",
     "RasterInputs": "types",
     "RasterOutputs": "types",
     "Settings": "schedule",
+    "Sliced": "types",
+    "SpacetimeSplats": "types",
     "Splats": "types",
     "ThresholdStore": "thresholds",
     "View": "types",
@@ -31,13 +43,17 @@ _HOME = {
     "finetune": "finetuning",
     "paused": "api",
     "rasterize": "engines",
+    "slice_at": "engines",
 }
 
 __all__ = [
     "Footprints",
+    "Moment",
     "RasterInputs",
     "RasterOutputs",
     "Settings",
+    "Sliced",
+    "SpacetimeSplats",
     "Splats",
     "ThresholdStore",
     "View",
@@ -47,6 +63,7 @@ __all__ = [
     "finetune",
     "paused",
     "rasterize",
+    "slice_at",
 ]
 
 

@@ -35,6 +35,9 @@ MIP_FLOOR: Final = 1e-6
 FEATURES_MAX: Final = 8
 """Most channels that one rasterization blends beside colour."""
 
+MARGINAL_MIN: Final = 0.05
+"""A Gaussian is not there when the moment is this unlikely for it, 1 at its mean in time."""
+
 RIM_WIDTH: Final = 0.01
 """Width w, in falloff, of the surrogate s((g - tau)/w) at the rim; results are flat .003 to .03."""
 

@@ -42,6 +42,19 @@ def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
         )
 
 
+def _check_degree(name: str, sh: Tensor | None, degree: int) -> None:
+    """Raise InputError unless the degree is 0 to 3, and sh has coefficients enough for it."""
+    if not 0 <= degree <= 3:
+        raise InputError(f"{name}.sh_degree", str(degree), "0 to 3", "Lower the SH degree.")
+    if sh is not None and sh.shape[1] < (degree + 1) ** 2:
+        raise InputError(
+            f"{name}.sh",
+            f"{sh.shape[1]} coefficients",
+            f"at least {(degree + 1) ** 2} for degree {degree}",
+            "Lower the SH degree or pass all coefficients.",
+        )
+
+
 @dataclass(frozen=True)
 class View:
     """One camera at one moment, in the hosts' convention.
@@ -185,17 +198,7 @@ class Splats:
                 "exactly one of them",
                 "Pass one of the two.",
             )
-        if not 0 <= self.sh_degree <= 3:
-            raise InputError(
-                "Splats.sh_degree", str(self.sh_degree), "0 to 3", "Lower the SH degree."
-            )
-        if self.sh is not None and self.sh.shape[1] < (self.sh_degree + 1) ** 2:
-            raise InputError(
-                "Splats.sh",
-                f"{self.sh.shape[1]} coefficients",
-                f"at least {(self.sh_degree + 1) ** 2} for degree {self.sh_degree}",
-                "Lower the SH degree or pass all coefficients.",
-            )
+        _check_degree("Splats", self.sh, self.sh_degree)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -204,6 +207,137 @@ class Splats:
     def device(self) -> torch.device:
         """Where the Gaussians live."""
         return self.means.device
+
+
+@dataclass(frozen=True)
+class SpacetimeSplats:
+    """N Gaussians in space and time, activated; a ``Moment`` cuts them.
+
+    They are given in one of four ways. ``cov3d``: sliced already, only colours depend on the
+    moment. ``scales`` and ``rotations``: in space alone. With ``times`` and ``scales_t``: in time,
+    apart from space. With ``rotations_r`` too: with axes anywhere in space and time.
+
+    Attributes:
+        means: (N, 3) world.
+        opacities: (N,) in (0, 1).
+        times: (N,) means in time.
+        scales: (N, 3) standard deviations, world units.
+        scales_t: (N,) in time: a standard deviation with ``rotations_r``, else a variance.
+        rotations: (N, 4) quaternions w, x, y, z; used as given, the host normalises.
+        rotations_r: (N, 4) the right ones; ``rotations`` are the left ones then.
+        cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz; scale_modifier does not apply.
+        sh: (N, K, 3), 16 coefficients to each cosine in time; None for no colours.
+        sh_degree: 0 to 3, how many bands of ``sh`` are used.
+    """
+
+    means: Tensor
+    opacities: Tensor
+    times: Tensor | None = None
+    scales: Tensor | None = None
+    scales_t: Tensor | None = None
+    rotations: Tensor | None = None
+    rotations_r: Tensor | None = None
+    cov3d: Tensor | None = None
+    sh: Tensor | None = None
+    sh_degree: int = 0
+
+    def __post_init__(self) -> None:
+        _check("SpacetimeSplats.means", self.means, None, 3)
+        n = len(self.means)
+        widths: dict[str, tuple[int | None, ...]] = {
+            **dict.fromkeys(("opacities", "times", "scales_t"), ()),
+            **dict.fromkeys(("rotations", "rotations_r"), (4,)),
+            "scales": (3,),
+            "cov3d": (6,),
+            "sh": (None, 3),
+        }
+        for name, width in widths.items():
+            _check(f"SpacetimeSplats.{name}", getattr(self, name), n, *width)
+        given = tuple(
+            getattr(self, name) is not None
+            for name in ("cov3d", "scales", "rotations", "scales_t", "rotations_r")
+        )
+        if given not in _SPACETIME_KINDS or (self.scales_t is not None and self.times is None):
+            raise InputError(
+                "SpacetimeSplats",
+                "cov3d, scales, rotations and times as given",
+                "cov3d alone, or scales and rotations, with scales_t and times, with rotations_r",
+                "Pass one of the four.",
+            )
+        _check_degree("SpacetimeSplats", self.sh, self.sh_degree)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians live."""
+        return self.means.device
+
+
+_SPACETIME_KINDS = (
+    (True, False, False, False, False),
+    (False, True, True, False, False),
+    (False, True, True, True, False),
+    (False, True, True, True, True),
+)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When and from where Gaussians in space and time are seen.
+
+    Attributes:
+        timestamp: the moment.
+        campos: (3,) camera centre in the world, for colour.
+        duration: longest period of the cosines that colour goes with; above 0.
+        sh_degree_t: how many of them are used at ``sh_degree`` 3, 0 to 2; None for colours that
+            time leaves alone.
+        prefilter_var: when positive, added to the variance in time that the marginal sees.
+        scale_modifier: factor on the scales.
+    """
+
+    timestamp: float
+    campos: Tensor
+    duration: float = 1.0
+    sh_degree_t: int | None = None
+    prefilter_var: float = -1.0
+    scale_modifier: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check("Moment.campos", self.campos, 3)
+        checks = (
+            ("duration", self.duration > 0, "above 0"),
+            ("sh_degree_t", self.sh_degree_t in (None, 0, 1, 2), "None, 0, 1 or 2"),
+        )
+        for name, holds, expected in checks:
+            if not holds:
+                raise InputError(
+                    f"Moment.{name}",
+                    repr(getattr(self, name)),
+                    expected,
+                    "Check the call's arguments.",
+                )
+
+
+@dataclass(frozen=True)
+class Sliced:
+    """N Gaussians at a moment. Who is not there is at the camera, and all else of it is 0.
+
+    Attributes:
+        means: (N, 3) world.
+        cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
+        opacities: (N,) times how likely the moment is.
+        present: (N,) bool, those that are there: the moment is likelier than 0.05, 1 at its mean in
+            time, and the covariance is finite.
+        colors: (N, 3) RGB, not below 0; None without ``sh``.
+    """
+
+    means: Tensor
+    cov3d: Tensor
+    opacities: Tensor
+    present: Tensor
+    colors: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,14 @@ of the vanilla CUDA rasterizer, down to which derivatives that rasterizer leaves
 
     covariance -> project -> (sh) -> fragment -> composite,  all called by ``render``.
 
-``render_footprints`` enters after the projection, for those who project in a way of their own.
+``render_footprints`` enters after the projection, for those who project in a way of their own;
+``slice_gaussians`` comes before, for Gaussians in space and time.
 """
 
 from reference_renderer.project import Footprints
 from reference_renderer.render import render, render_footprints
 from reference_renderer.scene import Camera, Gaussians, Options, Rendering
+from reference_renderer.spacetime import SpacetimeGaussians, slice_gaussians
 
 __all__ = [
     "Camera",
@@ -19,6 +21,8 @@ __all__ = [
     "Gaussians",
     "Options",
     "Rendering",
+    "SpacetimeGaussians",
     "render",
     "render_footprints",
+    "slice_gaussians",
 ]

@@ -113,7 +113,7 @@ class RT4DGS(GraphdecoAdapter):
         """
         import torch
 
-        from fragprune_rt_4dgs.slice4d import MARGINAL_MIN
+        from fragprune_plugins.constants import MARGINAL_MIN
 
         if call.get("cov3D_precomp") is None or model.gaussian_dim != 4:
             return None

@@ -13,8 +13,7 @@ from fragprune_plugins.lineage import GraphdecoDialect
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
-    from fragprune_rt_4dgs.slice4d import Moment
+    from fragprune_plugins.types import RasterInputs, RasterOutputs, Sliced
 
 RASTERIZER = "gaussian_renderer.diff_gaussian_rasterization"
 """A file of the host, compiled when it is imported."""
@@ -29,25 +28,24 @@ OUTPUTS = 6
 
 @dataclass(frozen=True)
 class RT4DGSDialect(GraphdecoDialect):
-    """Slices the 4D Gaussians at the call's moment, in torch; an engine draws what is left."""
+    """Slices the 4D Gaussians at the call's moment; an engine draws what is left."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Depth and optical flow become features; rows that are not there go behind the camera.
+        """Depth and optical flow become features; rows that are not there are at the camera.
 
         The host also drops a Gaussian whose integer radius is not above 0.4. With 0.3 pixels^2 of
         dilation no radius is below 3, so only a covariance that is not finite is meant.
         """
         import torch
 
-        s, moment = call.settings, at_moment(call)
-        there = (moment.present & moment.cov3d.isfinite().all(dim=1))[:, None]
-        means = torch.where(there, moment.means, s.campos)
+        s, sliced = call.settings, at_moment(call)
+        means = sliced.means
         flat = {
             "means3D": means,
             "means2D": call.get("means2D"),
-            "opacities": moment.opacities,
-            "cov3D_precomp": moment.cov3d,
-            "colors_precomp": _colors(call, moment),
+            "opacities": sliced.opacities,
+            "cov3D_precomp": sliced.cov3d,
+            "colors_precomp": call["colors_precomp"] if sliced.colors is None else sliced.colors,
         }
         inputs = super().unpack(HostCall(s, flat))
         depths = means @ s.viewmatrix[:3, 2:3] + s.viewmatrix[3, 2]
@@ -80,42 +78,38 @@ class RT4DGSDialect(GraphdecoDialect):
         return {**super().modules(draw), **neighbours.modules()}
 
 
-def at_moment(call: HostCall) -> Moment:
+def at_moment(call: HostCall) -> Sliced:
     """The Gaussians of a call as 3D Gaussians, by whichever of the host's paths it asks for."""
-    import torch
+    from fragprune_plugins import Moment, SpacetimeSplats, slice_at
 
-    from fragprune_rt_4dgs import slice4d
-
-    s, means = call.settings, call["means3D"]
-    opacities = call["opacities"].reshape(-1)
-    given = call.get("cov3D_precomp")
-    if given is not None:  # the host sliced them itself, in Python, and left out who is not there
-        everyone = torch.ones_like(opacities, dtype=torch.bool)
-        return slice4d.Moment(means, given, opacities, everyone)
-    scales, turns = call["scales"] * s.scale_modifier, call["rotations"]
-    if s.gaussian_dim == 3 and not s.rot_4d:
-        everyone = torch.ones_like(opacities, dtype=torch.bool)
-        cov3d = slice4d.upper(slice4d.covariance(slice4d.rotation(turns), scales))
-        return slice4d.Moment(means, cov3d, opacities, everyone)
-    times = call["ts"].reshape(-1)
-    scales = torch.cat([scales, call["scales_t"].reshape(-1, 1) * s.scale_modifier], dim=1)
-    variance = float(call.arguments.get("prefilter_var", -1.0))
-    when = {"timestamp": float(s.timestamp), "prefilter_var": variance}
-    if s.rot_4d:
-        both = turns, call["rotations_r"]
-        return slice4d.joint(means, opacities, times, scales, both, **when)
-    return slice4d.separate(means, opacities, times, scales, turns, **when)
-
-
-def _colors(call: HostCall, moment: Moment) -> Tensor:
-    """(N, 3) RGB: the host's, or from its harmonics, with or without time."""
-    from fragprune_rt_4dgs.color4d import Clock, colors
-
-    s, sh = call.settings, call.get("shs")
-    if sh is None:
-        return call["colors_precomp"]
-    clock = None
-    if s.gaussian_dim == 4 and not s.force_sh_3d:
-        times, duration = call["ts"].reshape(-1), float(s.time_duration)
-        clock = Clock(times, float(s.timestamp), duration, int(s.sh_degree_t))
-    return colors(sh, call["means3D"], moment.means, s.campos, int(s.sh_degree), clock)
+    s, given = call.settings, {}
+    in_time = s.gaussian_dim == 4 or s.rot_4d
+    if call.get("cov3D_precomp") is not None:  # the host sliced, and left out who is not there
+        given["cov3d"] = call["cov3D_precomp"]
+    else:
+        given |= {"scales": call["scales"], "rotations": call["rotations"]}
+        if in_time:
+            given["scales_t"] = call["scales_t"].reshape(-1)
+        if s.rot_4d:
+            given["rotations_r"] = call["rotations_r"]
+    if in_time:
+        given["times"] = call["ts"].reshape(-1)
+    splats = SpacetimeSplats(
+        means=call["means3D"],
+        opacities=call["opacities"].reshape(-1),
+        sh=call.get("shs"),
+        sh_degree=int(s.sh_degree),
+        **given,
+    )
+    timed = s.gaussian_dim == 4 and not s.force_sh_3d
+    return slice_at(
+        splats,
+        Moment(
+            timestamp=float(s.timestamp),
+            campos=s.campos,
+            duration=float(s.time_duration),
+            sh_degree_t=int(s.sh_degree_t) if timed else None,
+            prefilter_var=float(call.arguments.get("prefilter_var", -1.0)),
+            scale_modifier=float(s.scale_modifier),
+        ),
+    )

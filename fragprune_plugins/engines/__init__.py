@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
 from fragprune_plugins.errors import EngineError, InputError
@@ -10,7 +11,13 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
+    from fragprune_plugins.types import (
+        Moment,
+        RasterInputs,
+        RasterOutputs,
+        Sliced,
+        SpacetimeSplats,
+    )
 
 ENGINES = ("reference", "cpu", "cuda")
 
@@ -22,6 +29,13 @@ class Engine(Protocol):
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+
+
+class Slicer(Protocol):
+    """What our own engines do beside."""
+
+    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
+        """Cut Gaussians in space and time at a moment; inputs that require gradients get them."""
 
 
 def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
@@ -55,6 +69,26 @@ def _fastest(device: str) -> str:
     from fragprune_plugins.native import loader
 
     return "cpu" if device.startswith("cpu") and loader.available() else "reference"
+
+
+_slicer = cache(create_engine)
+"""Engines keep memory and kernels that the next frame uses again."""
+
+
+def slice_at(splats: SpacetimeSplats, moment: Moment) -> Sliced:
+    """The 3D Gaussians that Gaussians in space and time are at a moment. Differentiable.
+
+    By the fastest of our engines on the device of the splats. Gradients are those of RT-4DGS,
+    whose kernels differentiate by hand: without ``rotations_r`` the marginal has none; colours are
+    differentiated as seen where the moment has moved the means, though shown as seen where they are
+    stored; where time has a say in them, the second coefficient gets the first one's gradient, and
+    the times that of the highest cosine alone, with the opposite sign.
+
+    Raises:
+        InputError: harmonics with fewer coefficients than the moment's cosines take.
+    """
+    slicer: Slicer = _slicer(_fastest(str(splats.device)))  # type: ignore[assignment]
+    return slicer.slice(splats, moment)
 
 
 def rasterize(

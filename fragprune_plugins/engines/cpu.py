@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_args
 import torch
 from torch.autograd.function import once_differentiable
 
+from fragprune_plugins.engines.slicing import address as _address
+from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.native import loader
 from fragprune_plugins.types import Compensation, Footprints, RasterOutputs, Splats
@@ -18,7 +20,7 @@ from fragprune_plugins.types import Compensation, Footprints, RasterOutputs, Spl
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.types import Moment, RasterInputs, Sliced, SpacetimeSplats
 
 # The differentiable inputs, in the order in which the autograd function takes them.
 _NAMES = (
@@ -62,10 +64,6 @@ def _empty(workspace: loader.Workspace, *shape: int, dtype: torch.dtype = torch.
     if size < _SMALL:
         return torch.empty(shape, dtype=dtype)
     return torch.frombuffer(workspace.take(size), dtype=dtype).view(shape)
-
-
-def _address(tensor: Tensor | None) -> int | None:
-    return None if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
 
 
 def _stop(status: int, error: loader.Error) -> NoReturn:
@@ -232,6 +230,32 @@ class _Rasterize(torch.autograd.Function):
         return tuple(given)
 
 
+@dataclass(frozen=True)
+class _Blade:
+    """Cuts with the compiled library; see ``engines.slicing``."""
+
+    library: loader.Library
+    workspace: loader.Workspace
+    where = torch.device("cpu")
+
+    def empty(self, *shape: int) -> Tensor:
+        return _empty(self.workspace, *shape)
+
+    def slice(self, given: loader.Spacetime, to: loader.Sliced) -> None:
+        self._call("fragprune_slice", given, to)
+
+    def unslice(
+        self, given: loader.Spacetime, by: loader.Sliced, to: loader.SpacetimeGrads
+    ) -> None:
+        self._call("fragprune_unslice", given, by, to)
+
+    def _call(self, function: str, *structs: ctypes.Structure) -> None:
+        error = loader.Error()
+        status = getattr(self.library.calls, function)(*map(ctypes.byref, (*structs, error)))
+        if status != loader.OK:
+            _stop(status, error)
+
+
 class CpuEngine:
     """Rasterizes with the compiled library: any number of threads, the same result to the bit.
 
@@ -277,6 +301,10 @@ class CpuEngine:
             stages=drawing.stages,
             **{name: tensor.to(device) for name, tensor in drawing.found.items()},
         )
+
+    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
+        """Cut Gaussians in space and time at a moment."""
+        return slice_by(_Blade(self._library, self._workspace), splats, moment)
 
 
 def _channels(features: Tensor | None) -> int:

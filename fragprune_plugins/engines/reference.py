@@ -4,8 +4,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats
-from reference_renderer import Camera, Gaussians, Options, Rendering, render, render_footprints
+from fragprune_plugins.engines.slicing import check_harmonics
+from fragprune_plugins.types import (
+    Footprints,
+    Moment,
+    RasterInputs,
+    RasterOutputs,
+    Sliced,
+    SpacetimeSplats,
+    Splats,
+)
+from reference_renderer import (
+    Camera,
+    Gaussians,
+    Options,
+    Rendering,
+    SpacetimeGaussians,
+    render,
+    render_footprints,
+    slice_gaussians,
+)
 from reference_renderer import Footprints as Projected
 
 if TYPE_CHECKING:
@@ -34,6 +52,12 @@ class ReferenceEngine:
             wins_per_gaussian=drawn.wins_per_gaussian if inputs.scores else None,
             winners=drawn.winners if inputs.scores else None,
         )
+
+    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
+        """Cut Gaussians in space and time at a moment."""
+        check_harmonics(splats, moment)
+        given = SpacetimeGaussians(**vars(splats))
+        return Sliced(**vars(slice_gaussians(given, **vars(moment))))
 
 
 def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:

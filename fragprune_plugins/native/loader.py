@@ -10,7 +10,7 @@ import weakref
 from dataclasses import dataclass
 from typing import Any, Final
 
-API_VERSION: Final = 3
+API_VERSION: Final = 4
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -105,6 +105,39 @@ class InputGrads(_Sized):
     )
 
 
+class Spacetime(_Sized):
+    """fragprune_spacetime."""
+
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        ("threads", ctypes.c_int32),
+        ("timestamp", ctypes.c_float),
+        ("duration", ctypes.c_float),
+        ("prefilter_var", ctypes.c_float),
+        ("scale_modifier", ctypes.c_float),
+        ("sh_degree", ctypes.c_int32),
+        ("sh_degree_t", ctypes.c_int32),
+        ("sh_coefficients", ctypes.c_int32),
+        ("count", ctypes.c_int64),
+        *_pointers("campos means opacities times scales scales_t rotations rotations_r cov3d sh"),
+    )
+
+
+class Sliced(_Sized):
+    """fragprune_sliced."""
+
+    _fields_ = (("size", ctypes.c_uint32), *_pointers("means cov3d opacities colors present"))
+
+
+class SpacetimeGrads(_Sized):
+    """fragprune_spacetime_grads."""
+
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        *_pointers("means opacities times scales scales_t rotations rotations_r cov3d sh"),
+    )
+
+
 @dataclass(frozen=True)
 class Library:
     """An opened build.
@@ -159,6 +192,17 @@ def open_build(build: str) -> Library:
         ctypes.POINTER(OutputGrads),
         ctypes.POINTER(InputGrads),
         ctypes.c_int32,
+        ctypes.POINTER(Error),
+    ]
+    calls.fragprune_slice.argtypes = [
+        ctypes.POINTER(Spacetime),
+        ctypes.POINTER(Sliced),
+        ctypes.POINTER(Error),
+    ]
+    calls.fragprune_unslice.argtypes = [
+        ctypes.POINTER(Spacetime),
+        ctypes.POINTER(Sliced),
+        ctypes.POINTER(SpacetimeGrads),
         ctypes.POINTER(Error),
     ]
     calls.fragprune_free.argtypes = [_POINTER]

@@ -31,13 +31,17 @@ def _decide_anew():
 def test_header_and_python_hold_the_same_constants() -> None:
     found = dict(re.findall(r"#define FRAGPRUNE_([A-Z_]+) ([-(0-9][^\n]*)", HEADER))
     assert int(found.pop("API_VERSION")) == loader.API_VERSION
-    assert len(found) == 14
+    assert len(found) == 15
     for name, value in found.items():
         assert eval(value) == getattr(constants, name), name
 
 
 @pytest.mark.parametrize(
-    "mirror", [loader.Inputs, loader.Outputs, loader.OutputGrads, loader.InputGrads, loader.Error]
+    "mirror",
+    [
+        *(loader.Inputs, loader.Outputs, loader.OutputGrads, loader.InputGrads, loader.Error),
+        *(loader.Spacetime, loader.Sliced, loader.SpacetimeGrads),
+    ],
 )
 def test_header_and_python_hold_the_same_structs(mirror: type[ctypes.Structure]) -> None:
     name = f"fragprune_{re.sub(r'(?<!^)(?=[A-Z])', '_', mirror.__name__).lower()}"

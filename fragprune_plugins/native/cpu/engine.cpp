@@ -11,6 +11,7 @@
 
 #include "binning.h"
 #include "blend.h"
+#include "slice.h"
 
 namespace fp {
 
@@ -378,28 +379,6 @@ PixelSums<Lanes> unpack_sums(const Lanes* v, int want) {
   return s;
 }
 
-// kLanes Gaussians by their rows of the inputs. `count` are meant; the others repeat the last.
-struct Picked {
-  uint32_t ids[kLanes];
-  int count;
-
-  template <int kWidth>
-  void write(float* to, const Lanes* column) const {
-    if (!to) return;
-    float values[kWidth][kLanes];
-    for (int k = 0; k < kWidth; k++) store(values[k], column[k]);
-    for (int lane = 0; lane < count; lane++)
-      for (int k = 0; k < kWidth; k++)
-        to[static_cast<size_t>(ids[lane]) * kWidth + k] = values[k][lane];
-  }
-  void write(float* to, const Vec<Lanes>& v) const { write<3>(to, &v.x); }
-  void write(float* to, const Lanes* column, int width) const {
-    for (int k = 0; to && k < width; k++)
-      for (int lane = 0; lane < count; lane++)
-        to[static_cast<size_t>(ids[lane]) * width + k] = column[k][lane];
-  }
-};
-
 // From the sums over pixels to the inputs.
 class Chain {
  public:
@@ -454,42 +433,21 @@ class Chain {
   Vec<Lanes> colour(const Picked& who, const Vec<Lanes>& mean, const PixelSums<Lanes>& sums) const {
     const bool by_direction = to_.means && in_.sh_degree > 0;
     Lanes inv_length;
-    const Vec<Lanes> direction = direction_to(c_, mean, inv_length);
+    const Vec<Lanes> direction = direction_to(c_.centre, mean, inv_length);
     Harmonics<Lanes> h;
     const int terms = harmonics(in_.sh_degree, direction, h, by_direction);
-    Coefficients coefficients;
-    load_coefficients(in_, who.ids, terms, coefficients);
-    const Vec<Lanes> g = through_clamp(raw_colour(h, terms, coefficients), sums);
-    if (to_.sh) write_sh(who, h, terms, g);
+    const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
+    Coefficients coefficients, by;
+    load_coefficients(in_.sh, width, who.ids, terms, coefficients);
+    const Vec<Lanes> g =
+        through_clamp(raw_colour(h, terms, coefficients), {sums.r, sums.g, sums.b});
+    if (to_.sh) {
+      for (int k = 0; k < terms; k++) by.set(k, h.value[k] * g);
+      store_coefficients(by, terms, who, to_.sh, width);
+      clear_rest(who, to_.sh, 3 * static_cast<size_t>(terms), width);
+    }
     if (!by_direction) return Vec<Lanes>();
     return direction_gradient(h, terms, direction, inv_length, g, coefficients);
-  }
-
-  void write_sh(const Picked& who, const Harmonics<Lanes>& h, int terms,
-                const Vec<Lanes>& g) const {
-    Lanes column[48];
-    for (int k = 0; k < terms; k++) {
-      const Vec<Lanes> v = h.value[k] * g;
-      column[3 * k] = v.x, column[3 * k + 1] = v.y, column[3 * k + 2] = v.z;
-    }
-    const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
-    const size_t used = 3 * static_cast<size_t>(terms);
-    float scratch[48];  // where lanes go that are not meant
-    const auto row = [&](int lane) {
-      return lane < who.count ? to_.sh + who.ids[lane] * width : scratch;
-    };
-    if (used < 4) {
-      for (int lane = 0; lane < who.count; lane++)
-        for (size_t k = 0; k < used; k++) row(lane)[k] = column[k][lane];
-    } else {
-      for (size_t k = 0; k < used; k += 4) {
-        const size_t from = std::min(k, used - 4);
-        store_rows(column + from, [&](int lane) { return row(lane) + from; });
-      }
-    }
-    if (used == width) return;
-    for (int lane = 0; lane < who.count; lane++)
-      std::fill(row(lane) + used, row(lane) + width, 0.f);
   }
 
   void geometry(const Picked& who, Given<Lanes>& given, const Vec<Lanes>& by_mean,
@@ -666,6 +624,9 @@ int fail(fragprune_error* error, int status, const char* message) {
 
 constexpr int kMostThreads = 1024, kMostCoefficients = 1024;
 constexpr const char* kTooManyThreads = "threads must be at most 1024";
+constexpr const char* kBadCount = "count must be 0 to 2^31 - 1";
+constexpr const char* kOtherVersion = "structs of another version of fragprune.h";
+constexpr const char* kNotGiven = "a gradient of something that was not given";
 
 const char* footprints_fault_of(const fragprune_inputs* in) {
   if (in->means || in->scales || in->rotations || in->cov3d || in->sh)
@@ -695,10 +656,10 @@ const char* splats_fault_of(const fragprune_inputs* in) {
 
 const char* fault_of(const fragprune_inputs* in, const fragprune_outputs* out) {
   if (!in || in->size != sizeof *in || !out || out->size != sizeof *out)
-    return "structs of another version of fragprune.h";
+    return kOtherVersion;
   if (in->width < 1 || in->height < 1 || in->width > 1 << 16 || in->height > 1 << 16)
     return "width and height must be 1 to 65536 pixels";
-  if (in->count < 0 || in->count > INT32_MAX) return "count must be 0 to 2^31 - 1";
+  if (in->count < 0 || in->count > INT32_MAX) return kBadCount;
   if (in->threads > kMostThreads) return kTooManyThreads;
   if (!in->background) return "background is needed";
   if (!out->image || (in->count && !out->radii)) return "image and radii are needed";
@@ -734,6 +695,46 @@ float spread_of(const fragprune_inputs& in) {
     most = max(most, size);
   }
   return most;
+}
+
+// Of which kind they are, with what is given for each; see fragprune_spacetime.
+bool is_of_a_kind(const fragprune_spacetime& in) {
+  if (in.cov3d) return !in.scales && !in.rotations && !in.scales_t && !in.rotations_r;
+  if (!in.scales || !in.rotations) return false;
+  return in.scales_t ? in.times != nullptr : !in.rotations_r;
+}
+
+const char* slice_fault_of(const fragprune_spacetime* in, const fragprune_sliced* sliced) {
+  if (!in || in->size != sizeof *in || !sliced || sliced->size != sizeof *sliced)
+    return kOtherVersion;
+  if (in->count < 0 || in->count > INT32_MAX) return kBadCount;
+  if (in->threads > kMostThreads) return kTooManyThreads;
+  if (!in->campos) return "campos is needed";
+  if (in->count == 0) return nullptr;
+  if (!in->means || !in->opacities) return "means and opacities are needed";
+  if (!is_of_a_kind(*in))
+    return "either cov3d or scales and rotations, scales_t with times, rotations_r with scales_t";
+  if (!sliced->present) return "present is needed";
+  if (!in->sh) return nullptr;
+  if (in->sh_degree < 0 || in->sh_degree > 3 || in->sh_degree_t < -1 || in->sh_degree_t > 2)
+    return "sh_degree must be 0 to 3, sh_degree_t -1 to 2";
+  const int orders = in->sh_degree == 3 ? std::max(in->sh_degree_t, 0) : 0;
+  const int terms = (in->sh_degree + 1) * (in->sh_degree + 1);
+  if (in->sh_coefficients < terms + kBands * orders || in->sh_coefficients > kMostCoefficients)
+    return "sh_coefficients must be what the degrees take, to 1024";
+  if (orders && (!in->times || !(in->duration > 0)))
+    return "cosines in use need times and a duration above 0";
+  return nullptr;
+}
+
+bool wants_absent(const fragprune_spacetime& in, const fragprune_spacetime_grads& to) {
+  const std::pair<const void*, const void*> pairs[] = {
+      {to.times, in.times},         {to.scales, in.scales},           {to.scales_t, in.scales_t},
+      {to.rotations, in.rotations}, {to.rotations_r, in.rotations_r}, {to.cov3d, in.cov3d},
+      {to.sh, in.sh}};
+  for (const auto& [wanted, given] : pairs)
+    if (wanted && !given && in.count) return true;
+  return false;
 }
 
 template <class Work>
@@ -779,17 +780,50 @@ int fragprune_backward(const fragprune_state* state, const fragprune_output_grad
                        fragprune_error* error) {
   if (!state || !output_grads || output_grads->size != sizeof *output_grads || !input_grads ||
       input_grads->size != sizeof *input_grads)
-    return fp::fail(error, FRAGPRUNE_BAD_INPUT, "structs of another version of fragprune.h");
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kOtherVersion);
   if (input_grads->thresholds && !(state->in.thresholds && state->in.widen))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, "the forward pass did not widen for thresholds");
   if (threads > fp::kMostThreads)
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kTooManyThreads);
   if (fp::wants_absent(state->in, *input_grads))
-    return fp::fail(error, FRAGPRUNE_BAD_INPUT, "a gradient of something that was not given");
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kNotGiven);
   return fp::guarded(error, [&] { fp::backward(*state, *output_grads, *input_grads, threads); });
 }
 
 void fragprune_free(fragprune_state* state) { delete state; }
+
+int fragprune_slice(const fragprune_spacetime* inputs, const fragprune_sliced* outputs,
+                    fragprune_error* error) {
+  if (const char* fault = fp::slice_fault_of(inputs, outputs))
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fault);
+  if (inputs->count && (!outputs->means || !outputs->cov3d || !outputs->opacities ||
+                        !inputs->sh != !outputs->colors))
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT,
+                    "means, cov3d and opacities are needed, and colors where sh is given");
+  return fp::guarded(error, [&] {
+    const fp::SpacetimeRows rows(*inputs);
+    fp::Team(inputs->threads)
+        .each(static_cast<size_t>(inputs->count), fp::kPiece, [&](size_t begin, size_t end) {
+          fp::slice_rows(rows, *inputs, *outputs, begin, end);
+        });
+  });
+}
+
+int fragprune_unslice(const fragprune_spacetime* inputs, const fragprune_sliced* output_grads,
+                      const fragprune_spacetime_grads* input_grads, fragprune_error* error) {
+  if (const char* fault = fp::slice_fault_of(inputs, output_grads))
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fault);
+  if (!input_grads || input_grads->size != sizeof *input_grads)
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kOtherVersion);
+  if (fp::wants_absent(*inputs, *input_grads))
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kNotGiven);
+  return fp::guarded(error, [&] {
+    const fp::Unslicer unslicer(*inputs, *output_grads, *input_grads);
+    fp::Team(inputs->threads)
+        .each(static_cast<size_t>(inputs->count), fp::kPiece,
+              [&](size_t begin, size_t end) { unslicer.run(begin, end); });
+  });
+}
 
 fragprune_workspace* fragprune_workspace_new(void) {
   try {

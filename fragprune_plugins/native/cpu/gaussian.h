@@ -421,10 +421,10 @@ FP_HD inline Vec<V> raw_colour(const Harmonics<V>& h, int terms, CoefficientOf c
   return colour;
 }
 
-// The direction in which the camera sees a mean, and 1 / its distance.
+// The direction in which a camera sees a mean, and 1 / its distance.
 template <class V>
-FP_HD inline Vec<V> direction_to(const Camera<V>& c, const Vec<V>& mean, V& inv_length) {
-  const Vec<V> away = mean - c.centre;
+FP_HD inline Vec<V> direction_to(const Vec<V>& centre, const Vec<V>& mean, V& inv_length) {
+  const Vec<V> away = mean - centre;
   inv_length = 1.f / sqrt(dot(away, away));
   return inv_length * away;
 }
@@ -551,10 +551,10 @@ FP_HD inline Vec<V> mean_gradient(const Camera<V>& c, const Vec<V>& mean,
 
 // dL/d(channels) before the clamp at zero: a channel that it holds passes nothing on.
 template <class V>
-FP_HD inline Vec<V> through_clamp(const Vec<V>& raw, const PixelSums<V>& s) {
+FP_HD inline Vec<V> through_clamp(const Vec<V>& raw, const Vec<V>& by) {
   const V none = broadcast<V>(0.f);
-  return {select(gt(raw.x, none), s.r, none), select(gt(raw.y, none), s.g, none),
-          select(gt(raw.z, none), s.b, none)};
+  return {select(gt(raw.x, none), by.x, none), select(gt(raw.y, none), by.y, none),
+          select(gt(raw.z, none), by.z, none)};
 }
 
 // dL/dmean of what acts through the direction, for dL/d(channels) g.

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "ellipse.h"
+#include "rows.h"
 #include "threads.h"
 #include "workspace.h"
 
@@ -106,48 +107,6 @@ inline void load_shape(const Rows& rows, Given<Lanes>& g) {
   }
 }
 
-// Rows of 3 numbers picked by id, for registers that read a fourth: the array's last row is copied.
-class Triples {
- public:
-  Triples(const float* data, int64_t count) : data_(data), last_(static_cast<uint32_t>(count - 1)) {
-    if (data && count > 0) std::copy(data + 3 * size_t{last_}, data + 3 * size_t{last_} + 3, copy_);
-  }
-  Vec<Lanes> load(const uint32_t* ids) const {
-    Lanes v[4];
-    const auto row = [&](int i) { return ids[i] == last_ ? copy_ : data_ + size_t{3} * ids[i]; };
-    load_columns(row, v);
-    return {v[0], v[1], v[2]};
-  }
-
- private:
-  const float* data_;
-  uint32_t last_;
-  float copy_[4] = {};
-};
-
-// The spherical harmonics' coefficients of kLanes Gaussians as columns, 3 k + channel.
-struct Coefficients {
-  Lanes column[48];
-  Vec<Lanes> operator()(int k) const {
-    return {column[3 * k], column[3 * k + 1], column[3 * k + 2]};
-  }
-};
-
-inline void load_coefficients(const fragprune_inputs& in, const uint32_t* ids, int terms,
-                              Coefficients& to) {
-  const size_t width = 3 * static_cast<size_t>(in.sh_coefficients);
-  const int used = 3 * terms;
-  if (used < 4) {  // degree 0, and perhaps rows of 3
-    for (int k = 0; k < used; k++)
-      for (int i = 0; i < kLanes; i++) to.column[k][i] = in.sh[ids[i] * width + k];
-    return;
-  }
-  for (int k = 0; k < used; k += 4) {
-    const int from = std::min(k, used - 4);
-    load_columns([&](int i) { return in.sh + ids[i] * width + from; }, to.column + from);
-  }
-}
-
 // ---- a piece ---------------------------------------------------------------------------------
 
 // Colours, of splats that are about to be blended. Until then inv_z is -1/z; it is 0 where colour or
@@ -214,9 +173,10 @@ class Colours {
       Lanes inv_length;
       Harmonics<Lanes> h;
       const int terms =
-          harmonics(in_.sh_degree, direction_to(c_, means_.load(ids), inv_length), h, false);
+          harmonics(in_.sh_degree, direction_to(c_.centre, means_.load(ids), inv_length), h, false);
       Coefficients coefficients;
-      load_coefficients(in_, ids, terms, coefficients);
+      load_coefficients(in_.sh, 3 * static_cast<size_t>(in_.sh_coefficients), ids, terms,
+                        coefficients);
       colour = raw_colour(h, terms, coefficients);
     }
     const Lanes size = abs(colour.x) + abs(colour.y) + abs(colour.z);

@@ -21,7 +21,7 @@ __device__ inline Vec3 colour_of(const fragprune_inputs& in, const Camera<float>
                                  const Vec3& mean, size_t i) {
   if (in.colors) return read3(in.colors + 3 * i);
   float inv_length;
-  const Vec3 towards = direction_to(c, mean, inv_length);
+  const Vec3 towards = direction_to(c.centre, mean, inv_length);
   switch (in.sh_degree) {
     case 0: return colour_of_degree<0>(in, towards, i);
     case 1: return colour_of_degree<1>(in, towards, i);

@@ -270,12 +270,12 @@ __device__ inline Vec3 unshade(const Undraw& u, const Camera<float>& c, const Ve
                                const PixelSums<float>& sums) {
   const fragprune_inputs& in = u.frame.in;
   float inv_length;
-  const Vec3 direction = direction_to(c, mean, inv_length);
+  const Vec3 direction = direction_to(c.centre, mean, inv_length);
   Harmonics<float> h;
   const int terms = harmonics(kDegree, direction, h, kDegree > 0);
   const size_t row = 3 * static_cast<size_t>(in.sh_coefficients) * i;
   const auto coefficient = [&](int k) { return read3(in.sh + row + 3 * k); };
-  const Vec3 g = through_clamp(raw_colour(h, terms, coefficient), sums);
+  const Vec3 g = through_clamp(raw_colour(h, terms, coefficient), {sums.r, sums.g, sums.b});
   if (u.to.sh) {
 #pragma unroll
     for (int k = 0; k < terms; k++) write3(u.to.sh + row, k, h.value[k] * g);

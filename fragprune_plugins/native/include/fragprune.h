@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 3
+#define FRAGPRUNE_API_VERSION 4
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
@@ -27,6 +27,7 @@
 #define FRAGPRUNE_RIM_REACH 4.6
 #define FRAGPRUNE_FALLOFF_MIN 1e-4
 #define FRAGPRUNE_NEUTRAL_LOGIT -30.0
+#define FRAGPRUNE_MARGINAL_MIN 0.05
 
 #if defined(__GNUC__)
 #define FRAGPRUNE_EXPORT __attribute__((visibility("default")))
@@ -170,6 +171,69 @@ FRAGPRUNE_EXPORT int fragprune_backward(const fragprune_state *state,
                                         fragprune_error *error);
 
 FRAGPRUNE_EXPORT void fragprune_free(fragprune_state *state); /* NULL is fine */
+
+/* N Gaussians in space and time, and the moment at which to cut them. How they are given:
+ *   cov3d                      sliced already; only colours depend on the moment
+ *   scales, rotations          in space alone
+ *   with times, scales_t       and, apart from it, in time: scales_t is a variance then
+ *   with rotations_r as well   with axes anywhere in space and time, turned by both quaternions */
+typedef struct fragprune_spacetime {
+  uint32_t size;
+  int32_t threads;         /* at most 1024; results do not depend on it */
+  float timestamp;         /* the moment */
+  float duration;          /* of the cosines' longest period; above 0 */
+  float prefilter_var;     /* when positive, added to the variance in time that the marginal sees */
+  float scale_modifier;    /* factor on scales and scales_t */
+  int32_t sh_degree;       /* 0 to 3 */
+  int32_t sh_degree_t;     /* cosines in use at sh_degree 3, 0 to 2; -1: colours know no time */
+  int32_t sh_coefficients; /* K: (sh_degree + 1)^2 or more, and 16 more for each cosine; at most 1024 */
+  int64_t count;           /* N */
+  const float *campos;     /* (3) */
+  const float *means;      /* (N, 3) */
+  const float *opacities;  /* (N) */
+  const float *times;      /* (N) means in time; or NULL */
+  const float *scales;     /* (N, 3); or NULL */
+  const float *scales_t;   /* (N); or NULL */
+  const float *rotations;  /* (N, 4) w x y z, used as given; or NULL */
+  const float *rotations_r; /* (N, 4); or NULL */
+  const float *cov3d;      /* (N, 6) xx xy xz yy yz zz; or NULL */
+  const float *sh;         /* (N, K, 3), 16 to each cosine; or NULL: no colours */
+} fragprune_spacetime;
+
+/* 3D Gaussians, or gradients by them; NULL stands for zero there. One whose marginal is at most 0.05
+ * or whose covariance is not finite is not there: its mean is campos, where nothing is drawn, and the
+ * rest is zero. */
+typedef struct fragprune_sliced {
+  uint32_t size;
+  float *means;     /* (N, 3) */
+  float *cov3d;     /* (N, 6) */
+  float *opacities; /* (N) times the marginal */
+  float *colors;    /* (N, 3) not below 0; NULL when no sh is given */
+  uint8_t *present; /* (N) 1, or 0: not there; needed in both directions */
+} fragprune_sliced;
+
+/* Where to put gradients; NULL: not wanted. Every element is written. */
+typedef struct fragprune_spacetime_grads {
+  uint32_t size;
+  float *means;       /* (N, 3) */
+  float *opacities;   /* (N) */
+  float *times;       /* (N) */
+  float *scales;      /* (N, 3) */
+  float *scales_t;    /* (N) */
+  float *rotations;   /* (N, 4) */
+  float *rotations_r; /* (N, 4) */
+  float *cov3d;       /* (N, 6) */
+  float *sh;          /* (N, K, 3) */
+} fragprune_spacetime_grads;
+
+/* Cuts Gaussians at a moment. Nothing is kept: for the way back the same inputs are given again. */
+FRAGPRUNE_EXPORT int fragprune_slice(const fragprune_spacetime *inputs,
+                                     const fragprune_sliced *outputs, fragprune_error *error);
+
+FRAGPRUNE_EXPORT int fragprune_unslice(const fragprune_spacetime *inputs,
+                                       const fragprune_sliced *output_grads,
+                                       const fragprune_spacetime_grads *input_grads,
+                                       fragprune_error *error);
 
 /* Memory that calls hand on to the next ones, so that the system need not find and clear it each
  * time. Any number of calls may use one workspace at once; the states that came of them may outlive

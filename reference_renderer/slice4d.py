@@ -1,9 +1,9 @@
-"""A 4D Gaussian at one moment: the 3D Gaussian that RT-4DGS draws there.
+"""A Gaussian in space and time at one moment: the 3D Gaussian that is drawn there.
 
 Space and time have one covariance. At a moment, time is known: the 3D Gaussian is the conditional
-one, its mean moves linearly, and it is as strong as the moment is likely (the marginal). Plain
-torch, in the dtype of its arguments; gradients are the host's, which its kernels write by hand:
-where they differ from the derivative, so do ours, and it says so.
+one, its mean moves linearly, and it is as strong as the moment is likely (the marginal). Gradients
+are those of RT-4DGS, whose kernels write them by hand: where they differ from the derivative, so do
+ours, and it says so.
 """
 
 from __future__ import annotations
@@ -13,41 +13,35 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from reference_renderer.covariance import rotation_matrices
+
 MARGINAL_MIN = 0.05
 """At or below it a Gaussian is not there."""
 
 
 @dataclass(frozen=True)
-class Moment:
+class Sliced:
     """N Gaussians at one moment.
 
     Attributes:
         means: (N, 3) world.
         cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
         opacities: (N,) marginal included.
-        present: (N,) bool, those that the host does not cull for their time.
+        present: (N,) bool, those that are not culled for their time.
+        colors: (N, 3) RGB, or None.
     """
 
     means: Tensor
     cov3d: Tensor
     opacities: Tensor
     present: Tensor
+    colors: Tensor | None = None
 
 
 def _rows(*entries: Tensor) -> Tensor:
     """(N, n, n) of n * n columns (N,), row by row."""
     size = round(len(entries) ** 0.5)
     return torch.stack(entries, dim=-1).reshape(-1, size, size)
-
-
-def rotation(quaternions: Tensor) -> Tensor:
-    """(N, 3, 3) of quaternions (N, 4) w, x, y, z, used as given."""
-    w, x, y, z = quaternions.unbind(-1)
-    return _rows(
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
 
 
 def rotation_4d(left: Tensor, right: Tensor) -> Tensor:
@@ -83,7 +77,7 @@ def joint(
     *,
     timestamp: float,
     prefilter_var: float = -1.0,
-) -> Moment:
+) -> Sliced:
     """Gaussians whose axes lie anywhere in space and time (``rot_4d``).
 
     Args:
@@ -101,7 +95,7 @@ def joint(
     marginal = _marginal(since, in_time, prefilter_var)
     velocity = across / in_time[:, None]
     cov3d = upper(cov4d) - upper(across[:, :, None] * velocity[:, None, :])
-    return Moment(
+    return Sliced(
         means=means + velocity * since[:, None],
         cov3d=cov3d,
         opacities=opacities * marginal,
@@ -118,7 +112,7 @@ def separate(
     *,
     timestamp: float,
     prefilter_var: float = -1.0,
-) -> Moment:
+) -> Sliced:
     """Gaussians that come and go where they are (4D without ``rot_4d``).
 
     The host takes the scale in time for a variance, unsquared. Its backward pass leaves the
@@ -137,9 +131,9 @@ def separate(
     since = (timestamp - times).detach()
     marginal = _marginal(since, scales[:, 3].detach(), prefilter_var)
     strength = (opacities * marginal).detach() + (opacities - opacities.detach())
-    return Moment(
+    return Sliced(
         means=means,
-        cov3d=upper(covariance(rotation(rotations), scales[:, :3])),
+        cov3d=upper(covariance(rotation_matrices(rotations), scales[:, :3])),
         opacities=strength + 0.0 * (times + scales[:, 3]),
         present=marginal > MARGINAL_MIN,
     )

@@ -1,4 +1,4 @@
-"""Colour by direction and time: spherical harmonics times cosines, as RT-4DGS evaluates them.
+"""Colour by direction and time: spherical harmonics times cosines, as RT-4DGS has them.
 
 The picture is drawn with directions to the means as they are stored. The host's backward pass looks
 elsewhere: from the means where the moment has moved them. It also has slips in what it writes by
@@ -13,7 +13,7 @@ from math import pi
 import torch
 from torch import Tensor
 
-from fragprune_plugins.lineage.harmonics import C0, basis
+from reference_renderer.sh import sh_basis
 
 BANDS = 16
 """Coefficients of degree 3; time modulates them only when all are in use."""
@@ -60,11 +60,11 @@ def colors(
         clock: None for colours that time leaves alone.
     """
     with torch.no_grad():
-        harmonics = basis(_towards(means, campos), degree)
+        harmonics = sh_basis(_towards(means, campos), degree)
         value = _blend(sh, harmonics, clock) + 0.5
     asked = (sh, moved) if clock is None else (sh, moved, clock.times)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in asked):
-        slope = _slope(sh, basis(_towards(moved, campos), degree), clock)
+        slope = _slope(sh, sh_basis(_towards(moved, campos), degree), clock)
         value = value + (slope - slope.detach())
     return value.clamp_min(0)
 
@@ -103,7 +103,7 @@ def _slope(sh: Tensor, harmonics: Tensor, clock: Clock | None) -> Tensor:
     if clock is None:
         return _blend(sh, harmonics, None)
     given = harmonics.detach().clone()
-    given[:, 1:2] = C0
+    given[:, 1:2] = given[:, :1]
     total = _sum(harmonics, sh.detach()) + _sum(given, sh)
     orders = _orders(harmonics, clock)
     for order in orders:

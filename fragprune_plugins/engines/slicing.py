@@ -1,0 +1,192 @@
+"""Gaussians in space and time, cut at a moment by compiled code: the seam to autograd.
+
+Cutting looks at one Gaussian at a time, so that the cpu engine and the cuda engine share all but
+the call itself, a ``Blade``. Nothing is kept between the passes but what was given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from fragprune_plugins.errors import InputError
+from fragprune_plugins.native import loader
+from fragprune_plugins.types import Moment, Sliced, SpacetimeSplats
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+# The differentiable inputs, in the order in which the autograd function takes them.
+_NAMES = (
+    "means",
+    "opacities",
+    "times",
+    "scales",
+    "scales_t",
+    "rotations",
+    "rotations_r",
+    "cov3d",
+    "sh",
+)
+
+
+_SHAPE = frozenset(("scales", "scales_t", "rotations", "rotations_r"))
+
+# What acts on each output; an engine spends nothing on gradients by those that nothing wanted acts
+# on, which in fine-tuning is most.
+_FELT_BY = {
+    "means": _SHAPE | {"means", "times"},
+    "cov3d": _SHAPE | {"cov3d"},
+    "opacities": _SHAPE | {"opacities", "times"},
+    "colors": _SHAPE | {"sh", "means", "times"},
+}
+
+
+class Blade(Protocol):
+    """Where and by what Gaussians are cut."""
+
+    @property
+    def where(self) -> torch.device:
+        """The device that tensors must be on."""
+
+    def empty(self, *shape: int) -> Tensor:
+        """Memory for float32."""
+
+    def slice(self, given: loader.Spacetime, to: loader.Sliced) -> None:
+        """fragprune_slice."""
+
+    def unslice(
+        self, given: loader.Spacetime, by: loader.Sliced, to: loader.SpacetimeGrads
+    ) -> None:
+        """fragprune_unslice."""
+
+
+def address(tensor: Tensor | None) -> int | None:
+    """Of its first number; None stands for no array, or for an empty one."""
+    return None if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
+
+
+@dataclass
+class _Cut:
+    """One cut: what goes in beside the differentiable inputs.
+
+    Attributes:
+        blade: of the engine.
+        splats: as the engine got them.
+        moment: likewise.
+        arrays: what the compiled side reads.
+    """
+
+    blade: Blade
+    splats: SpacetimeSplats
+    moment: Moment
+    arrays: dict[str, Tensor]
+
+    def given(self) -> loader.Spacetime:
+        """The C struct; it points into ``arrays``."""
+        moment, sh = self.moment, self.splats.sh
+        return loader.Spacetime(
+            threads=min(torch.get_num_threads(), 1024),
+            timestamp=moment.timestamp,
+            duration=moment.duration,
+            prefilter_var=moment.prefilter_var,
+            scale_modifier=moment.scale_modifier,
+            sh_degree=self.splats.sh_degree,
+            sh_degree_t=-1 if moment.sh_degree_t is None else moment.sh_degree_t,
+            sh_coefficients=0 if sh is None else sh.shape[1],
+            count=len(self.splats),
+            **{name: address(array) for name, array in self.arrays.items()},
+        )
+
+
+class _Slice(torch.autograd.Function):
+    """The engines' seam to autograd."""
+
+    @staticmethod
+    def forward(ctx: Any, cut: _Cut, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
+        n, blade = len(cut.splats), cut.blade
+        outputs = {
+            "means": blade.empty(n, 3),
+            "cov3d": blade.empty(n, 6),
+            "opacities": blade.empty(n),
+            "colors": blade.empty(n, 3) if "sh" in cut.arrays else None,
+        }
+        present = torch.empty(n, dtype=torch.bool, device=blade.where)
+        addresses = {name: address(output) for name, output in outputs.items()}
+        blade.slice(cut.given(), loader.Sliced(present=address(present), **addresses))
+        wanted = {n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs}
+        idle = [o for name, o in outputs.items() if o is not None and not wanted & _FELT_BY[name]]
+        ctx.mark_non_differentiable(present, *idle)
+        ctx.set_materialize_grads(False)
+        ctx.cut, ctx.present = cut, present
+        # Saved for the sake of autograd's check against changes in place: the cut reads these.
+        ctx.save_for_backward(*tensors)
+        return *outputs.values(), present
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        cut, tensors = ctx.cut, ctx.saved_tensors
+        by = [None if g is None else _plain(g, cut.blade.where) for g in upstream[:4]]
+        wanted = [n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs]
+        grads = {name: cut.blade.empty(*cut.arrays[name].shape) for name in wanted}
+        cut.blade.unslice(
+            cut.given(),
+            loader.Sliced(
+                present=address(ctx.present),
+                **{name: address(g) for name, g in zip(_FELT_BY, by, strict=True)},
+            ),
+            loader.SpacetimeGrads(**{name: address(grad) for name, grad in grads.items()}),
+        )
+        given: list[Tensor | None] = [None]
+        for name, tensor in zip(_NAMES, tensors, strict=True):
+            grad = grads.get(name)
+            given.append(None if grad is None else grad.to(tensor.device, tensor.dtype))
+        return tuple(given)
+
+
+def _plain(tensor: Tensor, where: torch.device) -> Tensor:
+    return tensor.detach().to(where, torch.float32).contiguous()
+
+
+def slice_by(blade: Blade, splats: SpacetimeSplats, moment: Moment) -> Sliced:
+    """Cut the Gaussians at the moment; differentiable in all that the splats hold.
+
+    Raises:
+        InputError: harmonics with fewer coefficients than the moment's cosines take.
+    """
+    check_harmonics(splats, moment)
+    tensors = {name: getattr(splats, name) for name in _NAMES}
+    read = {**tensors, "campos": moment.campos}
+    arrays = {name: _plain(t, blade.where) for name, t in read.items() if t is not None}
+    cut = _Cut(blade, splats, moment, arrays)
+    means, cov3d, opacities, colors, present = _Slice.apply(  # type: ignore[no-untyped-call]
+        cut, *tensors.values()
+    )
+    device = splats.device
+    return Sliced(
+        means=means.to(device),
+        cov3d=cov3d.to(device),
+        opacities=opacities.to(device),
+        present=present.to(device),
+        colors=None if colors is None else colors.to(device),
+    )
+
+
+def check_harmonics(splats: SpacetimeSplats, moment: Moment) -> None:
+    """Raise InputError unless there are coefficients and times for the cosines in use."""
+    orders = moment.sh_degree_t if splats.sh is not None and splats.sh_degree == 3 else 0
+    if not orders:
+        return
+    assert splats.sh is not None
+    if splats.sh.shape[1] < 16 * (1 + orders) or splats.times is None:
+        raise InputError(
+            "SpacetimeSplats.sh",
+            f"{splats.sh.shape[1]} coefficients, times {'' if splats.times is not None else 'not '}"
+            "given",
+            f"times, and at least {16 * (1 + orders)} for {orders} cosines",
+            "Use fewer cosines or pass all coefficients.",
+        )

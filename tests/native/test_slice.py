@@ -1,0 +1,244 @@
+"""Compiled slices of Gaussians in space and time against the oracle in double precision."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+import spacetime
+import torch
+from spacetime import KINDS, agree, gradients, leaves, moment, splats
+
+import fragprune_plugins
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.errors import InputError
+from fragprune_plugins.native import loader
+from fragprune_plugins.types import SpacetimeSplats
+
+SIZES = (1, 3, 1024 + 37)
+"""Fewer than any register has lanes, and more than one piece of work, the last one odd."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("orders", [None, 0, 1, 2])
+def test_values_and_gradients_are_the_oracles(engine, kind, orders):
+    agree(engine, splats(kind, 200), moment(orders))
+
+
+@pytest.mark.parametrize("degree", range(3))
+@pytest.mark.parametrize("orders", [None, 2])
+def test_below_degree_3_time_leaves_colours_alone_but_for_one_gradient(engine, degree, orders):
+    given = splats("joint", 100, degree=degree, coefficients=(degree + 1) ** 2)
+    agree(engine, given, moment(orders))
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_any_number_of_them(engine, count):
+    agree(engine, splats("joint", count), moment())
+
+
+def test_coefficients_that_are_not_in_use_have_no_gradient(engine):
+    given = leaves(splats("joint", 50, coefficients=60), torch.float32)
+    cut = engine.slice(given, moment(1))
+    by_sh = gradients(given, cut)["sh"]
+    assert by_sh[:, :32].any()
+    assert not by_sh[:, 32:].any()
+
+
+@pytest.mark.parametrize("kind", ["apart", "joint"])
+@pytest.mark.parametrize("prefilter", [0.0, 0.05])
+def test_a_prefilter_widens_the_marginal(engine, kind, prefilter):
+    agree(engine, splats(kind, 60), moment(prefilter_var=prefilter))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_scale_modifier(engine, kind):
+    agree(engine, splats(kind, 60), moment(scale_modifier=0.6))
+
+
+@pytest.mark.parametrize("output", spacetime.OUTPUTS)
+def test_each_output_has_its_own_gradients(engine, output):
+    agree(engine, splats("joint", 60), moment(), outputs=(output,))
+
+
+def test_rotations_are_used_as_given(engine):
+    given = splats("joint", 60)
+    given = replace(given, rotations=1.2 * given.rotations, rotations_r=0.9 * given.rotations_r)
+    agree(engine, given, moment())
+
+
+def test_who_is_not_there_is_nowhere_and_has_no_gradients(engine):
+    given = leaves(splats("joint", 300), torch.float32)
+    when = moment()
+    cut = engine.slice(given, when)
+    absent = ~cut.present
+    assert 30 < int(absent.sum()) < 270
+    assert (cut.means[absent] == when.campos.float()).all()
+    for values in (cut.cov3d, cut.opacities, cut.colors, *gradients(given, cut).values()):
+        assert not values[absent].any()
+        assert values[cut.present].any()
+
+
+def test_long_after_everything_nobody_is_there(engine):
+    given = leaves(splats("joint", 40), torch.float32)
+    cut = engine.slice(given, replace(moment(), timestamp=1e6))
+    assert not cut.present.any()
+    assert not any(g.any() for g in gradients(given, cut).values())
+
+
+def broken(given, **changes):
+    """A copy in which the first rows of some tensors hold something else."""
+    values = {name: getattr(given, name).clone() for name in changes}
+    for name, bad in changes.items():
+        values[name][: len(bad)] = torch.tensor(bad, dtype=torch.float64).reshape(
+            -1, *[1] * (values[name].ndim - 1)
+        )
+    return replace(given, **values)
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize("kind", ["apart", "joint"])
+@pytest.mark.parametrize(
+    "changes", [{"scales_t": (0.0, NAN)}, {"rotations": (NAN,)}, {"scales": (INF, NAN)}]
+)
+def test_what_is_not_finite_is_not_there_and_spoils_nobody(engine, kind, changes):
+    good = splats(kind, 40)
+    good = replace(good, times=torch.full_like(good.times, spacetime.NOW + 1e-3))
+    bad = leaves(broken(good, **changes), torch.float32)
+    first = len(next(iter(changes.values())))
+    if kind == "joint" and "scales_t" in changes:  # turned, other axes reach into time
+        first, bad = 1, leaves(broken(good, scales_t=(NAN,)), torch.float32)
+    cut, well = engine.slice(bad, moment()), engine.slice(leaves(good, torch.float32), moment())
+    assert not cut.present[:first].any()
+    for name in spacetime.OUTPUTS:
+        assert torch.equal(getattr(cut, name)[first:], getattr(well, name)[first:])
+    for grad in gradients(bad, cut).values():
+        assert not grad[:first].any()
+        assert grad.isfinite().all()
+
+
+def test_flat_and_thin_gaussians(engine):
+    given = splats("joint", 60)
+    scales = given.scales * torch.tensor([1.0, 1e-3, 1e-6], dtype=torch.float64)
+    agree(engine, replace(given, scales=scales), moment())
+
+
+def test_a_fast_gaussian_keeps_its_shape(engine):
+    """Far along in time, where a difference of covariances would lose every digit."""
+    given = splats("joint", 60)
+    still = torch.full_like(given.times, spacetime.NOW)
+    fast = replace(given, scales_t=300 * given.scales_t, times=still)
+    expected = ReferenceEngine().slice(fast, moment())
+    found = engine.slice(leaves(fast, torch.float32), moment())
+    size = expected.cov3d.abs().amax(dim=1, keepdim=True)
+    assert ((found.cov3d - expected.cov3d).abs() < 1e-4 * size).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_gaussians(engine, kind):
+    given = leaves(splats(kind, 0), torch.float32)
+    cut = engine.slice(given, moment())
+    assert cut.means.shape == (0, 3)
+    assert cut.colors.shape == (0, 3)
+    assert all(len(grad) == 0 for grad in gradients(given, cut).values())
+
+
+def test_without_harmonics_there_are_no_colours(engine):
+    given = leaves(replace(splats("joint", 20), sh=None), torch.float32)
+    cut = engine.slice(given, moment())
+    assert cut.colors is None
+    assert gradients(given, cut, ("means",))["rotations_r"].any()
+
+
+def test_what_wants_no_gradient_gets_none(engine):
+    given = splats("joint", 20)
+    opacities = given.opacities.float().requires_grad_()
+    cut = engine.slice(replace(given, opacities=opacities), moment())
+    assert cut.opacities.requires_grad
+    assert not any(t.requires_grad for t in (cut.means, cut.cov3d, cut.colors))
+    cut.opacities.sum().backward()
+    marginal = ReferenceEngine().slice(given, moment()).opacities / given.opacities
+    torch.testing.assert_close(opacities.grad.double(), marginal, rtol=1e-5, atol=1e-7)
+    with torch.no_grad():
+        assert not engine.slice(replace(given, opacities=opacities), moment()).means.requires_grad
+
+
+def test_changes_in_place_before_the_way_back_are_noticed(engine):
+    given = leaves(splats("joint", 20), torch.float32)
+    cut = engine.slice(given, moment())
+    with torch.no_grad():
+        given.scales.mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        cut.cov3d.sum().backward()
+
+
+INPUTS = [f.name for f in fields(SpacetimeSplats) if f.name != "sh_degree"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", INPUTS)
+def test_each_input_alone_has_the_gradient_that_it_has_among_all(engine, kind, name):
+    given, when = splats(kind, 40), moment()
+    if getattr(given, name) is None:
+        return
+    everything = leaves(given, torch.float32)
+    expected = gradients(everything, engine.slice(everything, when))[name]
+    alone = replace(given, **{name: getattr(everything, name)})
+    assert torch.equal(gradients(alone, engine.slice(alone, when))[name], expected)
+
+
+def test_the_number_of_threads_changes_no_bit(engine):
+    given, before = leaves(splats("joint", 3000), torch.float32), torch.get_num_threads()
+    found = []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            cut = engine.slice(given, moment())
+            found.append([cut.means, cut.colors, *gradients(given, cut).values()])
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_slice_at_takes_the_fastest_engine(monkeypatch):
+    given, when = splats("joint", 50), moment()
+    expected = ReferenceEngine().slice(given, when)
+    assert fragprune_plugins.slice_at(given, when).means.dtype == (
+        torch.float32 if loader.usable_builds() else torch.float64
+    )
+    monkeypatch.setenv(loader.ENVIRONMENT, "off")
+    assert torch.equal(fragprune_plugins.slice_at(given, when).means, expected.means)
+
+
+def test_what_does_not_fit_is_refused(engine):
+    good = splats("joint", 5)
+    for changes in ({"times": None}, {"scales": None}, {"cov3d": torch.ones(5, 6)}):
+        with pytest.raises(InputError, match="cov3d alone"):
+            replace(good, **changes)
+    with pytest.raises(InputError, match="at least 16"):
+        replace(good, sh=good.sh[:, :15])
+    for name, value in {"duration": 0.0, "sh_degree_t": 3}.items():
+        with pytest.raises(InputError, match=name):
+            replace(moment(), **{name: value})
+    for slicer in (engine, ReferenceEngine()):
+        with pytest.raises(InputError, match="at least 48 for 2 cosines"):
+            slicer.slice(replace(good, sh=good.sh[:, :40]), moment())
+
+
+def test_the_library_refuses_what_does_not_fit(engine):
+    """Below the Python checks: the C interface stands on its own."""
+    calls, error = loader.library().calls, loader.Error()
+    three = torch.zeros(3).data_ptr()
+    good = {"count": 0, "campos": three, "duration": 1.0}
+    to = loader.Sliced()
+    assert calls.fragprune_slice(loader.Spacetime(**good), to, error) == loader.OK
+    for change in ({"threads": 1025}, {"count": -1}, {"campos": None}, {"count": 1}):
+        status = calls.fragprune_slice(loader.Spacetime(**{**good, **change}), to, error)
+        assert status != loader.OK
+        assert error.message
+    stale = loader.Sliced()
+    stale.size = 4
+    assert calls.fragprune_slice(loader.Spacetime(**good), stale, error) != loader.OK
+    assert b"version" in error.message
