@@ -7,14 +7,22 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from fragprune_plugins.engines.frames import Device, Drawing, Wanted, learnable
+from fragprune_plugins.engines.frames import Device, Drawing, KernelBlade, Wanted, learnable
+from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterOutputs
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.types import (
+        Footprints,
+        Moment,
+        RasterInputs,
+        Sliced,
+        SpacetimeSplats,
+        Splats,
+    )
 
 _FIRST_CAPACITY = 1 << 20
 """Entries of the tiles' lists that there is room for before any frame has told."""
@@ -98,14 +106,7 @@ class CudaEngine:
         Raises:
             InputError: the Gaussians are not on a GPU.
         """
-        where = inputs.splats.device
-        if where.type != self._device.kind:
-            raise InputError(
-                "engine 'cuda'",
-                f"Gaussians on {where}",
-                f"tensors on a {self._device.kind} device",
-                "Move the Gaussians, or use the engine 'cpu'.",
-            )
+        self._on_device(inputs.splats)
         drawing = Drawing(self._device, inputs, thresholds)
         tensors = {
             **learnable(inputs),
@@ -128,6 +129,25 @@ class CudaEngine:
             wins_per_gaussian=drawing.wins_per_gaussian,
             winners=drawing.winners,
         )
+
+    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
+        """Cut Gaussians in space and time at a moment.
+
+        Raises:
+            InputError: the Gaussians are not on a GPU.
+        """
+        return slice_by(KernelBlade(self._device, self._on_device(splats)), splats, moment)
+
+    def _on_device(self, splats: Splats | Footprints | SpacetimeSplats) -> torch.device:
+        where = splats.device
+        if where.type != self._device.kind:
+            raise InputError(
+                "engine 'cuda'",
+                f"Gaussians on {where}",
+                f"tensors on a {self._device.kind} device",
+                "Move the Gaussians, or use the engine 'cpu'.",
+            )
+        return where
 
     def draw(self, drawing: Drawing, wanted: Wanted) -> None:
         """The forward pass, again with more room when the lists did not fit."""

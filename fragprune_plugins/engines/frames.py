@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import ctypes
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol, get_args
 
 import torch
 
 from fragprune_plugins.constants import TILE
+from fragprune_plugins.engines.slicing import address as _address
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.native import loader
 from fragprune_plugins.types import Compensation, Splats
@@ -89,9 +91,20 @@ class Undraw(ctypes.Structure):
     )
 
 
+class Slicing(ctypes.Structure):
+    """fp::Slicing: what the kernels are handed that cut Gaussians at a moment, and back."""
+
+    _fields_ = (
+        ("given", loader.Spacetime),
+        ("sliced", loader.Sliced),
+        ("to", loader.SpacetimeGrads),
+    )
+
+
 MACROS: Final = {
     "FP_FRAME_SIZE": ctypes.sizeof(Frame),
     "FP_SORT_SIZE": ctypes.sizeof(Sort),
+    "FP_SLICING_SIZE": ctypes.sizeof(Slicing),
     "FP_UNDRAW_SIZE": ctypes.sizeof(Undraw),
 }
 """What every source is compiled with, to check that it knows the same structs."""
@@ -144,6 +157,7 @@ _TRAINED: Final = frozenset(("means", "hook", "opacities", "scales", "rotations"
 
 VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
     ("scene", {"FP_PACKED": 0}),
+    ("slice", {}),
     ("blend", blend_macros()),
     ("blend", blend_macros(counts=True)),
     *(
@@ -204,10 +218,6 @@ class _Arena:
 
 def _blocks(count: int, per_block: int = THREADS) -> int:
     return -(-count // per_block)
-
-
-def _address(tensor: Tensor | None) -> int | None:
-    return None if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
 
 
 def _plain(tensor: Tensor, where: torch.device) -> Tensor:
@@ -553,3 +563,29 @@ class Drawing:
         if by_tile is not None:
             grads["background"] = by_tile.sum(0, dtype=torch.float64).float()
         return grads
+
+
+@dataclass(frozen=True)
+class KernelBlade:
+    """Cuts Gaussians in space and time on a device; see ``engines.slicing``."""
+
+    device: Device
+    where: torch.device
+
+    def empty(self, *shape: int) -> Tensor:
+        """Memory for float32."""
+        return torch.empty(shape, device=self.where)
+
+    def slice(self, given: loader.Spacetime, to: loader.Sliced) -> None:
+        """Launch fp_slice."""
+        self._launch("fp_slice", Slicing(given=given, sliced=to))
+
+    def unslice(
+        self, given: loader.Spacetime, by: loader.Sliced, to: loader.SpacetimeGrads
+    ) -> None:
+        """Launch fp_unslice."""
+        self._launch("fp_unslice", Slicing(given=given, sliced=by, to=to))
+
+    def _launch(self, kernel: str, arguments: Slicing) -> None:
+        if blocks := _blocks(arguments.given.count):
+            self.device.launch(self.where, "slice", MACROS, kernel, blocks, arguments)

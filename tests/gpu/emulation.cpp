@@ -11,7 +11,9 @@
 #include <string>
 #include <vector>
 
-extern char __start_emulated_shared[], __stop_emulated_shared[];
+// Of the section that holds shared memory; absent where a source has none.
+extern char __start_emulated_shared[] __attribute__((weak));
+extern char __stop_emulated_shared[] __attribute__((weak));
 
 Index threadIdx, blockIdx;
 

@@ -67,6 +67,7 @@ def test_all_kernels_compile_without_stack_or_spills(
             pool.submit(nvrtc.compile, source, {**MACROS, **macros}, f"sm_{architecture}")
             for source, macros in (
                 ("scene", {}),
+                ("slice", {}),
                 ("unblend", {}),
                 ("unblend", TRAINED),
                 ("unblend", TUNED),
@@ -106,4 +107,4 @@ def test_nvcc_compiles_the_same_sources() -> None:
 
 
 def test_what_is_built_beforehand_is_what_training_asks_for() -> None:
-    assert {source for source, _ in VARIANTS} == {"scene", "blend", "unblend"}
+    assert {source for source, _ in VARIANTS} == {"scene", "slice", "blend", "unblend"}

@@ -260,10 +260,6 @@ __device__ inline void share(Room& room, const Pixel& p, const LossPixel& l) {
 
 // ---- the chain -------------------------------------------------------------------------------
 
-__device__ inline void write3(float* to, size_t i, const Vec3& v) {
-  if (to) to[3 * i] = v.x, to[3 * i + 1] = v.y, to[3 * i + 2] = v.z;
-}
-
 // Writes dL/dsh, returns dL/dmean through the direction.
 template <int kDegree>
 __device__ inline Vec3 unshade(const Undraw& u, const Camera<float>& c, const Vec3& mean, size_t i,
