@@ -9,7 +9,7 @@ import pytest
 import torch
 from oracle.naive import harmonic
 
-from reference_renderer import color4d, slice4d
+from reference_renderer import SpacetimeGaussians, color4d, slice4d, slice_gaussians
 from reference_renderer.color4d import Clock
 
 F64 = torch.float64
@@ -136,6 +136,39 @@ def test_without_4d_rotation_gaussians_stay_where_they_are_and_only_their_streng
     assert torch.equal(g["opacities"].grad, weights)
     assert not g["times"].grad.any()
     assert not g["scales"].grad.any()
+
+
+@pytest.mark.parametrize("kind", ["joint", "separate", "still", "sliced"])
+def test_a_slice_has_zeros_for_who_is_not_there_and_feels_nothing_of_them(kind):
+    g = gaussians()
+    g["times"][0] += 9
+    turns, scales = g.pop("rotations"), g.pop("scales")
+    given = {"scales": 2 * scales[:, :3], "rotations": turns[0]}
+    if kind in ("joint", "separate"):
+        given["scales_t"] = 2 * scales[:, 3]
+    if kind == "joint":
+        given["rotations_r"] = turns[1]
+    if kind == "sliced":
+        given = {"cov3d": slice4d.joint(**g, scales=scales, rotations=turns, timestamp=NOW).cov3d}
+        given["cov3d"][3, 2] = math.inf
+    leaves = {name: value.clone().requires_grad_() for name, value in (g | given).items()}
+    splats = SpacetimeGaussians(**leaves, sh=SH, sh_degree=3)
+    cut = slice_gaussians(splats, campos=CAMPOS, timestamp=NOW, scale_modifier=0.5)
+    if kind in ("joint", "separate"):
+        both = turns if kind == "joint" else turns[0]
+        expected = getattr(slice4d, kind)(**g, scales=scales, rotations=both, timestamp=NOW)
+        assert torch.equal(cut.present, expected.present)
+        torch.testing.assert_close(cut.cov3d[cut.present], expected.cov3d[cut.present])
+        torch.testing.assert_close(cut.opacities[cut.present], expected.opacities[cut.present])
+    absent = ~cut.present
+    assert absent.nonzero()[:1].flatten().tolist() == {"still": [], "sliced": [3]}.get(kind, [0])
+    assert (cut.means[absent] == CAMPOS).all()
+    for values in (cut.cov3d, cut.opacities, cut.colors):
+        assert not values[absent].any()
+    total = cut.means.sum() + cut.cov3d.sum() + cut.opacities.sum() + cut.colors.sum()
+    total.backward()
+    for leaf in leaves.values():
+        assert leaf.grad is None or not leaf.grad[absent].any()
 
 
 # -- colour ----------------------------------------------------------------------------------------
