@@ -9,7 +9,7 @@
 #include <new>
 #include <thread>
 
-#include "calls.h"
+#include "slices.h"
 
 namespace {
 
@@ -48,6 +48,7 @@ calls::Tally many(uint64_t seed, int64_t count) {
     calls::seed_in_hand = seed + static_cast<uint64_t>(k);
     calls::Source from(calls::seed_in_hand);
     calls::run(from, {}, tally);
+    if (from.one_in(4)) calls::run_cut(from, tally);
   }
   return tally;
 }
