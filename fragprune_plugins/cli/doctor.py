@@ -35,12 +35,15 @@ def command(build_cuda: str | None) -> Report:
         return _build(build_cuda)
     import torch
 
+    from fragprune_plugins.engines import proof
     from fragprune_plugins.native import driver, loader
     from fragprune_plugins.plugins import load_plugins
 
     packages = {name: _version(name) for name in _PACKAGES}
     native = loader.describe()
-    gpu = {**driver.describe(), "agrees": _agrees() if driver.missing() is None else None}
+    gpu = driver.describe()
+    doubt = proof.attempt() if gpu["available"] else None
+    gpu["agrees"] = doubt is None if gpu["available"] else None
     plugins = load_plugins()
     data: dict[str, Any] = {
         "python": platform.python_version(),
@@ -77,32 +80,9 @@ def command(build_cuda: str | None) -> Report:
     if gpu["agrees"] is False:
         wrong = True
         lines.append(
-            "The cuda engine draws something else than the reference engine here: use --engine "
-            "reference, and report it."
+            f"The cuda engine fails here: {doubt}. --engine auto does without it; please report it."
         )
     return Report(data, "\n".join(lines), exit_code=1 if wrong else 0)
-
-
-def _agrees() -> bool:
-    """Whether the cuda engine draws what the reference engine does, and learns from it the same."""
-    import torch
-
-    from fragprune_plugins.engines import create_engine
-    from fragprune_plugins.testing import scenes
-
-    found = []
-    for name in ("cuda", "reference"):
-        made, leaves = scenes.leaves(scenes.random_scene(0, 200, 70, 50, device="cuda"))
-        thresholds = scenes.random_thresholds(0, 200, device="cuda").requires_grad_()
-        out = create_engine(name, "cuda").rasterize(made, thresholds)
-        out.image.square().mean().backward()  # type: ignore[no-untyped-call]
-        found.append([out.image.detach(), leaves["means"].grad, thresholds.grad])
-    # a fragment at a cut may fall to one or the other: half a per cent of the sum, not of each
-    return all(
-        bool((a - b).abs().sum() <= 5e-3 * b.abs().sum() + 1e-6)
-        for a, b in zip(*found, strict=True)
-        if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor)
-    )
 
 
 def _build(architectures: str) -> Report:

@@ -65,10 +65,17 @@ def _fastest(device: str) -> str:
     if device.startswith("cuda"):
         from fragprune_plugins.native import driver
 
-        return "cuda" if driver.missing() is None else "reference"
+        return "cuda" if driver.missing() is None and _proven() else "reference"
     from fragprune_plugins.native import loader
 
     return "cpu" if device.startswith("cpu") and loader.available() else "reference"
+
+
+def _proven() -> bool:
+    """Whether the cuda engine has drawn here what the reference engine draws."""
+    from fragprune_plugins.engines import proof
+
+    return proof.doubt() is None
 
 
 _slicer = cache(create_engine)

@@ -272,7 +272,7 @@ def cache_folder() -> Path:
 
 
 @cache
-def _digest_of_sources() -> bytes:
+def digest_of_sources() -> bytes:
     """Of everything that kernels may include."""
     digest = hashlib.sha256()
     parent = SOURCES.parent
@@ -285,7 +285,7 @@ def _digest_of_sources() -> bytes:
 
 def _name_of(by: Compiler, source: str, macros: dict[str, int], target: str) -> str:
     what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
-    digest = hashlib.sha256(_digest_of_sources() + what.encode()).hexdigest()[:24]
+    digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]
     return f"{source}-{target}-{digest}"
 
 

@@ -8,15 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import CliRunner
-from gpu.emulated import EmulatedDevice
 
 from fragprune_plugins import engines
-from fragprune_plugins.cli import cli, doctor
-from fragprune_plugins.engines.cuda import CudaEngine
-from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.cli import cli
+from fragprune_plugins.engines import proof
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.native import kernels
-from fragprune_plugins.testing import scenes
+from fragprune_plugins.native import driver, kernels
 
 
 class Compiler:
@@ -71,19 +68,10 @@ def test_it_says_why_there_is_no_engine_for_gpus(monkeypatch: pytest.MonkeyPatch
     assert engines.create_engine("auto", "cuda").name == "reference"
 
 
-def test_it_compares_what_the_gpu_draws(
-    device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    random_scene, random_thresholds = scenes.random_scene, scenes.random_thresholds
-    monkeypatch.setattr(scenes, "random_scene", lambda *a, device: random_scene(*a))
-    monkeypatch.setattr(scenes, "random_thresholds", lambda *a, device: random_thresholds(*a))
-    made = {"cuda": CudaEngine(device), "reference": ReferenceEngine()}
-    monkeypatch.setattr(engines, "create_engine", lambda name, device: made[name])
-    assert doctor._agrees()
-
-    class Wrong(CudaEngine):
-        def rasterize(self, inputs, thresholds):
-            return super().rasterize(inputs, thresholds * 2)
-
-    made["cuda"] = Wrong(device)
-    assert not doctor._agrees()
+def test_a_gpu_that_fails_the_comparison_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = {"available": True, "reason": None}
+    monkeypatch.setattr(driver, "describe", lambda: dict(there))
+    for doubt, status in ((None, 0), ("no picture within 300 s", 1)):
+        monkeypatch.setattr(proof, "attempt", lambda doubt=doubt: doubt)
+        code, said = invoke()
+        assert (code, said["gpu"]["agrees"]) == (status, doubt is None)

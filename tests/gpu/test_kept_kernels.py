@@ -43,7 +43,7 @@ def test_whatever_changes_the_code_is_compiled_anew(kept: Path, monkeypatch) -> 
     ):
         assert not kernels.image_of(source, macros, target, slow)[1]
     assert not kernels.image_of("blend", {}, "sm_90", Slow("1.1"))[1]
-    monkeypatch.setattr(kernels, "_digest_of_sources", lambda: b"edited")
+    monkeypatch.setattr(kernels, "digest_of_sources", lambda: b"edited")
     assert not kernels.image_of("blend", {}, "sm_90", slow)[1]
 
 
