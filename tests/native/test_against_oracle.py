@@ -69,6 +69,16 @@ def check_images(
     assert ours.evaluated_per_pixel >= mean
 
 
+def test_large_pictures_are_written_whole_past_the_caches(engine: CpuEngine) -> None:
+    """Their rows are lines of memory, 262,144 pixels or more, the lowest tiles cut.
+
+    Coordinates are ten times the other scenes', and a float's distance between them.
+    """
+    inputs = scenes.random_scene(5, 60, width=528, height=500, features=2)
+    pair = draw_pair(engine, inputs, scenes.random_thresholds(5, 60))
+    check_images(*pair, tolerance=10 * IMAGE_TOLERANCE)
+
+
 def gradients(
     engine: CpuEngine | ReferenceEngine,
     inputs: RasterInputs,

@@ -254,36 +254,41 @@ struct Canvas {
   int32_t *fragments, *winners;
 };
 
-// One number per pixel of a tile, from block order to rows of the image.
-template <class T>
-class Painting {
- public:
-  void set(int block, const T* values) {
-    for (int i = 0; i < kBlockHeight; i++)
-      std::memcpy(&rows_[block_y(block) + i][block_x(block)], values + i * kBlockWidth,
-                  kBlockWidth * sizeof(T));
-  }
-  void paint(T* plane, int width, int height, int x0, int y0) const {
-    const int wide = std::min(kTile, width - x0), high = std::min(kTile, height - y0);
-    for (int y = 0; y < high; y++) {
-      T* to = plane + static_cast<size_t>(y0 + y) * width + x0;
-      if (wide == kTile)
-        std::memcpy(to, rows_[y], sizeof rows_[y]);
-      else
-        std::copy_n(rows_[y], wide, to);
-    }
-  }
+// A picture's planes are written past the caches where they would not stay there, a line at a time:
+// that spares reading each line first.
+inline bool streams(const Canvas& c, const void* plane) {
+  constexpr size_t kCached = size_t{1} << 18;  // pixels; their planes fill a second-level cache
+  return c.width % kTile == 0 && static_cast<size_t>(c.width) * c.height >= kCached &&
+         reinterpret_cast<uintptr_t>(plane) % kLine == 0;
+}
 
- private:
-  alignas(64) T rows_[kTile][kTile];
-};
+// One number per pixel of a tile, from block order to rows of a plane of the image.
+template <class T>
+inline void paint_tile(const Canvas& c, T* plane, int x0, int y0, const T (*values)[kLanes]) {
+  static_assert(kTile * sizeof(T) == kLine, "a tile's row is a line");
+  const int wide = std::min(kTile, c.width - x0), high = std::min(kTile, c.height - y0);
+  const bool past = streams(c, plane);
+  for (int y = 0; y < high; y++) {
+    T* to = plane + static_cast<size_t>(y0 + y) * c.width + x0;
+    const T(*from)[kLanes] = values + y / kBlockHeight * 4;
+    const int row = y % kBlockHeight * kBlockWidth;
+    if (past)
+      for (int b = 0; b < 4; b++) stream4(to + b * kBlockWidth, from[b] + row);
+    else if (wide == kTile)
+      for (int b = 0; b < 4; b++)
+        std::memcpy(to + b * kBlockWidth, from[b] + row, kBlockWidth * sizeof(T));
+    else
+      for (int x = 0; x < wide; x++) to[x] = from[x / kBlockWidth][row + x % kBlockWidth];
+  }
+}
 
 // Asks for the rows of the image that a tile will be painted on: they come while it is blended.
+// Those that are written past the caches need not come.
 inline void prefetch_canvas(const Canvas& c, int tile_x, int tile_y) {
   const size_t size = static_cast<size_t>(c.width) * c.height;
   const int high = std::min(kTile, c.height - tile_y);
   for (const float* plane : {c.image, c.image + size, c.image + 2 * size, c.invdepth, c.alpha})
-    for (int y = 0; plane && y < high; y++)
+    for (int y = 0; plane && !streams(c, plane) && y < high; y++)
       __builtin_prefetch(plane + static_cast<size_t>(tile_y + y) * c.width + tile_x, 1);
 }
 
@@ -383,14 +388,9 @@ inline int64_t close_tile(const Splat* splats, const Canvas& c, const OpenTile& 
   const size_t size = static_cast<size_t>(c.width) * c.height;
   const auto paint = [&](auto* plane, auto value_of) {
     if (!plane) return;
-    Painting<std::remove_reference_t<decltype(*plane)>> painting;
-    for (int b = 0; b < kBlocks; b++) {
-      const auto value = value_of(b);
-      std::remove_reference_t<decltype(*plane)> values[kLanes];
-      store(values, value);
-      painting.set(b, values);
-    }
-    painting.paint(plane, c.width, c.height, tile.x, tile.y);
+    alignas(kLine) std::remove_reference_t<decltype(*plane)> values[kBlocks][kLanes];
+    for (int b = 0; b < kBlocks; b++) store(values[b], value_of(b));
+    paint_tile(c, plane, tile.x, tile.y, values);
   };
   const auto over = [&](int b, Lanes v, float back) {
     return fma(tile.blocks[b].light, broadcast<Lanes>(back), v);

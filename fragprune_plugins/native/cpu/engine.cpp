@@ -150,6 +150,7 @@ class Cell {
                           p_.keep ? &p_.keep->pixels[t] : nullptr);
       if (extra) add_up(*extra, *list, splats_, p_.out, p_.weights);
     }
+    end_stream();
     if (p_.keep) keep_lists(p_.keep->cells[cell_]);
     return drawn;
   }

@@ -109,6 +109,25 @@ inline IntLanes load(const int32_t* p) {
 }
 inline void store(int32_t* p, IntLanes v) { std::memcpy(p, &v, sizeof v); }
 
+// Four numbers to an aligned place, past the caches where the machine can. Whoever did so calls
+// end_stream() before another thread may look.
+constexpr size_t kLine = 64;  // bytes
+template <class T>
+inline void stream4(T* to, const T* from) {
+  static_assert(sizeof *to == 4, "");
+#ifdef __SSE2__
+  const __m128i four = _mm_loadu_si128(reinterpret_cast<const __m128i*>(from));
+  _mm_stream_si128(reinterpret_cast<__m128i*>(to), four);
+#else
+  std::memcpy(to, from, 4 * sizeof *to);
+#endif
+}
+inline void end_stream() {
+#ifdef __SSE2__
+  _mm_sfence();
+#endif
+}
+
 #if FP_LANES == 16
 
 template <>
