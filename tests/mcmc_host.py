@@ -240,12 +240,17 @@ class MCMCHost(Host):
         }
 
 
+# Both only once the optimizer has stepped: the host fails before, and never does it so early.
+
+
 @torch.no_grad()
 def relocate(model, arguments, chance: Chance):
     share = (0.0, 1.0, chance.share, chance.share)[chance.seed % 4]
-    model.relocate_gs(dead_mask=chance.rows(len(model.get_xyz), share))
+    if model.optimizer.state:
+        model.relocate_gs(dead_mask=chance.rows(len(model.get_xyz), share))
 
 
 @torch.no_grad()
 def add(model, arguments, chance: Chance):
-    model.add_new_gs(cap_max=len(model.get_xyz) + int(10 * chance.share))
+    if model.optimizer.state:
+        model.add_new_gs(cap_max=len(model.get_xyz) + int(10 * chance.share))
