@@ -83,10 +83,8 @@ def measure(
     results = []
     for index, (case, engine, _) in enumerate(jobs):
         first = last[index - index % len(engines)]
-        median, drawn = (
-            statistics.median(times[index]),
-            float(last[index].fragments_per_pixel.detach()),
-        )
+        median = statistics.median(times[index])
+        drawn = float(last[index].fragments_per_pixel.detach())
         fragments = drawn * case.view.width * case.view.height
         results.append(
             {

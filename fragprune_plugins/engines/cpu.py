@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_args
 import torch
 from torch.autograd.function import once_differentiable
 
-from fragprune_plugins.engines.slicing import address as _address
+from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.native import loader
@@ -48,11 +48,6 @@ _SMALL = 1 << 16
 """Bytes below which the C library has memory at hand itself."""
 
 _STAGES = ("projection", "binning", "blend")
-
-
-def _plain(tensor: Tensor) -> Tensor:
-    """The values as the C side wants them: contiguous float32 in ordinary memory."""
-    return tensor.detach().to("cpu", torch.float32).contiguous()
 
 
 def _empty(workspace: loader.Workspace, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -122,7 +117,7 @@ class _Drawing:
             widen=widen,
             count=len(splats),
             workspace=self.workspace.handle,
-            **{name: _address(array) for name, array in self.arrays.items()},
+            **{name: address(array) for name, array in self.arrays.items()},
         )
 
     def draw(self, wants: dict[str, bool]) -> tuple[Tensor, ...]:
@@ -141,12 +136,12 @@ class _Drawing:
             self.found["wins_per_gaussian"] = empty(n, dtype=whole)
             self.found["winners"] = empty(*size, dtype=whole)
         outputs = loader.Outputs(
-            image=_address(image),
-            invdepth=_address(invdepth),
-            alpha=_address(alpha),
-            radii=_address(radii),
-            features=_address(features),
-            **{name: _address(tensor) for name, tensor in self.found.items()},
+            image=address(image),
+            invdepth=address(invdepth),
+            alpha=address(alpha),
+            radii=address(radii),
+            features=address(features),
+            **{name: address(tensor) for name, tensor in self.found.items()},
         )
         error = loader.Error()
         handle = ctypes.c_void_p()
@@ -172,14 +167,14 @@ class _Drawing:
     def undraw(self, upstream: tuple[Tensor | None, ...], wants: dict[str, bool]) -> dict[str, Any]:
         """Run the backward pass; gradients by name, float32 on the CPU."""
         assert self.state is not None
-        plain = [None if g is None else _plain(g) for g in upstream]
-        image, invdepth, alpha, features, per_pixel = plain
+        by = [None if g is None else plain(g) for g in upstream]
+        image, invdepth, alpha, features, per_pixel = by
         output_grads = loader.OutputGrads(
             fragments_per_pixel=0.0 if per_pixel is None else per_pixel.item(),
-            image=_address(image),
-            invdepth=_address(invdepth),
-            alpha=_address(alpha),
-            features=_address(features),
+            image=address(image),
+            invdepth=address(invdepth),
+            alpha=address(alpha),
+            features=address(features),
         )
         n = len(self.inputs.splats)
         shapes = {name: array.shape for name, array in self.arrays.items()}
@@ -189,7 +184,7 @@ class _Drawing:
         status = self.library.calls.fragprune_backward(
             self.state.handle,
             ctypes.byref(output_grads),
-            ctypes.byref(loader.InputGrads(**{k: _address(g) for k, g in grads.items()})),
+            ctypes.byref(loader.InputGrads(**{k: address(g) for k, g in grads.items()})),
             _threads(),
             ctypes.byref(error),
         )
@@ -281,9 +276,9 @@ class CpuEngine:
         constants = {k: getattr(view, k) for k in ("viewmatrix", "projmatrix", "campos")}
         constants["sample_offsets"] = inputs.sample_offsets
         read = {k: t for k, t in {**tensors, **constants}.items() if t is not None and k != "hook"}
-        arrays = {name: _plain(tensor) for name, tensor in read.items()}
+        arrays = {name: plain(tensor) for name, tensor in read.items()}
         if isinstance(splats, Footprints):
-            arrays["tiles"] = splats.tiles.detach().to("cpu", torch.int32).contiguous()
+            arrays["tiles"] = plain(splats.tiles, dtype=torch.int32)
         drawing = _Drawing(inputs, self._library, self._workspace, arrays)
         outputs = _Rasterize.apply(  # type: ignore[no-untyped-call]
             drawing, *(tensors[name] for name in _NAMES)

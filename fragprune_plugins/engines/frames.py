@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, get_args
 import torch
 
 from fragprune_plugins.constants import TILE
-from fragprune_plugins.engines.slicing import address as _address
+from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.native import loader
-from fragprune_plugins.types import Compensation, Splats
+from fragprune_plugins.types import Compensation, Footprints, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -220,11 +220,6 @@ def _blocks(count: int, per_block: int = THREADS) -> int:
     return -(-count // per_block)
 
 
-def _plain(tensor: Tensor, where: torch.device) -> Tensor:
-    whole = tensor.dtype == torch.int32  # tiles of footprints
-    return tensor.detach().to(where, None if whole else torch.float32).contiguous()
-
-
 def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
     """The tensors of a rasterization that gradients can be wanted of, but for thresholds."""
     splats = inputs.splats
@@ -266,12 +261,13 @@ class Drawing:
         given = {
             **learnable(inputs),
             **{name: getattr(view, name) for name in ("viewmatrix", "projmatrix", "campos")},
-            "tiles": getattr(inputs.splats, "tiles", None),
             "sample_offsets": inputs.sample_offsets,
             "thresholds": thresholds,
             "hook": None,  # its values are not used
         }
-        self._arrays = {k: _plain(t, self._where) for k, t in given.items() if t is not None}
+        self._arrays = {k: plain(t, self._where) for k, t in given.items() if t is not None}
+        if isinstance(inputs.splats, Footprints):
+            self._arrays["tiles"] = plain(inputs.splats.tiles, self._where, torch.int32)
         offsets = self._arrays.get("sample_offsets")
         self._spread = None if offsets is None else offsets.abs().amax()
         self._across, self._down = -(-view.width // TILE), -(-view.height // TILE)
@@ -339,7 +335,7 @@ class Drawing:
         frame = Frame(
             inputs=self._c_inputs("thresholds" in wanted),
             outputs=self._new_outputs(),
-            spread=_address(self._spread),
+            spread=address(self._spread),
             capacity=capacity,
             tiles_x=self._across,
             tiles_y=self._down,
@@ -362,7 +358,7 @@ class Drawing:
             reached=kept["reached"] if keep else None,
             transmittance=kept["transmittance"] if keep else None,
             stop=kept["stop"] if keep else None,
-            weights=_address(weights),
+            weights=address(weights),
         )
         counters = cleared["counters"]
         by_depth = Sort(
@@ -446,7 +442,7 @@ class Drawing:
             feature_count=self._channels,
             widen=widen,
             count=self._n,
-            **{name: _address(array) for name, array in self._arrays.items()},
+            **{name: address(array) for name, array in self._arrays.items()},
         )
 
     def _new_outputs(self) -> loader.Outputs:
@@ -470,7 +466,7 @@ class Drawing:
             self.winners, self.wins_per_gaussian = new(*size, dtype=torch.int32), zeros()
         names = "image invdepth alpha radii features fragments fragments_per_gaussian"
         names += " wins_per_gaussian winners"
-        return loader.Outputs(**{name: _address(getattr(self, name)) for name in names.split()})
+        return loader.Outputs(**{name: address(getattr(self, name)) for name in names.split()})
 
     def _sort(
         self,
@@ -525,7 +521,7 @@ class Drawing:
             "features": by_features,
             "fragments": by_fragments,
         }
-        by = {k: _plain(g, where) for k, g in upstream.items() if g is not None}
+        by = {k: plain(g, where) for k, g in upstream.items() if g is not None}
         macros = unblend_macros(
             wanted,
             sh_turns="sh" in self._arrays and frame.inputs.sh_degree > 0,
@@ -549,12 +545,12 @@ class Drawing:
         arguments = Undraw(
             frame=frame,
             by=loader.OutputGrads(
-                **{k: _address(by.get(k)) for k in ("image", "invdepth", "alpha", "features")}
+                **{k: address(by.get(k)) for k in ("image", "invdepth", "alpha", "features")}
             ),
-            to=loader.InputGrads(**{name: _address(grad) for name, grad in grads.items()}),
-            by_fragments=_address(by.get("fragments")),
-            background=_address(by_tile),
-            sums=_address(room),
+            to=loader.InputGrads(**{name: address(grad) for name, grad in grads.items()}),
+            by_fragments=address(by.get("fragments")),
+            background=address(by_tile),
+            sums=address(room),
             ceiling=math.inf if inputs.cap_gradient else inputs.alpha_max,
         )
         self._launch("unblend", macros, "fp_unblend", tiles, arguments)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch.autograd.function import once_differentiable
 
+from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.native import loader
 from fragprune_plugins.types import Moment, Sliced, SpacetimeSplats
@@ -62,11 +63,6 @@ class Blade(Protocol):
         self, given: loader.Spacetime, by: loader.Sliced, to: loader.SpacetimeGrads
     ) -> None:
         """fragprune_unslice."""
-
-
-def address(tensor: Tensor | None) -> int | None:
-    """Of its first number; None stands for no array, or for an empty one."""
-    return None if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
 
 
 @dataclass
@@ -130,7 +126,7 @@ class _Slice(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         cut, tensors = ctx.cut, ctx.saved_tensors
-        by = [None if g is None else _plain(g, cut.blade.where) for g in upstream[:4]]
+        by = [None if g is None else plain(g, cut.blade.where) for g in upstream[:4]]
         wanted = [n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs]
         grads = {name: cut.blade.empty(*cut.arrays[name].shape) for name in wanted}
         cut.blade.unslice(
@@ -148,10 +144,6 @@ class _Slice(torch.autograd.Function):
         return tuple(given)
 
 
-def _plain(tensor: Tensor, where: torch.device) -> Tensor:
-    return tensor.detach().to(where, torch.float32).contiguous()
-
-
 def slice_by(blade: Blade, splats: SpacetimeSplats, moment: Moment) -> Sliced:
     """Cut the Gaussians at the moment; differentiable in all that the splats hold.
 
@@ -161,7 +153,7 @@ def slice_by(blade: Blade, splats: SpacetimeSplats, moment: Moment) -> Sliced:
     check_harmonics(splats, moment)
     tensors = {name: getattr(splats, name) for name in _NAMES}
     read = {**tensors, "campos": moment.campos}
-    arrays = {name: _plain(t, blade.where) for name, t in read.items() if t is not None}
+    arrays = {name: plain(t, blade.where) for name, t in read.items() if t is not None}
     cut = _Cut(blade, splats, moment, arrays)
     means, cov3d, opacities, colors, present = _Slice.apply(  # type: ignore[no-untyped-call]
         cut, *tensors.values()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.errors import AlignmentError
@@ -21,10 +20,9 @@ def on_parents(
     state = session.models.get(model)
     if state is None:
         return wrapped(*args, **kwargs)
-    bound = signature(wrapped).bind(*args, **kwargs)
-    bound.apply_defaults()
     method = seam.attribute.split(".")[-1]
-    state.pending_parents = session.adapter.parents(model, method, bound.arguments)
+    arguments = named(wrapped, args, kwargs)
+    state.pending_parents = session.adapter.parents(model, method, arguments)
     try:
         result = wrapped(*args, **kwargs)
         left = 0 if state.pending_parents is None else len(state.pending_parents)
@@ -41,7 +39,7 @@ def on_append(
     state = session.models.get(model)
     if state is None:
         return wrapped(*args, **kwargs)
-    tensors = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
+    tensors = named(wrapped, args, kwargs)[seam.needs[0]]
     count, parents = len(next(iter(tensors.values()))), state.pending_parents
     if parents is not None:
         parents, rest = parents[:count], parents[count:]
@@ -74,7 +72,7 @@ def on_choice(
     result = wrapped(*args, **kwargs)
     state = session.models.get(model)
     if state is not None:
-        chosen = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
+        chosen = named(wrapped, args, kwargs)[seam.needs[0]]
         state.pending_parents = chosen.detach().clone()
     return result
 
@@ -86,7 +84,7 @@ def on_copy(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, k
     state = session.models.get(model)
     if state is None:
         return wrapped(*args, **kwargs)
-    mask = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
+    mask = named(wrapped, args, kwargs)[seam.needs[0]]
     target = mask.nonzero()[:, 0]
     state.pending_parents = None
     try:
@@ -116,9 +114,7 @@ def on_forget(
     result = wrapped(*args, **kwargs)
     state = session.models.get(model)
     if state is not None:
-        bound = signature(wrapped).bind(*args, **kwargs)
-        bound.apply_defaults()
-        state.store.forget(bound.arguments[seam.needs[0]])
+        state.store.forget(named(wrapped, args, kwargs)[seam.needs[0]])
     return result
 
 
@@ -127,7 +123,7 @@ def on_keep(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, k
     result = wrapped(*args, **kwargs)
     state = session.models.get(model)
     if state is not None:
-        mask = signature(wrapped).bind(*args, **kwargs).arguments[seam.needs[0]]
+        mask = named(wrapped, args, kwargs)[seam.needs[0]]
         before = len(state.store)
         state.store.keep(mask)
         session.changed(state.store, "keep", before)

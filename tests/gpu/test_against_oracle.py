@@ -62,6 +62,13 @@ def test_footprints_equal_the_oracle(engine: CudaEngine, kind: str) -> None:
     check_gradients(engine, inputs, thresholds, same)
 
 
+def test_tiles_of_footprints_may_be_any_integers(engine: CudaEngine) -> None:
+    inputs = flat(dialect(5))
+    wide = replace(inputs, splats=replace(inputs.splats, tiles=inputs.splats.tiles.long()))
+    drawn = [everything(engine, each, None)["image"] for each in (inputs, wide)]
+    assert torch.equal(*drawn)
+
+
 def test_tall_stacks_stop_where_the_oracle_does(engine: CudaEngine) -> None:
     inputs = scenes.stack([0.3, 0.9, 0.999, 0.5] * 90)  # more than is staged at once
     thresholds = torch.linspace(0.01, 0.6, 360)
