@@ -9,11 +9,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fragprune_plugins.api import activate, deactivate, paused
     from fragprune_plugins.engines import rasterize, slice_at
     from fragprune_plugins.finetuning import finetune
-    from fragprune_plugins.schedule import Settings
-    from fragprune_plugins.thresholds import ThresholdStore
+    from fragprune_plugins.injection.api import activate, deactivate, paused
+    from fragprune_plugins.learning.schedule import Settings
+    from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.types import (
         Footprints,
         Moment,
@@ -32,16 +32,16 @@ _HOME = {
     "Moment": "types",
     "RasterInputs": "types",
     "RasterOutputs": "types",
-    "Settings": "schedule",
+    "Settings": "learning.schedule",
     "Sliced": "types",
     "SpacetimeSplats": "types",
     "Splats": "types",
-    "ThresholdStore": "thresholds",
+    "ThresholdStore": "learning.thresholds",
     "View": "types",
-    "activate": "api",
-    "deactivate": "api",
+    "activate": "injection.api",
+    "deactivate": "injection.api",
     "finetune": "finetuning",
-    "paused": "api",
+    "paused": "injection.api",
     "rasterize": "engines",
     "slice_at": "engines",
 }

@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.detect import Match
-from fragprune_plugins.lineage import GraphdecoDialect
+from fragprune_plugins.hosts.findings import Match
+from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 

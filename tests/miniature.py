@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.adapter import HostAdapter
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing import host as kit
 from fragprune_plugins.testing.host import MINIATURE as HOST
 from fragprune_plugins.testing.host import Running, imported

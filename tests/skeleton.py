@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.hosts.source import HostRepo
 
 SETTINGS = [
     *("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier"),

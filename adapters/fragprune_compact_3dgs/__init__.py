@@ -11,12 +11,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import HostAdapter, HostInfo
-from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from torch import Tensor

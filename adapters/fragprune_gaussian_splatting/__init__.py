@@ -15,12 +15,13 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import CommandLine, HostAdapter, HostCall, HostInfo, RowTrace
-from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.errors import AlignmentError, EngineError, SessionError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo, RowTrace
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -48,7 +49,7 @@ class PackageDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The rasterizer, the neighbour distances and the relocation, inside their packages."""
-        from fragprune_plugins.lineage.stand_ins import compute_relocation
+        from fragprune_plugins.hosts.graphdeco.stand_ins import compute_relocation
 
         relocation = ModuleType(RELOCATION, "Stand-in of fragprune.")
         vars(relocation)["compute_relocation"] = compute_relocation

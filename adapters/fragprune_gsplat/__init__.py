@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import CommandLine, Dialect, HostAdapter, HostInfo, RowTrace
-from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.errors import SessionError, UsageError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import CommandLine, Dialect, HostAdapter, HostInfo, RowTrace
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from torch import Tensor

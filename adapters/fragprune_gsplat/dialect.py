@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from fragprune_gsplat.projection import TILE, Projection, Rules, covariances, project
-from fragprune_plugins.adapter import Dialect, HostCall
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.lineage.harmonics import basis
+from fragprune_plugins.hosts.adapter import Dialect, HostCall
+from fragprune_plugins.hosts.graphdeco.harmonics import basis
 from fragprune_plugins.types import Footprints, RasterInputs, View
 
 if TYPE_CHECKING:
@@ -251,7 +251,7 @@ class GsplatDialect(Dialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The two kernels that its strategies call beside ``rasterization``."""
-        from fragprune_plugins.lineage.stand_ins import compute_relocation
+        from fragprune_plugins.hosts.graphdeco.stand_ins import compute_relocation
 
         backend = ModuleType(BACKEND, "Stand-in of fragprune for compiled kernels.")
 

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import CommandLine, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.detect import Finding, HostRepo
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import CommandLine, ConfigFile, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.detect import Finding, HostRepo
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter, HostCall, HostInfo
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,7 +42,7 @@ class MCMCDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The lineage's stand-ins; the host imports the relocation from the rasterizer's."""
-        from fragprune_plugins.lineage.stand_ins import compute_relocation
+        from fragprune_plugins.hosts.graphdeco.stand_ins import compute_relocation
 
         modules = super().modules(draw)
         vars(modules[self.package])["compute_relocation"] = compute_relocation

@@ -14,11 +14,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.detect import Finding, HostRepo
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -68,7 +69,7 @@ class MiniSplattingDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The lineage's stand-ins and the scoring rasterizer's."""
-        from fragprune_plugins.lineage import stand_ins
+        from fragprune_plugins.hosts.graphdeco import stand_ins
 
         scoring = stand_ins.rasterizer(SCORING, self.settings, False, draw, also=("render_depth",))
         return {**super().modules(draw), SCORING: scoring}

@@ -15,17 +15,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.detect import Finding, HostRepo
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.lineage.graphdeco import default, reaches
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco.adapter import default, reaches
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.ply import SplatFile
+    from fragprune_plugins.storage.ply import SplatFile
     from fragprune_plugins.types import RasterInputs
 
 MODEL = "scene.gaussian_model"
@@ -109,7 +110,7 @@ class MipSplatting(GraphdecoAdapter):
 
     def read_model(self, ply: Path) -> SplatFile:
         """With the 3D filter, which only this host's own reader asks for."""
-        from fragprune_plugins.ply import read_ply
+        from fragprune_plugins.storage.ply import read_ply
 
         return read_ply(ply, filtered=True)
 

@@ -13,12 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from fragprune_plugins.adapter import CommandLine, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import Contract, GraphdecoAdapter
-from fragprune_plugins.seams import Role
+from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter
+from fragprune_plugins.hosts.seams import Role
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_rt_4dgs.config import YAMLFile
 from fragprune_rt_4dgs.dialect import OUTPUTS, RASTERIZER, SETTINGS, RT4DGSDialect
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import HostCall
-from fragprune_plugins.lineage import GraphdecoDialect
+from fragprune_plugins.hosts.adapter import HostCall
+from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
 
 if TYPE_CHECKING:
     from torch import Tensor

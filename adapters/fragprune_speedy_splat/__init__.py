@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.detect import Finding, HostRepo
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import Contract, GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from fragprune_plugins.types import RasterInputs, RasterOutputs

@@ -13,11 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.adapter import HostAdapter, HostInfo
-from fragprune_plugins.detect import Finding, HostRepo
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import Contract, GraphdecoAdapter
-from fragprune_plugins.lineage.graphdeco import MODEL
+from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter
+from fragprune_plugins.hosts.graphdeco.adapter import MODEL
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 
 OUTPUTS = 3
 """Colour, radii and, since August 2024, inverse depth."""

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import fragprune_plugins
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.learning.schedule import Settings
 
 parser = ArgumentParser()
 parser.add_argument("scene", type=Path)
@@ -42,8 +42,8 @@ from plyfile import PlyData  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
 from fragprune_plugins.finetuning import load_dataset  # noqa: E402
-from fragprune_plugins.finetuning.losses import photometric_loss  # noqa: E402
-from fragprune_plugins.ply import read_ply  # noqa: E402
+from fragprune_plugins.learning.losses import photometric_loss  # noqa: E402
+from fragprune_plugins.storage.ply import read_ply  # noqa: E402
 from fragprune_plugins.types import View  # noqa: E402
 
 SH_DEGREE = 1

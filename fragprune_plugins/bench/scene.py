@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fragprune_plugins.ply import SplatFile
+from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import View
 
 SEED = 20240607

@@ -12,7 +12,7 @@ import click
 from fragprune_plugins.cli.common import Command, Report
 
 if TYPE_CHECKING:
-    from fragprune_plugins.adapter import HostAdapter
+    from fragprune_plugins.hosts.adapter import HostAdapter
 
 
 @click.command("adapters", cls=Command)
@@ -25,7 +25,7 @@ def command(table: bool) -> Report:
       fragprune adapters --json
       fragprune adapters --table > docs/reference/support.md
     """
-    from fragprune_plugins.plugins import load_plugins
+    from fragprune_plugins.plugins.loading import load_plugins
 
     plugins = load_plugins()
     adapters = [
@@ -79,8 +79,8 @@ def _scripts(adapter: HostAdapter) -> tuple[str, ...]:
 
     They do not depend on the revision.
     """
-    from fragprune_plugins.detect import HostRepo
     from fragprune_plugins.errors import UsageError
+    from fragprune_plugins.hosts.source import HostRepo
 
     try:
         return adapter.command_line(HostRepo(Path("/nonexistent"))).scripts

@@ -75,7 +75,7 @@ def command(
 
     import torch
 
-    from fragprune_plugins.bench.measure import Case, measure, scaling, translation
+    from fragprune_plugins.bench.timing import Case, measure, scaling, translation
     from fragprune_plugins.engines import create_engine
 
     set_threads(threads)
@@ -127,8 +127,8 @@ def _scenes(
     from fragprune_plugins.bench.scene import make_scene, make_view
 
     if model is not None and cameras is not None:
-        from fragprune_plugins.cli.common import load_model
-        from fragprune_plugins.finetuning.cameras import load_cameras
+        from fragprune_plugins.datasets.cameras import load_cameras
+        from fragprune_plugins.storage.models import load_model
 
         splat, learned = load_model(model)
         _, view = load_cameras(cameras)[0]
@@ -149,8 +149,8 @@ def _peers(
     """Every scene at SH degree 0: our own row, then one a peer; see ``peers.time_peer``."""
     from dataclasses import replace
 
-    from fragprune_plugins.bench.measure import Case, measure
     from fragprune_plugins.bench.peers import installed, time_peer
+    from fragprune_plugins.bench.timing import Case, measure
     from fragprune_plugins.types import RasterInputs
 
     rows = []
@@ -211,9 +211,9 @@ def _table(data: dict[str, Any]) -> str:
 
 
 def _native() -> str | None:
-    from fragprune_plugins.native import loader
+    from fragprune_plugins.engines.cpu import binding
 
-    found = loader.describe()
+    found = binding.describe()
     return str(found["build"]) if found["available"] else None
 
 

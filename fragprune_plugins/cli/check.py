@@ -11,8 +11,9 @@ import click
 from fragprune_plugins.cli.common import FILE, Command, Report
 
 if TYPE_CHECKING:
-    from fragprune_plugins.adapter import HostAdapter
-    from fragprune_plugins.detect import Finding, HostRepo, Match, SeamState
+    from fragprune_plugins.hosts.adapter import HostAdapter
+    from fragprune_plugins.hosts.findings import Finding, Match
+    from fragprune_plugins.hosts.source import HostRepo, SeamState
 
 
 @click.command("check", cls=Command)
@@ -31,9 +32,9 @@ def command(host: Path, adapter: str | None) -> Report:
       fragprune check ~/code/my-fork --adapter vanilla-3dgs     (why does it not fit?)
       fragprune check gsplat                                    (an installed package)
     """
-    from fragprune_plugins.detect import HostRepo
     from fragprune_plugins.errors import UnknownHostError
-    from fragprune_plugins.plugins import load_plugins
+    from fragprune_plugins.hosts.source import HostRepo
+    from fragprune_plugins.plugins.loading import load_plugins
 
     if not host.is_dir() and HostRepo.installed(str(host)) is None:
         raise UnknownHostError(
@@ -153,8 +154,9 @@ class _Checked:
 
 def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:
     """The checkout that the folder is or lies in, or the package; else the folder itself."""
-    from fragprune_plugins.detect import HostRepo, locate
     from fragprune_plugins.errors import UnknownHostError
+    from fragprune_plugins.hosts.choosing import locate
+    from fragprune_plugins.hosts.source import HostRepo
 
     package = None if host.is_dir() else HostRepo.installed(str(host))
     if package is not None:
@@ -166,7 +168,7 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
 
 
 def _check(adapter: HostAdapter, repo: HostRepo) -> _Checked:
-    from fragprune_plugins.detect import look_up
+    from fragprune_plugins.hosts.source import look_up
 
     return _Checked(adapter, adapter.match(repo), look_up(repo, adapter.seams_for(repo)))
 

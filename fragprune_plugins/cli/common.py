@@ -13,14 +13,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
-from fragprune_plugins.records import strict
+from fragprune_plugins.storage.records import strict
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from fragprune_plugins.finetuning.dataset import Shot
-    from fragprune_plugins.ply import SplatFile
-    from fragprune_plugins.thresholds import ThresholdStore
+    from fragprune_plugins.datasets.dataset import Shot
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -178,45 +174,6 @@ def set_threads(threads: int | None) -> None:
         torch.set_num_threads(threads)
 
 
-def load_model(
-    path: Path, *, truncation: bool = True, filtered: bool = False
-) -> tuple[SplatFile, Tensor | None]:
-    """A model and its thresholds (N,): the sidecar's, else the file's own column, else None.
-
-    ``filtered`` as in ``read_ply``.
-
-    Raises:
-        ModelFileError: the model cannot be read.
-        SidecarError: the sidecar beside it is broken or belongs to another model.
-    """
-    from fragprune_plugins import sidecar
-    from fragprune_plugins.ply import read_ply
-
-    model = read_ply(path, filtered=filtered)
-    if not truncation:
-        return model, None
-    if sidecar.path_beside(path).exists():
-        store = load_store(path, model)
-        return model, None if store.neutral else store.values.detach()
-    return model, model.thresholds
-
-
-def load_store(path: Path, model: SplatFile) -> ThresholdStore:
-    """The thresholds of a model to go on learning from: as ``load_model``, neutral when none."""
-    import torch
-
-    from fragprune_plugins import sidecar
-    from fragprune_plugins.thresholds import ThresholdStore
-
-    store = ThresholdStore(len(model))
-    if sidecar.path_beside(path).exists():
-        sidecar.load(path, store)
-    elif model.thresholds is not None:
-        with torch.no_grad():
-            store.logits.copy_(torch.logit(model.thresholds))
-    return store
-
-
 def load_shots(
     folder: Path, views: str, *, resolution: int, white_background: bool
 ) -> Sequence[Shot]:
@@ -225,7 +182,7 @@ def load_shots(
     Raises:
         DatasetError: the folder cannot be read as a scene.
     """
-    from fragprune_plugins.finetuning.dataset import load_dataset
+    from fragprune_plugins.datasets.dataset import load_dataset
 
     dataset = load_dataset(folder, resolution=resolution, white_background=white_background)
     return {

@@ -14,12 +14,12 @@ from fragprune_plugins.cli.common import (
     describe,
     engine_options,
     gain,
-    load_model,
     load_shots,
     set_threads,
     truncation_option,
     views_option,
 )
+from fragprune_plugins.storage.models import load_model
 
 
 @click.command("compare", cls=Command)
@@ -50,11 +50,11 @@ def command(
     Example:
       fragprune compare point_cloud.ply small.ply --data scene --out pictures
     """
-    from fragprune_plugins import records
     from fragprune_plugins.cli.profile import draw_panels
     from fragprune_plugins.engines import create_engine
-    from fragprune_plugins.files import writable_folder
     from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.storage import records
+    from fragprune_plugins.storage.atomic import writable_folder
 
     set_threads(threads)
     if out is not None:

@@ -45,7 +45,7 @@ def command(out: Path, iters: int, seed: int, engine: str, threads: int | None) 
     """
     # Read when torch loads: idle threads sleep instead of spinning against other programs' work.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from fragprune_plugins.demo.story import DemoSettings, honest, quotable, run_demo
+    from fragprune_plugins.demo.demo import DemoSettings, honest, quotable, run_demo
 
     set_threads(threads)
     settings = DemoSettings(iterations=iters, finetune=iters // 2, seed=seed, engine=engine)

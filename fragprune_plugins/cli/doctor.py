@@ -35,14 +35,14 @@ def command(build_cuda: str | None) -> Report:
         return _build(build_cuda)
     import torch
 
-    from fragprune_plugins.engines import proof
-    from fragprune_plugins.native import driver, loader
-    from fragprune_plugins.plugins import load_plugins
+    from fragprune_plugins.engines.cpu import binding
+    from fragprune_plugins.engines.cuda import driver, self_check
+    from fragprune_plugins.plugins.loading import load_plugins
 
     packages = {name: _version(name) for name in _PACKAGES}
-    native = loader.describe()
+    native = binding.describe()
     gpu = driver.describe()
-    doubt = proof.attempt() if gpu["available"] else None
+    doubt = self_check.attempt() if gpu["available"] else None
     gpu["agrees"] = doubt is None if gpu["available"] else None
     plugins = load_plugins()
     data: dict[str, Any] = {
@@ -55,7 +55,7 @@ def command(build_cuda: str | None) -> Report:
         "gpu": gpu,
         "engines": [
             "reference",
-            *(["cpu"] if loader.available() else []),
+            *(["cpu"] if binding.available() else []),
             *(["cuda"] if gpu["available"] else []),
         ],
         "adapters": [adapter.name for adapter in plugins.adapters],
@@ -71,8 +71,8 @@ def command(build_cuda: str | None) -> Report:
         f"adapters: {', '.join(data['adapters']) or 'none'}",
         *(str(finding) for finding in plugins.findings),
     ]
-    wrong = not loader.available() or any(f.level == "error" for f in plugins.findings)
-    if not loader.available():
+    wrong = not binding.available() or any(f.level == "error" for f in plugins.findings)
+    if not binding.available():
         lines.append(
             "The cpu engine is missing: rasterization on the CPU uses the slow reference engine. "
             "Install a C++17 compiler and install fragprune-plugins again."
@@ -87,8 +87,8 @@ def command(build_cuda: str | None) -> Report:
 
 def _build(architectures: str) -> Report:
     """Compile the usual kernels for some architectures and keep them."""
-    from fragprune_plugins.engines.frames import MACROS, VARIANTS
-    from fragprune_plugins.native import kernels
+    from fragprune_plugins.engines.cuda import kernels
+    from fragprune_plugins.engines.cuda.frame import MACROS, VARIANTS
 
     try:
         codes = [int(code.strip().removeprefix("sm_")) for code in architectures.split(",")]

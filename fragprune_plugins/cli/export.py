@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from fragprune_plugins.cli.common import FILE, Command, Report, load_model
+from fragprune_plugins.cli.common import FILE, Command, Report
 from fragprune_plugins.errors import SidecarError
+from fragprune_plugins.storage.models import load_model
 
 
 @click.command("export", cls=Command)
@@ -24,8 +25,8 @@ def command(model: Path, out: Path) -> Report:
     Example:
       fragprune export small.ply --out small_with_thresholds.ply
     """
-    from fragprune_plugins import sidecar
-    from fragprune_plugins.ply import THRESHOLD_COLUMN, write_ply
+    from fragprune_plugins.storage import sidecar
+    from fragprune_plugins.storage.ply import THRESHOLD_COLUMN, write_ply
 
     splat, thresholds = load_model(model)
     if thresholds is None:

@@ -15,13 +15,12 @@ from fragprune_plugins.cli.common import (
     describe,
     engine_options,
     gain,
-    load_model,
-    load_store,
     set_threads,
 )
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.storage.models import load_model, load_store
 
 if TYPE_CHECKING:
     from fragprune_plugins.finetuning.loop import Record
@@ -65,12 +64,12 @@ def command(
     if out.resolve() == model.resolve():
         raise UsageError("--out", f"{out}, the model itself", "another file", "Name a new file.")
 
-    from fragprune_plugins import records, sidecar
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.errors import OutputError
-    from fragprune_plugins.files import writable_folder
     from fragprune_plugins.finetuning import finetune, load_dataset, save
     from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.storage import records, sidecar
+    from fragprune_plugins.storage.atomic import writable_folder
 
     set_threads(threads)
     writable_folder(out.parent)

@@ -9,8 +9,8 @@ from typing import Any
 import click
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.pressure import ELASTICITY, LEAST_PRESSURE
-from fragprune_plugins.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
+from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE
+from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
 
 _OPTIONS = (
     click.option(

@@ -14,18 +14,18 @@ from fragprune_plugins.cli.common import (
     data_options,
     describe,
     engine_options,
-    load_model,
     load_shots,
     set_threads,
     truncation_option,
     views_option,
 )
+from fragprune_plugins.storage.models import load_model
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from fragprune_plugins.datasets.dataset import Shot
     from fragprune_plugins.engines import Engine
-    from fragprune_plugins.finetuning.dataset import Shot
     from fragprune_plugins.measure import Candidate
 
 PANELS = 4
@@ -59,10 +59,10 @@ def command(
     """
     import torch
 
-    from fragprune_plugins import records
     from fragprune_plugins.engines import create_engine
-    from fragprune_plugins.files import writable_folder
     from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.storage import records
+    from fragprune_plugins.storage.atomic import writable_folder
 
     set_threads(threads)
     if out is not None:

@@ -12,13 +12,13 @@ from fragprune_plugins.cli.common import (
     Report,
     engine_options,
     image_options,
-    load_model,
     load_shots,
     set_threads,
     truncation_option,
     views_option,
 )
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.storage.models import load_model
 
 
 @click.command("render", cls=Command)
@@ -59,10 +59,10 @@ def command(
 
     import torch
 
+    from fragprune_plugins.datasets.cameras import load_cameras
     from fragprune_plugins.engines import create_engine
-    from fragprune_plugins.files import writable_folder
-    from fragprune_plugins.finetuning.cameras import load_cameras
     from fragprune_plugins.measure.pictures import save_heatmap, save_image
+    from fragprune_plugins.storage.atomic import writable_folder
     from fragprune_plugins.types import RasterInputs
 
     set_threads(threads)

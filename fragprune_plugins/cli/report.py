@@ -17,12 +17,12 @@ from fragprune_plugins.cli.common import (
     describe,
     engine_options,
     gain,
-    load_model,
     set_threads,
 )
+from fragprune_plugins.storage.models import load_model
 
 if TYPE_CHECKING:
-    from fragprune_plugins.records import Record
+    from fragprune_plugins.storage.records import Record
 
 PAGE = "report.html"
 
@@ -48,9 +48,9 @@ def command(
     Example:
       fragprune report out
     """
-    from fragprune_plugins.files import replacing
-    from fragprune_plugins.measure import page
-    from fragprune_plugins.records import find
+    from fragprune_plugins.measure import report_page
+    from fragprune_plugins.storage.atomic import replacing
+    from fragprune_plugins.storage.records import find
 
     set_threads(threads)
     records = find(folder)
@@ -61,18 +61,18 @@ def command(
         pictures = Path(name)
         views, learning, missing = _draw(main, pictures, data, engine)
         more = [*learning, *_files(records, pictures)]
-        text = page.compose(
+        text = report_page.compose(
             title=f"fragprune report: {folder.resolve().name}",
             quote=line,
             text=[
-                page.preformatted(_table(main)),
-                page.paragraph(missing or (_SLIDERS if views else "")),
+                report_page.preformatted(_table(main)),
+                report_page.paragraph(missing or (_SLIDERS if views else "")),
                 *(block for record in others for block in _block(record)),
             ],
             views=views,
             pictures=more,
             source=lambda file: _embedded(pictures / file),
-            ending=["<h2>Settings</h2>", page.preformatted(_facts(main))],
+            ending=["<h2>Settings</h2>", report_page.preformatted(_facts(main))],
         )
     target = out or folder / PAGE
     with replacing(target) as path:
@@ -133,13 +133,13 @@ def _block(record: Record) -> list[str]:
     """Another record under its heading."""
     from html import escape
 
-    from fragprune_plugins.measure import page
+    from fragprune_plugins.measure import report_page
 
     where = escape(f"{record.command}: {record.path.name}")
     return [
         f"<h2>{where}</h2>",
-        page.paragraph(_sentence(record)),
-        page.preformatted(_table(record)),
+        report_page.paragraph(_sentence(record)),
+        report_page.preformatted(_table(record)),
     ]
 
 
@@ -159,10 +159,10 @@ def _draw(
     Returns:
         Names of the views, headed pictures besides, and what is missing and why.
     """
+    from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.errors import DatasetError, ModelFileError, SidecarError
-    from fragprune_plugins.finetuning.dataset import load_dataset
-    from fragprune_plugins.measure import Candidate, page
+    from fragprune_plugins.measure import Candidate, report_page
 
     drawn, curves = record.data.get("photographs"), record.data.get("curves")
     if drawn is None:
@@ -173,8 +173,8 @@ def _draw(
         before, after = (Candidate(*model, drawn["drawing"]) for model in models)
         if curves and after.thresholds is not None:
             rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
-            page.save_learning(folder / page.LEARNING, rows, after.thresholds)
-            learning = [("How it learned", page.LEARNING)]
+            report_page.save_learning(folder / report_page.LEARNING, rows, after.thresholds)
+            learning = [("How it learned", report_page.LEARNING)]
         dataset = load_dataset(
             data or Path(drawn["folder"]),
             resolution=drawn["resolution"],
@@ -184,7 +184,7 @@ def _draw(
         if data is not None:  # they were asked for
             raise
         return [], learning, f"No views are shown: {error}"
-    views = page.draw_views(folder, before, after, dataset.test, create_engine(engine))
+    views = report_page.draw_views(folder, before, after, dataset.test, create_engine(engine))
     return list(views), learning, ""
 
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import click
 
-from fragprune_plugins import records
 from fragprune_plugins.cli.common import JSON, Command, Report, describe
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import FragpruneError, UsageError
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.storage import records
 
 
 @click.command(
@@ -88,7 +88,7 @@ def command(
     if alternate is not None and stage != "joint":
         raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Add or drop it.")
 
-    from fragprune_plugins.launch import RunOptions, run
+    from fragprune_plugins.injection.launch import RunOptions, run
 
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     options = RunOptions(
@@ -155,9 +155,9 @@ def _photographs(host_command: list[str], summary: Any) -> dict[str, Any] | None
 
 def _measure(photographs: dict[str, Any]) -> list[dict[str, Any]] | None:
     """Before and after on held-out views."""
-    from fragprune_plugins.cli.common import load_model
     from fragprune_plugins.finetuning import load_dataset
     from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.storage.models import load_model
 
     try:
         dataset = load_dataset(

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.files import replacing
+from fragprune_plugins.storage.atomic import replacing
 
 if TYPE_CHECKING:
-    from fragprune_plugins.launch import RunSummary
+    from fragprune_plugins.injection.launch import RunSummary
 
 _INTRODUCTION = """A small training repository learned this room from ray-traced photographs. Then
 every Gaussian learned how far it reaches; what lies beyond is neither sorted nor blended. No line
@@ -23,38 +23,41 @@ def write_page(
     out: Path, report: dict[str, Any], scene: Path, summary: RunSummary, engine: str
 ) -> list[str]:
     """Write ``pictures/`` and ``index.html``; returns the files, relative to ``out``."""
-    from fragprune_plugins.cli.common import describe, load_model
-    from fragprune_plugins.demo.story import honest, quotable
+    from fragprune_plugins.cli.common import describe
+    from fragprune_plugins.datasets.dataset import load_dataset
+    from fragprune_plugins.demo.demo import honest, quotable
     from fragprune_plugins.engines import create_engine
-    from fragprune_plugins.finetuning.dataset import load_dataset
-    from fragprune_plugins.measure import Candidate, page
+    from fragprune_plugins.measure import Candidate, report_page
+    from fragprune_plugins.storage.models import load_model
 
     assert summary.model_before is not None
     assert summary.model_after is not None
     pictures = out / "pictures"
     models = (summary.model_before, summary.model_after)
     before, after = (Candidate(*load_model(path)) for path in models)
-    views = page.draw_views(
+    views = report_page.draw_views(
         pictures, before, after, load_dataset(scene).test, create_engine(engine)
     )
     files = [file for names in views.values() for file in names]
     learning = []
     if summary.curves and after.thresholds is not None:
-        page.save_learning(pictures / page.LEARNING, summary.curves, after.thresholds)
-        learning = [("How it learned", page.LEARNING)]
-        files.append(page.LEARNING)
-    text = page.compose(
+        report_page.save_learning(pictures / report_page.LEARNING, summary.curves, after.thresholds)
+        learning = [("How it learned", report_page.LEARNING)]
+        files.append(report_page.LEARNING)
+    text = report_page.compose(
         title="The same picture from fewer fragments",
         quote=quotable(report),
         text=[
-            page.paragraph(_INTRODUCTION),
-            page.preformatted(describe({"before": report["before"], "after": report["after"]})),
-            page.paragraph(honest(report)),
+            report_page.paragraph(_INTRODUCTION),
+            report_page.preformatted(
+                describe({"before": report["before"], "after": report["after"]})
+            ),
+            report_page.paragraph(honest(report)),
         ],
         views=list(views),
         pictures=learning,
         source=lambda file: f"pictures/{file}",
-        ending=["<h2>Your own</h2>", page.preformatted(_YOUR_OWN)],
+        ending=["<h2>Your own</h2>", report_page.preformatted(_YOUR_OWN)],
     )
     with replacing(out / "index.html") as path:
         path.write_text(text, encoding="utf-8")

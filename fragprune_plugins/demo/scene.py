@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fragprune_plugins.demo.room import CENTRE, furnish
 from fragprune_plugins.demo.textures import displayed
 from fragprune_plugins.demo.tracer import FAR, Array, World, times
-from fragprune_plugins.files import replacing, writable_folder
+from fragprune_plugins.storage.atomic import replacing, writable_folder
 
 
 @dataclass(frozen=True)

@@ -47,11 +47,11 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     if name == "auto":
         name = _fastest(str(device))
     if name == "cpu":
-        from fragprune_plugins.engines.cpu import CpuEngine
+        from fragprune_plugins.engines.cpu.engine import CpuEngine
 
         return CpuEngine()
     if name == "cuda":
-        from fragprune_plugins.engines.cuda import CudaEngine
+        from fragprune_plugins.engines.cuda.engine import CudaEngine
 
         return CudaEngine()
     if name == "reference":
@@ -63,19 +63,19 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
 
 def _fastest(device: str) -> str:
     if device.startswith("cuda"):
-        from fragprune_plugins.native import driver
+        from fragprune_plugins.engines.cuda import driver
 
         return "cuda" if driver.missing() is None and _proven() else "reference"
-    from fragprune_plugins.native import loader
+    from fragprune_plugins.engines.cpu import binding
 
-    return "cpu" if device.startswith("cpu") and loader.available() else "reference"
+    return "cpu" if device.startswith("cpu") and binding.available() else "reference"
 
 
 def _proven() -> bool:
     """Whether the cuda engine has drawn here what the reference engine draws."""
-    from fragprune_plugins.engines import proof
+    from fragprune_plugins.engines.cuda import self_check
 
-    return proof.doubt() is None
+    return self_check.doubt() is None
 
 
 _slicer = cache(create_engine)

@@ -13,8 +13,8 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines.arrays import address, plain
+from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.native import loader
 from fragprune_plugins.types import Moment, Sliced, SpacetimeSplats
 
 if TYPE_CHECKING:
@@ -56,11 +56,11 @@ class Blade(Protocol):
     def empty(self, *shape: int) -> Tensor:
         """Memory for float32."""
 
-    def slice(self, given: loader.Spacetime, to: loader.Sliced) -> None:
+    def slice(self, given: binding.Spacetime, to: binding.Sliced) -> None:
         """fragprune_slice."""
 
     def unslice(
-        self, given: loader.Spacetime, by: loader.Sliced, to: loader.SpacetimeGrads
+        self, given: binding.Spacetime, by: binding.Sliced, to: binding.SpacetimeGrads
     ) -> None:
         """fragprune_unslice."""
 
@@ -81,10 +81,10 @@ class _Cut:
     moment: Moment
     arrays: dict[str, Tensor]
 
-    def given(self) -> loader.Spacetime:
+    def given(self) -> binding.Spacetime:
         """The C struct; it points into ``arrays``."""
         moment, sh = self.moment, self.splats.sh
-        return loader.Spacetime(
+        return binding.Spacetime(
             threads=min(torch.get_num_threads(), 1024),
             timestamp=moment.timestamp,
             duration=moment.duration,
@@ -112,7 +112,7 @@ class _Slice(torch.autograd.Function):
         }
         present = torch.empty(n, dtype=torch.bool, device=blade.where)
         addresses = {name: address(output) for name, output in outputs.items()}
-        blade.slice(cut.given(), loader.Sliced(present=address(present), **addresses))
+        blade.slice(cut.given(), binding.Sliced(present=address(present), **addresses))
         wanted = {n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs}
         idle = [o for name, o in outputs.items() if o is not None and not wanted & _FELT_BY[name]]
         ctx.mark_non_differentiable(present, *idle)
@@ -131,11 +131,11 @@ class _Slice(torch.autograd.Function):
         grads = {name: cut.blade.empty(*cut.arrays[name].shape) for name in wanted}
         cut.blade.unslice(
             cut.given(),
-            loader.Sliced(
+            binding.Sliced(
                 present=address(ctx.present),
                 **{name: address(g) for name, g in zip(_FELT_BY, by, strict=True)},
             ),
-            loader.SpacetimeGrads(**{name: address(grad) for name, grad in grads.items()}),
+            binding.SpacetimeGrads(**{name: address(grad) for name, grad in grads.items()}),
         )
         given: list[Tensor | None] = [None]
         for name, tensor in zip(_NAMES, tensors, strict=True):

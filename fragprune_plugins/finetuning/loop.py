@@ -14,21 +14,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from fragprune_plugins import sidecar
+from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine, create_engine
-from fragprune_plugins.files import replacing, writable_folder
-from fragprune_plugins.finetuning.dataset import Dataset, Shot
-from fragprune_plugins.finetuning.losses import photometric_loss
-from fragprune_plugins.ply import SplatFile, write_ply
-from fragprune_plugins.pressure import (
+from fragprune_plugins.learning.losses import photometric_loss
+from fragprune_plugins.learning.pressure import (
     CALIBRATE_AT,
     CALIBRATION_VIEWS,
     TARGET_TOLERANCE,
     Observation,
     calibrate,
 )
-from fragprune_plugins.schedule import Schedule, Settings
-from fragprune_plugins.thresholds import ThresholdStore
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.atomic import replacing, writable_folder
+from fragprune_plugins.storage.ply import SplatFile, write_ply
 from fragprune_plugins.types import RasterInputs
 
 RECORDS = 100

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fragprune_plugins.datasets.dataset import Shot
 from fragprune_plugins.engines import Engine, create_engine
-from fragprune_plugins.finetuning.dataset import Shot
 from fragprune_plugins.measure.metrics import psnr, ssim
-from fragprune_plugins.ply import SplatFile
+from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import RasterInputs, Splats, View
 
 REPEATS = 9

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.finetuning.losses import SIGMA, WINDOW
+from fragprune_plugins.learning.losses import SIGMA, WINDOW
 
 
 def psnr(image: Tensor, target: Tensor) -> float:

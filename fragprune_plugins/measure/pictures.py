@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from fragprune_plugins.files import replacing
+from fragprune_plugins.storage.atomic import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,1 +1,1 @@
-"""The compiled rasterizer: plain shared libraries behind a C interface, opened with ctypes."""
+"""Sources and builds of the compiled engines; ``engines.cpu`` and ``engines.cuda`` open them."""

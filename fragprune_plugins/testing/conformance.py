@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 import pytest
 
-from fragprune_plugins.adapter import HostAdapter
-from fragprune_plugins.detect import HostRepo
-from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
 from fragprune_plugins.testing.host import Host

@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection
 from types import ModuleType
 from typing import Any
 
-from fragprune_plugins.plugins import GROUP
+from fragprune_plugins.plugins.loading import GROUP
 
 _PRELOAD = ["torch._dynamo", "scipy.spatial", "plyfile", "fragprune_plugins.testing.invariants"]
 

@@ -26,13 +26,13 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins import demo
-from fragprune_plugins.adapter import HostAdapter
 from fragprune_plugins.constants import NEUTRAL_LOGIT
-from fragprune_plugins.detect import HostRepo
-from fragprune_plugins.device import cpu_only
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.schedule import JointSchedule, Settings
-from fragprune_plugins.session import Session
+from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.cpu_only import cpu_only
+from fragprune_plugins.injection.session import Session
+from fragprune_plugins.learning.schedule import JointSchedule, Settings
+from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.types import View
 
 MINIATURE = Path(demo.__file__).with_name("host")

@@ -6,8 +6,8 @@ import ast
 import shutil
 from pathlib import Path
 
-from fragprune_plugins.detect import HostRepo
-from fragprune_plugins.seams import Seam
+from fragprune_plugins.hosts.seams import Seam
+from fragprune_plugins.hosts.source import HostRepo
 
 RENAMED = "renamed_by_the_conformance_kit"
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from miniature import running, tensors
 
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.learning.schedule import Settings
 
 MOVES = {
     "opacity": {"opacity"},

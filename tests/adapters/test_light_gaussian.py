@@ -17,14 +17,15 @@ from miniature import HOST, TINY, expect_ancestors, joint, label, running, tenso
 from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
-from fragprune_plugins import sidecar
-from fragprune_plugins.detect import HostRepo, choose
 from fragprune_plugins.errors import UnknownHostError, UsageError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.launch import RunOptions, run
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 
 COUNT = 16
 

@@ -22,13 +22,14 @@ from miniature import (
 )
 
 from fragprune_mcmc import MCMC
-from fragprune_plugins import sidecar
-from fragprune_plugins.detect import HostRepo, choose
 from fragprune_plugins.errors import AlignmentError, UnknownHostError, UsageError
-from fragprune_plugins.launch import HostFailed, RunOptions, run
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import HostFailed, RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 
 COUNT = 24
 

@@ -14,14 +14,16 @@ from mini_splatting_host import MiniSplattingHost
 from miniature import HOST, joint, label
 
 from fragprune_mini_splatting import MiniSplatting
-from fragprune_plugins import launch, sidecar
-from fragprune_plugins.detect import HostRepo, choose, locate
 from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.launch import RunOptions, run
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.hosts.choosing import choose, locate
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import launch
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 
 NAMES = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
 

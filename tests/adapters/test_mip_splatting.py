@@ -14,18 +14,19 @@ from mip_splatting_host import MipHost
 from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
-from fragprune_plugins import sidecar
 from fragprune_plugins.cli.run import _measure, _photographs
-from fragprune_plugins.detect import HostRepo, choose
 from fragprune_plugins.engines import rasterize
 from fragprune_plugins.errors import ModelFileError, UnknownHostError
 from fragprune_plugins.finetuning import load_dataset
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.launch import RunOptions, run
+from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.measure import Candidate
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 
 COUNT = 16
 

@@ -8,12 +8,12 @@ from importlib import import_module
 import pytest
 from miniature import HOST, imported, running
 
-from fragprune_plugins import session as sessions
-from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.errors import LateImportError, SeamError, SessionError
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.seams import Role, Seam
-from fragprune_plugins.session import Session
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import session as sessions
+from fragprune_plugins.injection.session import Session
+from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 STAND_INS = ("diff_gaussian_rasterization", "simple_knn", "simple_knn._C")

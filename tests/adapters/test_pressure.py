@@ -8,10 +8,10 @@ import pytest
 import torch
 from miniature import joint, running
 
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.lineage import GraphdecoDialect
-from fragprune_plugins.pressure import ELASTICITY, LEAST_PRESSURE
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
+from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 

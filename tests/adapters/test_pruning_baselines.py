@@ -14,13 +14,14 @@ from skeleton import skeleton
 
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_lp_3dgs import LP3DGS
-from fragprune_plugins import sidecar
-from fragprune_plugins.detect import HostRepo, choose
 from fragprune_plugins.errors import EngineError, UnknownHostError, UsageError
-from fragprune_plugins.launch import RunOptions, run
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 from fragprune_speedy_splat import SpeedySplat
 
 OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=6, threshold_lr=0.3))

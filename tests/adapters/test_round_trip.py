@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from miniature import joint
 
-from fragprune_plugins import sidecar
+from fragprune_plugins.storage import sidecar
 
 
 def trained(host, count=20):

@@ -9,11 +9,11 @@ import pytest
 import torch
 from rt_4dgs_host import PythonHost, RigidHost, RT4DGSHost
 
-from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.launch import RunOptions, run
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing.host import joint, running
 from fragprune_rt_4dgs import RT4DGS, neighbours
 from fragprune_rt_4dgs.config import YAMLFile

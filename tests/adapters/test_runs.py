@@ -15,15 +15,16 @@ import pytest
 import torch
 from miniature import HOST, TINY, running
 
-from fragprune_plugins import launch, sidecar
-from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.errors import Interrupted, UsageError
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.launch import RunOptions, _forget_modules, _host_process, run
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Schedule, Settings
-from fragprune_plugins.session import Session
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import launch
+from fragprune_plugins.injection.launch import RunOptions, _forget_modules, _host_process, run
+from fragprune_plugins.injection.session import Session
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import fragprune_plugins
-from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.plugins.loading import load_plugins
 
 ROOT = Path(__file__).parents[2]
 ADAPTERS = sorted(p.name for p in (ROOT / "adapters").glob("fragprune_*") if p.is_dir())
@@ -35,8 +35,9 @@ MODULES = [module for package in PACKAGES for module in modules(package)]
 
 def test_the_outer_rooms_import_without_torch(python):
     core = (
-        "adapter detect errors constants files hookspecs launch lineage patching plugins pressure "
-        "schedule seams types"
+        "constants errors types hosts.adapter hosts.choosing hosts.graphdeco hosts.seams "
+        "hosts.source injection.launch injection.patching learning.pressure learning.schedule "
+        "plugins.hookspecs plugins.loading storage.atomic"
     )
     light = [
         *(m for m in MODULES if m.startswith("fragprune_plugins.cli")),
@@ -64,7 +65,7 @@ print(json.dumps(heavy))
 def test_loading_every_plugin_imports_no_torch(python):
     assert python(
         "import json, sys\n"
-        "from fragprune_plugins.plugins import load_plugins\n"
+        "from fragprune_plugins.plugins.loading import load_plugins\n"
         "plugins = load_plugins()\n"
         "names = [(a.name, a.info.title, [str(s) for s in a.seams]) for a in plugins.adapters]\n"
         "print(json.dumps([bool(names), 'torch' in sys.modules]))"

@@ -12,7 +12,7 @@ from finetune import tiny
 
 from fragprune_plugins.bench import peers
 from fragprune_plugins.cli.bench import TRUNCATION
-from fragprune_plugins.ply import write_ply
+from fragprune_plugins.storage.ply import write_ply
 
 SMALL = ("--size", "40x30", "--gaussians", 200, "--repeats", 2)
 

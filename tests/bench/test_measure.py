@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from fragprune_plugins.bench import measure as bench
-from fragprune_plugins.bench.measure import Case, measure, translation
+from fragprune_plugins.bench import timing as bench
 from fragprune_plugins.bench.scene import make_scene, make_view
+from fragprune_plugins.bench.timing import Case, measure, translation
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 

@@ -9,7 +9,7 @@ import torch
 
 from fragprune_plugins.bench.scene import make_scene, make_view
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.ply import SplatFile
+from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import RasterInputs
 
 COLUMNS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")

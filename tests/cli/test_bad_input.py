@@ -8,7 +8,7 @@ import pytest
 from cli.commands import run
 from finetune import tiny
 
-from fragprune_plugins import sidecar
+from fragprune_plugins.storage import sidecar
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_refused(scene, tmp_path, how, code, words, command):
     elif how == "image missing":
         (data / "images" / "view04.png").unlink()
     elif how == "stale sidecar":
-        from fragprune_plugins.thresholds import ThresholdStore
+        from fragprune_plugins.learning.thresholds import ThresholdStore
 
         sidecar.save(path, ThresholdStore(60))
         path.write_bytes(path.read_bytes()[:-1] + b"\x01")

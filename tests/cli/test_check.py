@@ -10,8 +10,8 @@ from cli.commands import run, run_json
 from skeleton import STATES, skeleton
 
 from fragprune_plugins import demo
-from fragprune_plugins.detect import HostRepo
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.testing import mutations
 
 MINIATURE = Path(demo.__file__).with_name("host")

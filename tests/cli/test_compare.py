@@ -6,7 +6,7 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.ply import write_ply
+from fragprune_plugins.storage.ply import write_ply
 
 
 def test_two_models(tmp_path):

@@ -6,8 +6,8 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins import sidecar
-from fragprune_plugins.ply import read_ply
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 
 
 def test_one_file_with_the_thresholds(tmp_path):

@@ -13,10 +13,10 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins import sidecar
 from fragprune_plugins.finetuning import loop
-from fragprune_plugins.ply import read_ply, write_ply
-from fragprune_plugins.pressure import LEAST_PRESSURE
+from fragprune_plugins.learning.pressure import LEAST_PRESSURE
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply, write_ply
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.ply import write_ply
+from fragprune_plugins.storage.ply import write_ply
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins import records
+from fragprune_plugins.storage import records
 
 
 @pytest.fixture(scope="module")

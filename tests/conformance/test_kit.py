@@ -11,7 +11,7 @@ import broken_adapters as broken
 import pytest
 from miniature import HOST
 
-from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
 from fragprune_plugins.testing.plugin import table

@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 from skeleton import SETTINGS, STATES, skeleton
 
-from fragprune_plugins.detect import HostRepo, Match, choose, locate
 from fragprune_plugins.errors import UnknownHostError
+from fragprune_plugins.hosts.choosing import choose, locate
+from fragprune_plugins.hosts.findings import Match
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_vanilla_3dgs import OTHER_HOSTS, Vanilla3DGS
 
 
@@ -142,8 +144,9 @@ def test_detection_imports_neither_the_host_nor_torch(tmp_path, python):
         """
 import json, sys
 from pathlib import Path
-from fragprune_plugins.detect import HostRepo, choose
-from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.plugins.loading import load_plugins
 adapter = choose(HostRepo(Path(sys.argv[1])), load_plugins().adapters)
 print(json.dumps([adapter.name, "torch" in sys.modules, "scene" in sys.modules]))
 """,

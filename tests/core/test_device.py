@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fragprune_plugins import device
-from fragprune_plugins.device import cpu_only
+from fragprune_plugins.injection import cpu_only as redirection
+from fragprune_plugins.injection.cpu_only import cpu_only
 
 FACTORIES = {
     "zeros": lambda d: torch.zeros(3, device=d),
@@ -61,8 +61,8 @@ def test_values_that_only_look_like_devices_are_left_alone():
     with cpu_only():
         assert torch.nn.functional.pad(torch.ones(1, 2), (1, 1), mode="reflect").shape == (1, 4)
         assert torch.einsum("i,i->", torch.ones(2), torch.ones(2)) == 2
-    assert device._redirected("cudaX") == "cudaX"
-    assert device._redirected("cpu") == "cpu"
+    assert redirection._redirected("cudaX") == "cudaX"
+    assert redirection._redirected("cpu") == "cpu"
 
 
 def test_events_measure_and_calls_without_a_meaning_do_nothing():
@@ -92,7 +92,7 @@ def test_checkpoints_load_to_the_cpu(tmp_path, where):
 
 @pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt])
 def test_everything_is_put_back_however_the_block_ends(error):
-    names = list(device._SUBSTITUTES)
+    names = list(redirection._SUBSTITUTES)
     before = [getattr(torch.cuda, name) for name in names], torch.load, torch.Tensor.cuda
 
     def block():

@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 
 from fragprune_plugins import errors
-from fragprune_plugins.detect import Finding
 from fragprune_plugins.errors import FragpruneError
-from fragprune_plugins.launch import HostFailed
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.injection.launch import HostFailed
 
 KINDS = [
     kind

@@ -6,7 +6,7 @@ import os
 import pytest
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.files import digest, replacing, writable_folder
+from fragprune_plugins.storage.atomic import digest, replacing, writable_folder
 
 
 def test_the_new_file_appears_whole_under_its_name(tmp_path):

@@ -12,7 +12,7 @@ import pytest
 from skeleton import skeleton
 
 from fragprune_plugins.errors import Interrupted, UnknownHostError, UsageError
-from fragprune_plugins.launch import (
+from fragprune_plugins.injection.launch import (
     HostFailed,
     RunOptions,
     _forget_modules,
@@ -227,7 +227,7 @@ for iteration in args.checkpoint_iterations:
 
 def test_stage_one_is_asked_for_a_checkpoint_and_stage_two_resumes_it(host, tmp_path):
     """The number of iterations is nowhere on the command line: it is read from the source."""
-    from fragprune_plugins.schedule import Settings
+    from fragprune_plugins.learning.schedule import Settings
 
     out = tmp_path / "out"
     options = RunOptions(device="cpu", settings=Settings(iterations=100))

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.pressure import (
+from fragprune_plugins.learning.pressure import (
     ELASTICITY,
     LEAST_PRESSURE,
     ElasticPressure,
@@ -13,7 +13,7 @@ from fragprune_plugins.pressure import (
     Observation,
     PressureController,
 )
-from fragprune_plugins.schedule import JointSchedule, Schedule, Settings
+from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings
 
 
 @given(st.integers(2, 10_000))

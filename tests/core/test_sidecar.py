@@ -6,9 +6,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from fragprune_plugins import sidecar
 from fragprune_plugins.errors import OutputError, SidecarError
-from fragprune_plugins.thresholds import ThresholdStore
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import sidecar
 
 
 @pytest.fixture

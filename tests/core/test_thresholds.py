@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import AlignmentError, SidecarError
-from fragprune_plugins.thresholds import ThresholdStore
+from fragprune_plugins.learning.thresholds import ThresholdStore
 
 
 class Shadow:

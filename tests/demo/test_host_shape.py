@@ -4,7 +4,7 @@ import ast
 
 import pytest
 
-from fragprune_plugins.demo.story import HOST
+from fragprune_plugins.demo.demo import HOST
 
 ROOT = HOST.parent
 
@@ -112,8 +112,9 @@ def test_it_is_a_checkout_not_a_package_of_ours():
 
 
 def test_an_adapter_fits_the_host():
-    from fragprune_plugins.detect import HostRepo, choose
-    from fragprune_plugins.plugins import load_plugins
+    from fragprune_plugins.hosts.choosing import choose
+    from fragprune_plugins.hosts.source import HostRepo
+    from fragprune_plugins.plugins.loading import load_plugins
 
     adapter = choose(HostRepo(ROOT), load_plugins().adapters, None)
     assert adapter.name == "vanilla-3dgs"

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fragprune_plugins.datasets.dataset import load_dataset
 from fragprune_plugins.demo.room import furnish
 from fragprune_plugins.demo.scene import (
     SceneSettings,
@@ -14,7 +15,6 @@ from fragprune_plugins.demo.scene import (
     surface_points,
 )
 from fragprune_plugins.demo.textures import displayed
-from fragprune_plugins.finetuning.dataset import load_dataset
 
 SMALL = SceneSettings(views=9, width=80, height=60, supersample=2, points=300)
 

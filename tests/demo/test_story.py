@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from fragprune_plugins.demo.story import DemoSettings, honest, host_command, quotable, run_demo
+from fragprune_plugins.demo.demo import DemoSettings, honest, host_command, quotable, run_demo
 from fragprune_plugins.errors import OutputError
 
 TINY = """
 import json, sys
 from pathlib import Path
 from fragprune_plugins.demo.scene import SceneSettings
-from fragprune_plugins.demo.story import DemoSettings, run_demo
+from fragprune_plugins.demo.demo import DemoSettings, run_demo
 scene = SceneSettings(views=9, width=48, height=36, supersample=1, points=400)
 settings = DemoSettings(iterations=60, finetune=30, scene=scene)
 print(json.dumps(run_demo(Path(sys.argv[1]), settings)))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from cli.commands import run, run_json
 
-from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.plugins.loading import load_plugins
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "support.md"
 ADAPTERS = load_plugins().adapters

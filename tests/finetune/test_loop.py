@@ -9,14 +9,14 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins import sidecar
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.finetuning import finetune, loop, save
 from fragprune_plugins.finetuning.loop import mean_fragments
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.pressure import calibrate
-from fragprune_plugins.schedule import Settings
-from fragprune_plugins.thresholds import ThresholdStore
+from fragprune_plugins.learning.pressure import calibrate
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import conv2d
 
-from fragprune_plugins.finetuning.losses import l1, photometric_loss, ssim
+from fragprune_plugins.learning.losses import l1, photometric_loss, ssim
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_ssim_agrees_with_scikit_image_inside(pair):
     )
     inside = full[10:-10, 10:-10].mean()
     x, y = (z.double() for z in pair)
-    from fragprune_plugins.finetuning import losses
+    from fragprune_plugins.learning import losses
 
     maps = torch.stack([x, y, x * x, y * y, x * y])
     mx, my, xx, yy, xy = losses._blur(maps)

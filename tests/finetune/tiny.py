@@ -13,8 +13,9 @@ import torch
 from PIL import Image
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.finetuning.dataset import Camera, Dataset, Shot
-from fragprune_plugins.ply import SplatFile, write_ply
+from fragprune_plugins.datasets.dataset import Dataset, Shot
+from fragprune_plugins.datasets.pinhole import Camera
+from fragprune_plugins.storage.ply import SplatFile, write_ply
 from fragprune_plugins.types import RasterInputs
 
 SIDE = 32

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from gpu.emulated import EmulatedDevice
 
-from fragprune_plugins.engines.cuda import CudaEngine
-from fragprune_plugins.native import kernels
+from fragprune_plugins.engines.cuda import kernels
+from fragprune_plugins.engines.cuda.engine import CudaEngine
 
 
 @pytest.fixture(scope="session")

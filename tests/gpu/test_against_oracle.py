@@ -17,9 +17,9 @@ from native.test_against_oracle import check_gradients, check_images, draw_pair
 from native.test_dialects import check_scores, dialect, flat
 from native.test_invariants import assert_identical, everything
 
-from fragprune_plugins.engines import frames
-from fragprune_plugins.engines.cpu import CpuEngine
-from fragprune_plugins.engines.cuda import CudaEngine
+from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.cuda import frame
+from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs
@@ -200,7 +200,7 @@ def test_captured_frames_read_nothing_back_until_they_are_checked(
 def test_more_entries_than_can_be_counted_are_refused(
     engine: CudaEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frames, "ENTRIES_MAX", 10)
+    monkeypatch.setattr(frame, "ENTRIES_MAX", 10)
     with pytest.raises(EngineError, match="entries"):
         engine.rasterize(scenes.random_scene(0), None)
 

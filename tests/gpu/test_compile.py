@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from fragprune_plugins.engines.frames import MACROS, VARIANTS, unblend_macros
-from fragprune_plugins.native import kernels
+from fragprune_plugins.engines.cuda import kernels
+from fragprune_plugins.engines.cuda.frame import MACROS, VARIANTS, unblend_macros
 
 ARCHITECTURES = (
     75,

@@ -11,9 +11,8 @@ from click.testing import CliRunner
 
 from fragprune_plugins import engines
 from fragprune_plugins.cli import cli
-from fragprune_plugins.engines import proof
+from fragprune_plugins.engines.cuda import driver, kernels, self_check
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.native import driver, kernels
 
 
 class Compiler:
@@ -72,6 +71,6 @@ def test_a_gpu_that_fails_the_comparison_is_a_finding(monkeypatch: pytest.Monkey
     there = {"available": True, "reason": None}
     monkeypatch.setattr(driver, "describe", lambda: dict(there))
     for doubt, status in ((None, 0), ("no picture within 300 s", 1)):
-        monkeypatch.setattr(proof, "attempt", lambda doubt=doubt: doubt)
+        monkeypatch.setattr(self_check, "attempt", lambda doubt=doubt: doubt)
         code, said = invoke()
         assert (code, said["gpu"]["agrees"]) == (status, doubt is None)

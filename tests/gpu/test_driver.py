@@ -16,8 +16,8 @@ from gpu.emulated import EmulatedDevice
 from gpu.test_compile import nvrtc
 from native.test_invariants import everything
 
-from fragprune_plugins.engines.cuda import CudaEngine
-from fragprune_plugins.native import kernels
+from fragprune_plugins.engines.cuda import kernels
+from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.testing import scenes
 
 __all__ = ["nvrtc"]
@@ -30,9 +30,10 @@ from types import SimpleNamespace
 import torch
 from native.test_invariants import assert_identical, everything
 
-from fragprune_plugins.engines import create_engine, proof
-from fragprune_plugins.engines.cuda import CudaEngine
-from fragprune_plugins.native.driver import Driver
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.cuda import self_check
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.engines.cuda.driver import Driver
 from fragprune_plugins.testing import scenes
 
 torch.cuda.is_available = lambda: True
@@ -42,7 +43,7 @@ torch.cuda.current_stream = lambda index: SimpleNamespace(cuda_stream=0)
 torch.cuda.get_device_capability = lambda index: (9, 0)
 torch.cuda.is_current_stream_capturing = lambda: False
 Driver.kind = "cpu"
-proof.doubt = lambda: None
+self_check.doubt = lambda: None
 assert create_engine("auto", "cuda").name == "cuda"
 
 expected = torch.load(sys.argv[1])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fragprune_plugins.native import kernels
+from fragprune_plugins.engines.cuda import kernels
 
 
 class Slow:

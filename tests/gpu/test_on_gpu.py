@@ -9,7 +9,7 @@ import torch
 from gpu.test_against_oracle import KINDS
 from native.test_dialects import dialect
 
-from fragprune_plugins.engines.cuda import CudaEngine
+from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs

@@ -11,10 +11,9 @@ import pytest
 from gpu.emulated import EmulatedDevice
 
 from fragprune_plugins import engines
-from fragprune_plugins.engines import proof
-from fragprune_plugins.engines.cuda import CudaEngine
+from fragprune_plugins.engines.cuda import driver, kernels, self_check
+from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.native import driver, kernels
 
 
 class WrongPicture(CudaEngine):
@@ -34,47 +33,47 @@ def test_pictures_slices_and_gradients_are_compared(
     device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch, engine: type, agrees: bool
 ) -> None:
     made = {"cuda": engine(device), "reference": ReferenceEngine()}
-    monkeypatch.setattr(proof, "create_engine", lambda name, device: made[name])
-    assert proof.agrees("cpu") == agrees
+    monkeypatch.setattr(self_check, "create_engine", lambda name, device: made[name])
+    assert self_check.agrees("cpu") == agrees
 
 
 @pytest.fixture
 def attempts(kept: Path, monkeypatch: pytest.MonkeyPatch):
     """What each attempt finds, first to last; those that are left were not made."""
     found: list[str | None] = []
-    proof.doubt.cache_clear()
-    monkeypatch.setattr(proof, "attempt", lambda: found.pop(0))
-    monkeypatch.setattr(proof, "_circumstances", lambda: "here")
+    self_check.doubt.cache_clear()
+    monkeypatch.setattr(self_check, "attempt", lambda: found.pop(0))
+    monkeypatch.setattr(self_check, "_circumstances", lambda: "here")
     yield found
-    proof.doubt.cache_clear()
+    self_check.doubt.cache_clear()
 
 
 def a_new_process() -> None:
-    proof.doubt.cache_clear()
+    self_check.doubt.cache_clear()
 
 
 def test_a_proof_is_remembered_on_the_machine(attempts: list) -> None:
     attempts += [None, "not again"]
-    assert proof.doubt() is None
+    assert self_check.doubt() is None
     a_new_process()
-    assert proof.doubt() is None
+    assert self_check.doubt() is None
     assert attempts == ["not again"]
 
 
 def test_a_doubt_is_not_remembered_beyond_its_process(attempts: list, caplog) -> None:
     attempts += ["it crashed", None]
-    assert [proof.doubt(), proof.doubt()] == ["it crashed"] * 2
+    assert [self_check.doubt(), self_check.doubt()] == ["it crashed"] * 2
     assert caplog.text.count("it crashed") == 1
     a_new_process()
-    assert proof.doubt() is None
+    assert self_check.doubt() is None
 
 
 def test_another_gpu_toolkit_or_source_is_proved_anew(attempts: list, monkeypatch) -> None:
     attempts += [None, "wrong there"]
-    assert proof.doubt() is None
+    assert self_check.doubt() is None
     a_new_process()
-    monkeypatch.setattr(proof, "_circumstances", lambda: "elsewhere")
-    assert proof.doubt() == "wrong there"
+    monkeypatch.setattr(self_check, "_circumstances", lambda: "elsewhere")
+    assert self_check.doubt() == "wrong there"
 
 
 def test_a_folder_that_cannot_be_written_leaves_the_proof_to_each_process(
@@ -83,9 +82,9 @@ def test_a_folder_that_cannot_be_written_leaves_the_proof_to_each_process(
     (tmp_path / "file").touch()
     monkeypatch.setenv(kernels.CACHE, str(tmp_path / "file" / "folder"))
     attempts += [None, None]
-    assert proof.doubt() is None
+    assert self_check.doubt() is None
     a_new_process()
-    assert proof.doubt() is None
+    assert self_check.doubt() is None
     assert attempts == []
 
 
@@ -109,9 +108,9 @@ def test_crashes_and_hangs_stay_in_a_process_of_their_own(
     monkeypatch: pytest.MonkeyPatch, program: str, doubt: str | None
 ) -> None:
     real = subprocess.run
-    monkeypatch.setattr(proof, "PATIENCE", 2 if "sleep" in program else 60)
+    monkeypatch.setattr(self_check, "PATIENCE", 2 if "sleep" in program else 60)
     monkeypatch.setattr(
-        proof.subprocess, "run", lambda _, **how: real([sys.executable, "-c", program], **how)
+        self_check.subprocess, "run", lambda _, **how: real([sys.executable, "-c", program], **how)
     )
-    why = proof.attempt()
+    why = self_check.attempt()
     assert why is None if doubt is None else doubt in why

@@ -6,7 +6,7 @@ import pytest
 import torch
 from spacetime import KINDS, OUTPUTS, agree, gradients, leaves, moment, splats
 
-from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.engines.cpu.engine import CpuEngine
 
 
 @pytest.mark.parametrize("kind", KINDS)

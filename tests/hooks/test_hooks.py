@@ -10,12 +10,13 @@ import pytest
 import torch
 from miniature import HOST, joint, running
 
-from fragprune_plugins import hookspecs
-from fragprune_plugins.detect import HostRepo, choose
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.schedule import Schedule, Settings
+from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("fragprune_")]

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from fragprune_plugins.adapter import HostAdapter
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import load_plugins
 
 
 class Entry:

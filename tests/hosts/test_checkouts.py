@@ -16,7 +16,7 @@ from skeleton import STATES
 
 from fragprune_mcmc import MCMC
 from fragprune_mip_splatting import MipSplatting
-from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_rain_gs import RainGS
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -122,10 +122,10 @@ from dataclasses import replace
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from fragprune_plugins import sidecar
-from fragprune_plugins.launch import RunOptions, run
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.learning.schedule import Settings
 
 host, data, out = (Path(argument) for argument in sys.argv[1:4])
 train = sys.argv[4]
@@ -183,12 +183,12 @@ from types import SimpleNamespace
 from importlib import import_module
 import numpy as np, torch
 torch.set_num_threads(1)
-from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_rain_gs import RainGS
-from fragprune_plugins.device import cpu_only
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.schedule import JointSchedule, Settings
-from fragprune_plugins.session import Session
+from fragprune_plugins.injection.cpu_only import cpu_only
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.learning.schedule import JointSchedule, Settings
+from fragprune_plugins.injection.session import Session
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 root, settings = Path(sys.argv[1]), Settings(iterations=9)
@@ -248,12 +248,12 @@ from types import SimpleNamespace
 from importlib import import_module
 import numpy as np, torch
 torch.set_num_threads(1)
-from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_rain_gs import RainGS
-from fragprune_plugins.device import cpu_only
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.schedule import JointSchedule, Settings
-from fragprune_plugins.session import Session
+from fragprune_plugins.injection.cpu_only import cpu_only
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.learning.schedule import JointSchedule, Settings
+from fragprune_plugins.injection.session import Session
 from fragprune_mcmc import MCMC
 from fragprune_mip_splatting import MipSplatting
 
@@ -309,8 +309,8 @@ import contextlib, hashlib, json
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from fragprune_plugins.launch import RunOptions, run
-from fragprune_plugins import sidecar
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.storage import sidecar
 host, out = Path(sys.argv[1]), Path(sys.argv[2])
 def pictures():
     run([str(host / "render.py"), "-m", str(out), "--skip_train"], RunOptions(device="cpu"))

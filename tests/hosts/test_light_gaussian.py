@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fragprune_light_gaussian import LightGaussian
-from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -44,10 +44,10 @@ from pathlib import Path
 from types import ModuleType
 import torch
 torch.set_num_threads(1)
-from fragprune_plugins import sidecar
-from fragprune_plugins.launch import RunOptions, run
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.learning.schedule import Settings
 
 def absent(name, **members):
     try:

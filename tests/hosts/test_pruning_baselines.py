@@ -8,7 +8,7 @@ import pytest
 from hosts.test_checkouts import RUN, each_of
 
 from fragprune_lp_3dgs import LP3DGS
-from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_speedy_splat import SpeedySplat
 from fragprune_vanilla_3dgs import Vanilla3DGS
 

@@ -10,7 +10,7 @@ import pytest
 from hosts.test_checkouts import each_of
 from PIL import Image
 
-from fragprune_plugins.detect import HostRepo
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_rt_4dgs import RT4DGS
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -89,8 +89,8 @@ RUN = """
 import contextlib, json, sys
 import torch
 torch.set_num_threads(1)
-from fragprune_plugins.launch import RunOptions, run
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
 host, config = sys.argv[1:]
 names = ("degree", "xyz", "dc", "rest", "scaling", "rotation", "opacity")
 with contextlib.redirect_stdout(sys.stderr):

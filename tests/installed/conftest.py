@@ -7,12 +7,12 @@ from importlib.util import find_spec
 import pytest
 
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
-from fragprune_plugins.detect import HostRepo
-from fragprune_plugins.device import cpu_only
-from fragprune_plugins.launch import _forget_modules
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.schedule import JointSchedule, Settings
-from fragprune_plugins.session import Session
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.cpu_only import cpu_only
+from fragprune_plugins.injection.launch import _forget_modules
+from fragprune_plugins.injection.session import Session
+from fragprune_plugins.learning.schedule import JointSchedule, Settings
+from fragprune_plugins.plugins.loading import load_plugins
 
 
 @pytest.fixture(autouse=True)

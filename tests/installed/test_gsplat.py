@@ -14,12 +14,12 @@ import torch
 from click.testing import CliRunner
 
 from fragprune_gsplat import Gsplat
-from fragprune_plugins import sidecar
 from fragprune_plugins.cli import cli
-from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.errors import AlignmentError, InputError, SessionError, UsageError
-from fragprune_plugins.ply import read_ply
-from fragprune_plugins.schedule import JointSchedule, Settings
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.learning.schedule import JointSchedule, Settings
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 
 WIDTH, HEIGHT = 48, 32
 LOOP = Path(__file__).parents[2] / "docs" / "how-to" / "gsplat_loop.py"

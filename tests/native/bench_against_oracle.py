@@ -17,7 +17,7 @@ import time
 import torch
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.native import loader
+from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.testing import scenes
 
 
@@ -46,7 +46,7 @@ def main() -> None:
     slow = seconds("reference", **options, runs=3)
     fast = seconds("cpu", **options, runs=15)
     report = {
-        "build": loader.describe()["build"],
+        "build": binding.describe()["build"],
         "threads": torch.get_num_threads(),
         "load": os.getloadavg()[0],
         "reference_ms": round(slow * 1e3, 1),

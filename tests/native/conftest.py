@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 from native.sanitize import building
 
-from fragprune_plugins.engines.cpu import CpuEngine
-from fragprune_plugins.native import loader
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cpu.engine import CpuEngine
 
 
-@pytest.fixture(params=loader.usable_builds(), scope="session")
+@pytest.fixture(params=binding.usable_builds(), scope="session")
 def engine(request: pytest.FixtureRequest) -> CpuEngine:
     """The cpu engine, once per build."""
-    return CpuEngine(loader.open_build(request.param))
+    return CpuEngine(binding.open_build(request.param))
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from native.test_against_oracle import check_gradients, check_images, draw_pair, gradients
 
-from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs

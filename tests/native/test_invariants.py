@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
-from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Compensation, RasterInputs

@@ -14,23 +14,23 @@ import pytest
 import fragprune_plugins.native
 from fragprune_plugins import constants
 from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.native import loader
 
 HEADER = (Path(fragprune_plugins.native.__file__).parent / "include/fragprune.h").read_text()
-needs_native = pytest.mark.skipif(not loader.usable_builds(), reason="no compiled rasterizer here")
+needs_native = pytest.mark.skipif(not binding.usable_builds(), reason="no compiled rasterizer here")
 
 
 @pytest.fixture(autouse=True)
 def _decide_anew():
-    loader.forget()
+    binding.forget()
     yield
-    loader.forget()
+    binding.forget()
 
 
 def test_header_and_python_hold_the_same_constants() -> None:
     found = dict(re.findall(r"#define FRAGPRUNE_([A-Z_]+) ([-(0-9][^\n]*)", HEADER))
-    assert int(found.pop("API_VERSION")) == loader.API_VERSION
+    assert int(found.pop("API_VERSION")) == binding.API_VERSION
     assert len(found) == 15
     for name, value in found.items():
         assert eval(value) == getattr(constants, name), name
@@ -39,8 +39,8 @@ def test_header_and_python_hold_the_same_constants() -> None:
 @pytest.mark.parametrize(
     "mirror",
     [
-        *(loader.Inputs, loader.Outputs, loader.OutputGrads, loader.InputGrads, loader.Error),
-        *(loader.Spacetime, loader.Sliced, loader.SpacetimeGrads),
+        *(binding.Inputs, binding.Outputs, binding.OutputGrads, binding.InputGrads, binding.Error),
+        *(binding.Spacetime, binding.Sliced, binding.SpacetimeGrads),
     ],
 )
 def test_header_and_python_hold_the_same_structs(mirror: type[ctypes.Structure]) -> None:
@@ -52,16 +52,16 @@ def test_header_and_python_hold_the_same_structs(mirror: type[ctypes.Structure])
 
 
 def test_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(loader.ENVIRONMENT, "off")
-    assert not loader.available()
-    assert "switched off" in loader.describe()["reason"]
+    monkeypatch.setenv(binding.ENVIRONMENT, "off")
+    assert not binding.available()
+    assert "switched off" in binding.describe()["reason"]
     with pytest.raises(EngineError, match="switched off"):
         create_engine("cpu")
     assert create_engine("auto").name == "reference"
 
 
 def test_absent_is_remembered_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(loader.ENVIRONMENT, raising=False)
+    monkeypatch.delenv(binding.ENVIRONMENT, raising=False)
     calls = []
 
     def nothing(name: str) -> None:
@@ -69,9 +69,9 @@ def test_absent_is_remembered_with_its_reason(monkeypatch: pytest.MonkeyPatch) -
 
     with monkeypatch.context() as patch:
         patch.setattr(importlib.util, "find_spec", nothing)
-        assert not loader.available()
-        assert "not installed" in loader.describe()["reason"]
-        assert not loader.available()
+        assert not binding.available()
+        assert "not installed" in binding.describe()["reason"]
+        assert not binding.available()
     assert len(calls) == 1
 
 
@@ -80,20 +80,20 @@ def test_a_broken_file_is_a_reason_not_a_crash(
 ) -> None:
     broken = tmp_path / "broken.so"
     broken.write_bytes(b"not a library")
-    monkeypatch.setattr(loader, "_path_of", lambda build: str(broken))
-    assert "cannot be opened" in loader.describe()["reason"]
+    monkeypatch.setattr(binding, "_path_of", lambda build: str(broken))
+    assert "cannot be opened" in binding.describe()["reason"]
 
 
 def test_an_unknown_build_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(loader.ENVIRONMENT, "sse9")
-    assert "none of off, avx512, avx2, baseline" in loader.describe()["reason"]
+    monkeypatch.setenv(binding.ENVIRONMENT, "sse9")
+    assert "none of off, avx512, avx2, baseline" in binding.describe()["reason"]
 
 
 @needs_native
-@pytest.mark.parametrize("build", loader.usable_builds())
+@pytest.mark.parametrize("build", binding.usable_builds())
 def test_the_environment_chooses(monkeypatch: pytest.MonkeyPatch, build: str) -> None:
-    monkeypatch.setenv(loader.ENVIRONMENT, build)
-    described = loader.describe()
+    monkeypatch.setenv(binding.ENVIRONMENT, build)
+    described = binding.describe()
     assert described["available"]
     assert described["build"] == build
     assert described["lanes"] == {"baseline": 4, "avx2": 8, "avx512": 16}[build]
@@ -101,40 +101,40 @@ def test_the_environment_chooses(monkeypatch: pytest.MonkeyPatch, build: str) ->
 
 @needs_native
 def test_the_best_build_is_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(loader.ENVIRONMENT, raising=False)
-    assert loader.describe()["build"] == loader.usable_builds()[0]
+    monkeypatch.delenv(binding.ENVIRONMENT, raising=False)
+    assert binding.describe()["build"] == binding.usable_builds()[0]
     assert create_engine("auto").name == "cpu"
 
 
 @needs_native
 def test_a_processor_without_avx_gets_the_baseline(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(loader.ENVIRONMENT, raising=False)
-    monkeypatch.setattr(loader, "BUILDS", {"avx512": 1 << 20, "avx2": 1 << 21, "baseline": 0})
-    assert loader.describe()["build"] == "baseline"
+    monkeypatch.delenv(binding.ENVIRONMENT, raising=False)
+    monkeypatch.setattr(binding, "BUILDS", {"avx512": 1 << 20, "avx2": 1 << 21, "baseline": 0})
+    assert binding.describe()["build"] == "baseline"
 
 
 @needs_native
 def test_bad_calls_get_a_status_and_a_message() -> None:
-    calls = loader.library().calls
-    error = loader.Error()
-    for inputs in (loader.Inputs(), loader.Inputs(width=3, height=3, count=-1)):
-        outputs = loader.Outputs()
+    calls = binding.library().calls
+    error = binding.Error()
+    for inputs in (binding.Inputs(), binding.Inputs(width=3, height=3, count=-1)):
+        outputs = binding.Outputs()
         status = calls.fragprune_forward(inputs, outputs, None, error)
-        assert status != loader.OK
+        assert status != binding.OK
         assert error.message
-    stale = loader.Inputs()
+    stale = binding.Inputs()
     stale.size = 8
-    assert calls.fragprune_forward(stale, loader.Outputs(), None, error) != loader.OK
+    assert calls.fragprune_forward(stale, binding.Outputs(), None, error) != binding.OK
     assert b"version" in error.message
-    status = calls.fragprune_backward(None, loader.OutputGrads(), loader.InputGrads(), 1, error)
-    assert status != loader.OK
+    status = calls.fragprune_backward(None, binding.OutputGrads(), binding.InputGrads(), 1, error)
+    assert status != binding.OK
     calls.fragprune_free(None)
 
 
 @needs_native
 def test_only_the_interface_is_exported() -> None:
     listing = subprocess.run(
-        ["nm", "-D", "--defined-only", loader.library().path], capture_output=True, text=True
+        ["nm", "-D", "--defined-only", binding.library().path], capture_output=True, text=True
     )
     if listing.returncode:
         pytest.skip("no nm")
@@ -146,8 +146,8 @@ def test_only_the_interface_is_exported() -> None:
 @needs_native
 def test_opening_the_library_does_not_need_torch() -> None:
     code = (
-        "import sys; from fragprune_plugins.native import loader;"
-        "assert loader.available(); assert 'torch' not in sys.modules"
+        "import sys; from fragprune_plugins.engines.cpu import binding;"
+        "assert binding.available(); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
@@ -157,7 +157,7 @@ def test_memory_is_returned() -> None:
     """A state that nobody freed would grow by 3 MB per turn here."""
     import resource
 
-    from fragprune_plugins.engines.cpu import CpuEngine
+    from fragprune_plugins.engines.cpu.engine import CpuEngine
     from fragprune_plugins.testing import scenes
 
     engine = CpuEngine()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from native.test_against_oracle import check_gradients, check_images, draw_pair
 
 from fragprune_plugins.constants import NEAR, TILE
-from fragprune_plugins.engines.cpu import CpuEngine
+from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs, Splats, View
 

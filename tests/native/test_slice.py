@@ -10,9 +10,9 @@ import torch
 from spacetime import KINDS, agree, gradients, leaves, moment, splats
 
 import fragprune_plugins
+from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.native import loader
 from fragprune_plugins.types import SpacetimeSplats
 
 SIZES = (1, 3, 1024 + 37)
@@ -206,9 +206,9 @@ def test_slice_at_takes_the_fastest_engine(monkeypatch):
     given, when = splats("joint", 50), moment()
     expected = ReferenceEngine().slice(given, when)
     assert fragprune_plugins.slice_at(given, when).means.dtype == (
-        torch.float32 if loader.usable_builds() else torch.float64
+        torch.float32 if binding.usable_builds() else torch.float64
     )
-    monkeypatch.setenv(loader.ENVIRONMENT, "off")
+    monkeypatch.setenv(binding.ENVIRONMENT, "off")
     assert torch.equal(fragprune_plugins.slice_at(given, when).means, expected.means)
 
 
@@ -229,16 +229,16 @@ def test_what_does_not_fit_is_refused(engine):
 
 def test_the_library_refuses_what_does_not_fit(engine):
     """Below the Python checks: the C interface stands on its own."""
-    calls, error = loader.library().calls, loader.Error()
+    calls, error = binding.library().calls, binding.Error()
     three = torch.zeros(3).data_ptr()
     good = {"count": 0, "campos": three, "duration": 1.0}
-    to = loader.Sliced()
-    assert calls.fragprune_slice(loader.Spacetime(**good), to, error) == loader.OK
+    to = binding.Sliced()
+    assert calls.fragprune_slice(binding.Spacetime(**good), to, error) == binding.OK
     for change in ({"threads": 1025}, {"count": -1}, {"campos": None}, {"count": 1}):
-        status = calls.fragprune_slice(loader.Spacetime(**{**good, **change}), to, error)
-        assert status != loader.OK
+        status = calls.fragprune_slice(binding.Spacetime(**{**good, **change}), to, error)
+        assert status != binding.OK
         assert error.message
-    stale = loader.Sliced()
+    stale = binding.Sliced()
     stale.size = 4
-    assert calls.fragprune_slice(loader.Spacetime(**good), stale, error) != loader.OK
+    assert calls.fragprune_slice(binding.Spacetime(**good), stale, error) != binding.OK
     assert b"version" in error.message

@@ -8,8 +8,8 @@ from types import ModuleType
 import pytest
 
 from fragprune_plugins.errors import LateImportError, SeamError
-from fragprune_plugins.patching import PatchLedger
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.injection.patching import PatchLedger
 
 NAME = "a_host_of_the_ledgers_tests"
 SOURCE = """

@@ -11,8 +11,8 @@ from itertools import product
 
 import pytest
 
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.seams import Seam
+from fragprune_plugins.hosts.seams import Seam
+from fragprune_plugins.plugins.loading import load_plugins
 
 WITHOUT_A_MINIATURE = ("compact-3dgs", "gaussian-splatting", "gsplat")
 ADAPTERS = {
@@ -32,8 +32,8 @@ ORDERS = [
 PROGRAM = """
 import json, sys
 from importlib import import_module
-from fragprune_plugins.patching import PatchLedger
-from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.injection.patching import PatchLedger
+from fragprune_plugins.plugins.loading import load_plugins
 
 adapter, = (a for a in load_plugins().adapters if a.name == sys.argv[1])
 modules = list(dict.fromkeys(seam.module for seam in adapter.seams))
@@ -127,8 +127,8 @@ LATER = """
 import json, sys
 from importlib import import_module
 from fragprune_plugins.errors import SeamError
-from fragprune_plugins.patching import PatchLedger
-from fragprune_plugins.plugins import load_plugins
+from fragprune_plugins.injection.patching import PatchLedger
+from fragprune_plugins.plugins.loading import load_plugins
 adapter, = (a for a in load_plugins().adapters if a.name == sys.argv[1])
 ledger = PatchLedger()
 for seam in adapter.seams:

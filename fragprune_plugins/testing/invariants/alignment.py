@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import AlignmentError
-from fragprune_plugins.seams import Role
+from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.testing.host import Chance, expect_ancestors, joint, label
 from fragprune_plugins.testing.invariants.case import COUNT, Case, require
 

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.adapter import HostAdapter
-from fragprune_plugins.detect import HostRepo
-from fragprune_plugins.hookspecs import hookimpl
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing.host import Host, Running
 
 COUNT = 16

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import Chance, running, tensors
 from fragprune_plugins.testing.invariants.case import Case, require
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import Chance, Running, joint
 from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, open_all, require
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from fragprune_plugins.schedule import Schedule, Settings
+from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.testing.host import Chance, Running, joint, running, tensors
 from fragprune_plugins.testing.invariants.case import COUNT, Case, require
 

@@ -11,12 +11,12 @@ from unittest import mock
 import torch
 import wrapt
 
-from fragprune_plugins import session as sessions
-from fragprune_plugins.device import cpu_only
 from fragprune_plugins.errors import LateImportError, SessionError
-from fragprune_plugins.plugins import load_plugins
-from fragprune_plugins.seams import Seam
-from fragprune_plugins.session import Session
+from fragprune_plugins.hosts.seams import Seam
+from fragprune_plugins.injection import session as sessions
+from fragprune_plugins.injection.cpu_only import cpu_only
+from fragprune_plugins.injection.session import Session
+from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing.host import imported, joint
 from fragprune_plugins.testing.invariants.case import (
     COUNT,

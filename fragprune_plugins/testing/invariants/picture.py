@@ -7,7 +7,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import FragpruneError
-from fragprune_plugins.schedule import Settings
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.fresh import NotApplicable
 from fragprune_plugins.testing.host import Chance, joint
 from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, open_all, require

@@ -7,10 +7,10 @@ from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fragprune_plugins import session as sessions
-from fragprune_plugins.detect import HostRepo
 from fragprune_plugins.errors import FragpruneError, SeamError
-from fragprune_plugins.seams import Role, Seam
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import session as sessions
 from fragprune_plugins.testing import mutations
 from fragprune_plugins.testing.host import running
 from fragprune_plugins.testing.invariants.case import Case, require

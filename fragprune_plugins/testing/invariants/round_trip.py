@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins import sidecar
 from fragprune_plugins.errors import SidecarError
-from fragprune_plugins.seams import Role
+from fragprune_plugins.hosts.seams import Role
+from fragprune_plugins.storage import sidecar
 from fragprune_plugins.testing.fresh import NotApplicable
 from fragprune_plugins.testing.host import Running, joint, running, tensors
 from fragprune_plugins.testing.invariants.case import Case, require

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from fragprune_plugins.native import loader
+from fragprune_plugins.engines.cpu import binding
 
 ROOT = Path(__file__).parents[3]
 TESTS = ROOT / "tests" / "native"
@@ -35,8 +35,8 @@ ENVIRONMENT = {
 
 def builds() -> list[str]:
     """The instruction sets that this machine runs."""
-    features = loader.cpu_features()
-    return [name for name, needs in loader.BUILDS.items() if needs & ~features == 0]
+    features = binding.cpu_features()
+    return [name for name, needs in binding.BUILDS.items() if needs & ~features == 0]
 
 
 def shipped_flags(build: str) -> tuple[list[str], list[str]]:

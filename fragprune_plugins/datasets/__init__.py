@@ -1,0 +1,1 @@
+"""Photographs and cameras, read from the folders that trainings use."""

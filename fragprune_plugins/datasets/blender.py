@@ -1,0 +1,104 @@
+"""Blender's layout: transforms_train.json and transforms_test.json, as NeRF synthetic scenes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.datasets.images import image_size
+from fragprune_plugins.datasets.pinhole import Camera
+from fragprune_plugins.errors import DatasetError
+
+Row = tuple[str, Camera, Path]
+"""name, camera, image file"""
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def read(folder: Path) -> tuple[list[Row], list[Row]]:
+    """Training and held-out views: name, camera, image path.
+
+    Raises:
+        DatasetError: a missing or broken file, lens distortion, a missing image.
+    """
+    train, test = (
+        read_transforms(folder / f"transforms_{part}.json") for part in ("train", "test")
+    )
+    return train, test
+
+
+def read_transforms(path: Path) -> list[Row]:
+    """The views of one transforms file.
+
+    Intrinsics are ``fl_x, fl_y, cx, cy`` where given, else ``camera_angle_x`` and a centred
+    principal point; ``w, h`` where given, else the size of the image.
+
+    Raises:
+        DatasetError: see ``read``.
+    """
+    content = load_json(path)
+    try:
+        distortion = [key for key in _DISTORTION if float(content.get(key, 0)) != 0]
+        if distortion:
+            raise DatasetError(
+                str(path),
+                f"lens distortion ({', '.join(distortion)})",
+                "undistorted images: rasterization knows no lens distortion",
+                "Undistort them first (colmap image_undistorter).",
+            )
+        return [_row(path.parent, content, frame) for frame in content["frames"]]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DatasetError(
+            str(path),
+            f"not a transforms file ({error!r})",
+            "frames with file_path and transform_matrix, and camera_angle_x or fl_x",
+            "Export it again.",
+        ) from error
+
+
+def load_json(path: Path) -> Any:
+    """A JSON file's content.
+
+    Raises:
+        DatasetError: missing or not JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DatasetError(
+            str(path), "no such file", "a JSON file of cameras", "Check the path."
+        ) from error
+    except (OSError, ValueError) as error:
+        raise DatasetError(
+            str(path), f"not readable as JSON ({error})", "a JSON file of cameras", "Save it again."
+        ) from error
+
+
+def _row(folder: Path, content: dict[str, Any], frame: dict[str, Any]) -> Row:
+    image = folder / frame["file_path"]
+    if not image.is_file():
+        image = image.with_name(image.name + ".png")  # these files name images without extension
+    width, height = (int(content["w"]), int(content["h"])) if "w" in content else image_size(image)
+    fx = (
+        float(content["fl_x"])
+        if "fl_x" in content
+        else width / (2 * math.tan(float(content["camera_angle_x"]) / 2))
+    )
+    pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64).reshape(-1, 4)[:3]
+    to_world = pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])  # OpenGL's y up, z back, to COLMAP's
+    rotation = to_world.T.contiguous()
+    camera = Camera(
+        rotation,
+        -rotation @ pose[:, 3],
+        width,
+        height,
+        fx,
+        float(content.get("fl_y", fx)),
+        float(content.get("cx", width / 2)),
+        float(content.get("cy", height / 2)),
+    )
+    return image.name.rsplit(".", 1)[0], camera, image

@@ -1,0 +1,59 @@
+"""Cameras without photographs, for ``fragprune render --cameras FILE``.
+
+Two kinds of file: the ``cameras.json`` a host writes beside its model (a list of ``id, img_name,
+width, height, position, rotation, fx, fy``; rotation is camera to world, principal point centred),
+and a Blender ``transforms_*.json``, which needs ``w`` and ``h`` where its images are absent.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.datasets.blender import load_json, read_transforms
+from fragprune_plugins.datasets.pinhole import Camera
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.types import View
+
+
+def load_cameras(path: Path, *, white_background: bool = False) -> list[tuple[str, View]]:
+    """Named views of a cameras file.
+
+    Raises:
+        DatasetError: missing, broken or empty.
+    """
+    content = load_json(path)
+    if isinstance(content, dict):
+        cameras = [(name, camera) for name, camera, _ in read_transforms(path)]
+    else:
+        try:
+            cameras = [(str(entry["img_name"]), _camera(entry)) for entry in content]
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise DatasetError(
+                str(path),
+                f"not a cameras file ({error!r})",
+                "cameras.json of a 3DGS model, or a transforms file",
+                "Pass the cameras.json that a training wrote.",
+            ) from error
+    if not cameras:
+        raise DatasetError(str(path), "0 cameras", "at least one", "Pass another file.")
+    background = torch.full((3,), float(white_background))
+    return [(name, camera.view(background)) for name, camera in cameras]
+
+
+def _camera(entry: dict[str, Any]) -> Camera:
+    rotation = torch.tensor(entry["rotation"], dtype=torch.float64).reshape(3, 3).T.contiguous()
+    position = torch.tensor(entry["position"], dtype=torch.float64).reshape(3)
+    width, height = int(entry["width"]), int(entry["height"])
+    return Camera(
+        rotation,
+        -rotation @ position,
+        width,
+        height,
+        float(entry["fx"]),
+        float(entry["fy"]),
+        width / 2,
+        height / 2,
+    )

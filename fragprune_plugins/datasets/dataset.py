@@ -1,0 +1,143 @@
+"""Photographs with their cameras, from a COLMAP or a Blender (transforms) folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fragprune_plugins.datasets import blender, colmap
+from fragprune_plugins.datasets.images import image_size, unreadable
+from fragprune_plugins.datasets.pinhole import Camera
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.types import View
+
+_ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One photograph with its camera.
+
+    Attributes:
+        name: unique in its dataset.
+        view: the camera, with the background colour that the image was composited over.
+        path: the image file; read when first asked for, kept as 8-bit.
+    """
+
+    name: str
+    view: View
+    path: Path
+
+    @property
+    def image(self) -> Tensor:
+        """(3, H, W) RGB in [0, 1], alpha composited over the view's background."""
+        return self._bytes.permute(2, 0, 1).float() / 255
+
+    @cached_property
+    def _bytes(self) -> Tensor:
+        from PIL import Image
+
+        try:
+            with Image.open(self.path) as file:
+                picture = file.convert("RGBA") if "A" in file.getbands() else file.convert("RGB")
+                size = (self.view.width, self.view.height)
+                if picture.size != size:
+                    picture = picture.resize(size)
+        except (OSError, SyntaxError) as error:
+            raise unreadable(self.path, error) from error
+        values = np.asarray(picture)
+        if values.shape[2] == 4:
+            alpha = values[..., 3:].astype(np.float32) / 255
+            behind = 255 * self.view.background.numpy()
+            over = values[..., :3] * alpha + behind * (1 - alpha)
+            values = np.round(over).astype(np.uint8)
+        return torch.from_numpy(values.copy())
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Views to learn from and views held out for measuring."""
+
+    train: Sequence[Shot]
+    test: Sequence[Shot]
+
+    @property
+    def extent(self) -> float:
+        """1.1 times the largest distance of a training camera from their mean, world units.
+
+        Hosts scale the learning rate of positions by it.
+        """
+        centres = torch.stack([shot.view.campos for shot in self.train])
+        return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max()) or 1.0
+
+
+def load_dataset(folder: Path, *, resolution: int = 1, white_background: bool = False) -> Dataset:
+    """Read a COLMAP folder (sparse/, images/) or a Blender one (transforms_train/test.json).
+
+    COLMAP holds out every 8th view of the sorted names, as hosts do. Images whose size differs
+    from their camera's are accepted when the aspect agrees to 1 %: intrinsics scale with them.
+
+    Args:
+        folder: the scene.
+        resolution: divide the images' sides by this.
+        white_background: composite images with alpha over white instead of black, render likewise.
+
+    Raises:
+        DatasetError: neither or both layouts, missing images, an unknown camera model, sizes that
+            do not match.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DatasetError(
+            str(folder), "no such folder", "a folder with photographs", "Check --data."
+        )
+    is_colmap = colmap.find_model(folder) is not None
+    is_blender = (folder / "transforms_train.json").exists()
+    layouts = "sparse/0 with images/ (COLMAP), or transforms_train.json (Blender)"
+    if is_colmap == is_blender:
+        found = "both a COLMAP and a Blender layout" if is_colmap else "neither layout"
+        remedy = (
+            "Move one of the two aside." if is_colmap else "Pass the folder that contains them."
+        )
+        raise DatasetError(str(folder), found, layouts, remedy)
+    background = torch.full((3,), float(white_background))
+    reader = colmap if is_colmap else blender
+    train, test = (
+        [make_shot(name, camera, path, background, resolution) for name, camera, path in part]
+        for part in reader.read(folder)
+    )
+    for name, part in (("training", train), ("held-out", test)):
+        if not part:
+            raise DatasetError(
+                str(folder),
+                f"no {name} view ({len(train) + len(test)} in all)",
+                "at least one training and one held-out view",
+                "Add photographs; every 8th is held out.",
+            )
+    return Dataset(train, test)
+
+
+def make_shot(
+    name: str, camera: Camera, path: Path, background: Tensor, resolution: int = 1
+) -> Shot:
+    """Pair an image file with its camera; only the file's header is read here.
+
+    Raises:
+        DatasetError: the file is missing or unreadable, or its size does not fit the camera.
+    """
+    width, height = image_size(path)
+    if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT_TOLERANCE:
+        raise DatasetError(
+            str(path),
+            f"{width}x{height} pixels",
+            f"those of its camera, {camera.width}x{camera.height}, or that aspect",
+            "Use the images that the cameras were calibrated with.",
+        )
+    size = (max(1, round(width / resolution)), max(1, round(height / resolution)))
+    return Shot(name, camera.resized(*size).view(background), path)

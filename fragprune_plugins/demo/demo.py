@@ -1,0 +1,254 @@
+"""The demo from beginning to end: photographs, training, fine-tuning, before and after."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.errors import OutputError
+from fragprune_plugins.storage.atomic import replacing, writable_folder
+
+if TYPE_CHECKING:
+    from fragprune_plugins.injection.launch import RunOptions, RunSummary
+    from fragprune_plugins.storage.ply import SplatFile
+
+HOST = Path(__file__).with_name("host") / "train.py"
+"""The training script that the demo runs, as a user runs their own."""
+
+REPORT = "report.json"
+"""Written last; a folder that holds it, or nothing, is ours to write into."""
+
+
+_REPEATS = 20  # timed frames a view: small frames are quick, and laptops are noisy
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """How long a demo to run.
+
+    Attributes:
+        iterations: of the host's own training.
+        finetune: iterations of stage 2.
+        pressure: weight of drawn fragments per pixel; None for the default.
+        seed: of the scene and of the training.
+        engine: what rasterizes.
+        scene: the photographs.
+    """
+
+    iterations: int = 2000
+    finetune: int = 1000
+    pressure: float | None = None
+    seed: int = 0
+    engine: str = "auto"
+    scene: SceneSettings = field(default_factory=SceneSettings)
+
+
+def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
+    """What one would type to train the host on the scene; the timetable scaled to its length."""
+    n = settings.iterations
+    flags: dict[str, object] = {
+        "-s": scene,
+        "-m": model,
+        "--iterations": n,
+        "--sh_degree": 1,
+        "--position_lr_max_steps": n,
+        "--densify_from_iter": n // 10,
+        "--densify_until_iter": int(n * 0.65),
+        "--densification_interval": max(1, n // 20),
+        "--opacity_reset_interval": 10 * n,  # too short a training to recover from one
+        "--densify_grad_threshold": 0.0009,
+        "--test_iterations": -1,
+        "--save_iterations": n,
+        "--seed": settings.seed,
+    }
+    words = [str(word) for flag in flags.items() for word in flag]
+    return [str(HOST), *words, "--eval"]
+
+
+def run_demo(
+    out: Path,
+    settings: DemoSettings | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Make a scene, train the host on it, fine-tune, measure, draw; progress bars on stderr.
+
+    Args:
+        out: folder for everything: ``scene/``, ``model/``, ``pictures/``, ``index.html``.
+        settings: how long.
+        say: told one line at the start of each part.
+
+    Returns:
+        The report: "before", "after" and "control" (opacities alone, as long) as measured on the
+        held-out views, seconds by part.
+
+    Raises:
+        OutputError: the folder cannot be written, or holds something else.
+    """
+    from fragprune_plugins.demo.page import write_page
+    from fragprune_plugins.injection.launch import run
+
+    settings = settings or DemoSettings()
+    _prepare(out)
+    clock = _Clock()
+    scene, model = out / "scene", out / "model"
+    views = settings.scene.views
+    with clock.part("scene"):
+        say(f"1/5  Photographing a room from {views} sides (ray-traced, nothing is downloaded)")
+        _photograph(scene, settings)
+    with clock.part("train"), contextlib.redirect_stdout(sys.stderr):
+        command = host_command(scene.resolve(), model.resolve(), settings)
+        say(
+            f"2/5  Training for {settings.iterations} iterations, then opacities and thresholds "
+            f"for {settings.finetune}"
+        )
+        summary = run(command, _run_options(settings))
+    with clock.part("control"):
+        say(f"3/5  The honest zero: the same {settings.finetune} iterations with opacities alone")
+        control = _control(scene, summary, settings)
+    with clock.part("measure"):
+        say("4/5  Measuring on the held-out views")
+        report = _measure(scene, summary, control, settings)
+    with clock.part("pictures"):
+        say("5/5  Drawing the pictures")
+        report["files"] = write_page(out, report, scene, summary, settings.engine)
+    report["seconds_by_part"] = clock.seconds
+    report["seconds"] = sum(clock.seconds.values())
+    with replacing(out / REPORT) as path:
+        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    return report
+
+
+def quotable(report: dict[str, Any]) -> str:
+    """The outcome in one sentence; it claims faster frames only beyond two standard errors."""
+    before, after = report["before"], report["after"]
+    gain = before["frame_ms"] - after["frame_ms"]
+    faster = gain > 2 * math.hypot(before["frame_ms_se"], after["frame_ms_se"])
+    return (
+        f"{report['fragments_ratio']:.2f}x fewer fragments per pixel "
+        f"({before['fragments_per_pixel']:.1f} to {after['fragments_per_pixel']:.1f})"
+        + (f" and {report['frame_ratio']:.2f}x faster frames" if faster else "")
+        + f" at {report['psnr_change']:+.2f} dB PSNR: {after['gaussians']:,} Gaussians, "
+        f"{after['views']} held-out views."
+    )
+
+
+def honest(report: dict[str, Any]) -> str:
+    """How much of the change in quality is not truncation's, in one sentence."""
+    return (
+        f"The same {report['iterations']:,} iterations with opacities alone: "
+        f"{report['control_psnr_change']:+.2f} dB PSNR "
+        f"at {report['control']['fragments_per_pixel']:.1f} fragments per pixel."
+    )
+
+
+def _prepare(out: Path) -> None:
+    """Make the folder, or empty our own earlier demo: its checkpoints would be taken up again."""
+    writable_folder(out)
+    ours = {"scene", "model", "pictures", "index.html", REPORT}
+    strange = sorted(path.name for path in out.iterdir() if path.name not in ours)
+    if strange:
+        raise OutputError(
+            str(out),
+            f"holds {strange[0]!r}, which no demo wrote",
+            "a new or empty folder, or an earlier demo's",
+            "Choose another --out.",
+        )
+    (out / REPORT).unlink(missing_ok=True)
+    for name in ("scene", "model", "pictures"):
+        shutil.rmtree(out / name, ignore_errors=True)
+
+
+def _photograph(folder: Path, settings: DemoSettings) -> None:
+    from dataclasses import replace
+
+    from tqdm import tqdm
+
+    with tqdm(total=settings.scene.views, desc="Photographs", unit="view") as bar:
+        make_scene(
+            folder,
+            replace(settings.scene, seed=settings.seed),
+            lambda done, _: bar.update(done - bar.n) and None,
+        )
+
+
+def _run_options(settings: DemoSettings) -> RunOptions:
+    from fragprune_plugins.injection.launch import RunOptions
+    from fragprune_plugins.learning.schedule import Settings
+
+    learning = Settings(
+        iterations=settings.finetune, pressure=settings.pressure, seed=settings.seed
+    )
+    return RunOptions(settings=learning, engine=settings.engine, device="cpu")
+
+
+def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> SplatFile:
+    from fragprune_plugins.datasets.dataset import load_dataset
+    from fragprune_plugins.finetuning.loop import finetune
+    from fragprune_plugins.learning.schedule import Settings
+    from fragprune_plugins.storage.models import load_model
+
+    assert summary.model_before is not None  # the host saves at its last iteration
+    model, _ = load_model(summary.model_before)
+    learning = Settings(iterations=settings.finetune, truncate=False, seed=settings.seed)
+    data = load_dataset(scene)
+    return finetune(model, data, learning, engine=settings.engine, progress=True).model
+
+
+def _measure(
+    scene: Path, summary: RunSummary, control: SplatFile, settings: DemoSettings
+) -> dict[str, Any]:
+    from fragprune_plugins.datasets.dataset import load_dataset
+    from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.storage.models import load_model
+
+    assert summary.model_before is not None
+    assert summary.model_after is not None
+    candidates = [
+        *(Candidate(*load_model(path)) for path in (summary.model_before, summary.model_after)),
+        Candidate(control, None),
+    ]
+    shots = load_dataset(scene).test
+    before, after, zero = measure(candidates, shots, engine=settings.engine, repeats=_REPEATS)
+    return {
+        "before": before,
+        "after": after,
+        "control": zero,
+        "fragments_ratio": before["fragments_per_pixel"] / max(after["fragments_per_pixel"], 1e-9),
+        "frame_ratio": before["frame_ms"] / max(after["frame_ms"], 1e-9),
+        "psnr_change": after["psnr"] - before["psnr"],
+        "control_psnr_change": zero["psnr"] - before["psnr"],
+        "ssim_change": after["ssim"] - before["ssim"],
+        "gaussians": after["gaussians"],
+        "iterations": summary.iterations,
+        "train_seconds": summary.train_seconds,
+        "adapter": summary.adapter,
+        "engine": after["engine"],
+        "device": after["device"],
+        "seed": settings.seed,
+        "model_before": str(summary.model_before),
+        "model_after": str(summary.model_after),
+        "settings": summary.settings,
+    }
+
+
+class _Clock:
+    """Seconds by part."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Time the block."""
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = round(time.perf_counter() - started, 3)

@@ -1,0 +1,1 @@
+"""The CPU engine: compiled C++ behind a plain C interface, opened with ctypes."""

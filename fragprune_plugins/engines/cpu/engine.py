@@ -1,0 +1,311 @@
+"""The compiled CPU rasterizer as an engine: tensors in, tensors out, every gradient."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any, NoReturn, get_args
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from fragprune_plugins.engines.arrays import address, plain
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.slicing import slice_by
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.types import Compensation, Footprints, RasterOutputs, Splats
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import Moment, RasterInputs, Sliced, SpacetimeSplats
+
+# The differentiable inputs, in the order in which the autograd function takes them.
+_NAMES = (
+    "means",
+    "hook",
+    "opacities",
+    "scales",
+    "rotations",
+    "cov3d",
+    "sh",
+    "colors",
+    "features",
+    "thresholds",
+    "means2d",
+    "conics",
+    "depths",
+    "background",
+)
+
+_COMPENSATIONS = get_args(Compensation)
+"""In the order of enum fragprune_compensation."""
+
+
+_SMALL = 1 << 16
+"""Bytes below which the C library has memory at hand itself."""
+
+_STAGES = ("projection", "binning", "blend")
+
+
+def _empty(workspace: binding.Workspace, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """As torch.empty, for four bytes a number; large ones in memory that the engine used before.
+
+    Fresh memory costs more than filling it: the system clears it page by page.
+    """
+    size = 4 * math.prod(shape)
+    if size < _SMALL:
+        return torch.empty(shape, dtype=dtype)
+    return torch.frombuffer(workspace.take(size), dtype=dtype).view(shape)
+
+
+def _stop(status: int, error: binding.Error) -> NoReturn:
+    text = error.message.decode(errors="replace")
+    if status == binding.OUT_OF_MEMORY:
+        raise MemoryError(f"fragprune's cpu engine: {text}")
+    raise EngineError(
+        "engine 'cpu'", text, "inputs it can draw", "Check the camera and the Gaussians."
+    )
+
+
+@dataclass
+class _Drawing:
+    """One forward pass: what goes in beside the differentiable inputs, and what stays behind.
+
+    Attributes:
+        inputs: as the engine got them.
+        library: the build that draws.
+        workspace: the engine's.
+        arrays: what the C side reads, kept alive as long as its state.
+        state: what backward needs; None when nothing wants gradients.
+        evaluated: lanes spent.
+        stages: milliseconds by stage.
+        found: what counts and scores ask for, by the names of ``RasterOutputs``.
+    """
+
+    inputs: RasterInputs
+    library: binding.Library
+    workspace: binding.Workspace
+    arrays: dict[str, Tensor]
+    state: binding.State | None = None
+    evaluated: int = 0
+    stages: dict[str, float] = field(default_factory=dict)
+    found: dict[str, Tensor] = field(default_factory=dict)
+
+    def fill(self, widen: bool) -> binding.Inputs:
+        """The C struct; it points into ``arrays``."""
+        view, splats = self.inputs.view, self.inputs.splats
+        sh = splats.sh if isinstance(splats, Splats) else None
+        return binding.Inputs(
+            threads=_threads(),
+            width=view.width,
+            height=view.height,
+            tan_fov_x=view.tan_fov_x,
+            tan_fov_y=view.tan_fov_y,
+            scale_modifier=self.inputs.scale_modifier,
+            dilation=self.inputs.dilation,
+            near=self.inputs.near,
+            alpha_max=self.inputs.alpha_max,
+            compensation=_COMPENSATIONS.index(self.inputs.compensation),
+            cap_gradient=self.inputs.cap_gradient,
+            absolute_gradient=self.inputs.absolute_gradient,
+            sh_degree=splats.sh_degree if isinstance(splats, Splats) else 0,
+            sh_coefficients=0 if sh is None else sh.shape[1],
+            feature_count=_channels(splats.features),
+            widen=widen,
+            count=len(splats),
+            workspace=self.workspace.handle,
+            **{name: address(array) for name, array in self.arrays.items()},
+        )
+
+    def draw(self, wants: dict[str, bool]) -> tuple[Tensor, ...]:
+        """Run the forward pass; image, invdepth, alpha, features, radii, fragments per pixel."""
+        view, n = self.inputs.view, len(self.inputs.splats)
+        size = (view.height, view.width)
+        empty = partial(_empty, self.workspace)
+        image, invdepth, alpha = empty(3, *size), empty(1, *size), empty(1, *size)
+        features = empty(_channels(self.inputs.splats.features), *size)
+        radii, whole = empty(n, dtype=torch.int32), torch.int32
+        if self.inputs.counts:
+            self.found["fragments"] = empty(*size, dtype=whole)
+            self.found["fragments_per_gaussian"] = empty(n, dtype=whole)
+        if self.inputs.scores:
+            self.found["weights_per_gaussian"] = empty(n)
+            self.found["wins_per_gaussian"] = empty(n, dtype=whole)
+            self.found["winners"] = empty(*size, dtype=whole)
+        outputs = binding.Outputs(
+            image=address(image),
+            invdepth=address(invdepth),
+            alpha=address(alpha),
+            radii=address(radii),
+            features=address(features),
+            **{name: address(tensor) for name, tensor in self.found.items()},
+        )
+        error = binding.Error()
+        handle = ctypes.c_void_p()
+        keep = any(wants.values())
+        status = self.library.calls.fragprune_forward(
+            ctypes.byref(self.fill(wants["thresholds"])),
+            ctypes.byref(outputs),
+            ctypes.byref(handle) if keep else None,
+            ctypes.byref(error),
+        )
+        if status != binding.OK:
+            _stop(status, error)
+        if keep:
+            self.state = binding.State(self.library)
+            self.state.handle = handle.value
+        else:
+            self.arrays = {}
+        self.evaluated = outputs.evaluated
+        self.stages = {name: getattr(outputs, f"{name}_ms") for name in _STAGES}
+        drawn = torch.tensor(outputs.drawn / (view.width * view.height), dtype=torch.float32)
+        return image, invdepth, alpha, features, radii, drawn
+
+    def undraw(self, upstream: tuple[Tensor | None, ...], wants: dict[str, bool]) -> dict[str, Any]:
+        """Run the backward pass; gradients by name, float32 on the CPU."""
+        assert self.state is not None
+        by = [None if g is None else plain(g) for g in upstream]
+        image, invdepth, alpha, features, per_pixel = by
+        output_grads = binding.OutputGrads(
+            fragments_per_pixel=0.0 if per_pixel is None else per_pixel.item(),
+            image=address(image),
+            invdepth=address(invdepth),
+            alpha=address(alpha),
+            features=address(features),
+        )
+        n = len(self.inputs.splats)
+        shapes = {name: array.shape for name, array in self.arrays.items()}
+        shapes["hook"] = torch.Size((n, 3))
+        grads = {k: _empty(self.workspace, *shapes[k]) for k, wanted in wants.items() if wanted}
+        error = binding.Error()
+        status = self.library.calls.fragprune_backward(
+            self.state.handle,
+            ctypes.byref(output_grads),
+            ctypes.byref(binding.InputGrads(**{k: address(g) for k, g in grads.items()})),
+            _threads(),
+            ctypes.byref(error),
+        )
+        if status != binding.OK:
+            _stop(status, error)
+        return grads
+
+
+class _Rasterize(torch.autograd.Function):
+    """The engine's seam to autograd."""
+
+    @staticmethod
+    def forward(ctx: Any, drawing: _Drawing, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+        wants = dict(zip(_NAMES, ctx.needs_input_grad[1:], strict=True))
+        outputs = drawing.draw(wants)
+        ctx.mark_non_differentiable(outputs[4])
+        ctx.set_materialize_grads(False)
+        ctx.drawing, ctx.wants = drawing, wants
+        # Saved for the sake of autograd's check against changes in place: the state reads these.
+        ctx.save_for_backward(*tensors)
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        tensors = ctx.saved_tensors
+        image, invdepth, alpha, features, _, per_pixel = upstream
+        grads = ctx.drawing.undraw((image, invdepth, alpha, features, per_pixel), ctx.wants)
+        given: list[Tensor | None] = [None]
+        for name, tensor in zip(_NAMES, tensors, strict=True):
+            if name not in grads:
+                given.append(None)
+                continue
+            grad = grads[name]
+            if name == "hook" and tensor.shape[1] != 3:
+                grad = torch.nn.functional.pad(grad, (0, tensor.shape[1] - 3))
+            given.append(grad.to(tensor.device, tensor.dtype))
+        return tuple(given)
+
+
+@dataclass(frozen=True)
+class _Blade:
+    """Cuts with the compiled library; see ``engines.slicing``."""
+
+    library: binding.Library
+    workspace: binding.Workspace
+    where = torch.device("cpu")
+
+    def empty(self, *shape: int) -> Tensor:
+        return _empty(self.workspace, *shape)
+
+    def slice(self, given: binding.Spacetime, to: binding.Sliced) -> None:
+        self._call("fragprune_slice", given, to)
+
+    def unslice(
+        self, given: binding.Spacetime, by: binding.Sliced, to: binding.SpacetimeGrads
+    ) -> None:
+        self._call("fragprune_unslice", given, by, to)
+
+    def _call(self, function: str, *structs: ctypes.Structure) -> None:
+        error = binding.Error()
+        status = getattr(self.library.calls, function)(*map(ctypes.byref, (*structs, error)))
+        if status != binding.OK:
+            _stop(status, error)
+
+
+class CpuEngine:
+    """Rasterizes with the compiled library: any number of threads, the same result to the bit.
+
+    Args:
+        library: the build to use; the best for this machine when None.
+    """
+
+    name = "cpu"
+
+    def __init__(self, library: binding.Library | None = None) -> None:
+        self._library = binding.library() if library is None else library
+        self._workspace = binding.Workspace(self._library)
+
+    def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
+        """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+        view, splats = inputs.view, inputs.splats
+        others = {
+            "hook": inputs.means2d_hook,
+            "thresholds": thresholds,
+            "background": view.background,
+        }
+        tensors = {name: others.get(name, getattr(splats, name, None)) for name in _NAMES}
+        constants = {k: getattr(view, k) for k in ("viewmatrix", "projmatrix", "campos")}
+        constants["sample_offsets"] = inputs.sample_offsets
+        read = {k: t for k, t in {**tensors, **constants}.items() if t is not None and k != "hook"}
+        arrays = {name: plain(tensor) for name, tensor in read.items()}
+        if isinstance(splats, Footprints):
+            arrays["tiles"] = plain(splats.tiles, dtype=torch.int32)
+        drawing = _Drawing(inputs, self._library, self._workspace, arrays)
+        outputs = _Rasterize.apply(  # type: ignore[no-untyped-call]
+            drawing, *(tensors[name] for name in _NAMES)
+        )
+        image, invdepth, alpha, features, radii, per_pixel = outputs
+        device = splats.device
+        return RasterOutputs(
+            image=image.to(device),
+            radii=radii.to(device),
+            invdepth=invdepth.to(device),
+            alpha=alpha.to(device),
+            fragments_per_pixel=per_pixel.to(device),
+            evaluated_per_pixel=drawing.evaluated / (view.width * view.height),
+            features=None if splats.features is None else features.to(device),
+            stages=drawing.stages,
+            **{name: tensor.to(device) for name, tensor in drawing.found.items()},
+        )
+
+    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
+        """Cut Gaussians in space and time at a moment."""
+        return slice_by(_Blade(self._library, self._workspace), splats, moment)
+
+
+def _channels(features: Tensor | None) -> int:
+    return 0 if features is None else features.shape[1]
+
+
+def _threads() -> int:
+    """As many as torch uses; the C side takes no more than this."""
+    return min(torch.get_num_threads(), 1024)

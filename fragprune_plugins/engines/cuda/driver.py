@@ -1,0 +1,167 @@
+"""Runs kernels on a GPU: the only place that calls CUDA's driver.
+
+Streams and contexts are torch's: kernels go to torch's current stream of the tensors' device.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from typing import Any, Final
+
+import torch
+
+from fragprune_plugins.engines.cuda import kernels
+from fragprune_plugins.errors import EngineError
+
+THREADS: Final = 256
+"""Of every block of every kernel (native/cuda/frame.h)."""
+
+
+def missing() -> str | None:
+    """Why kernels cannot be compiled and run here; None when they can."""
+    try:
+        kernels.compiler()
+    except kernels.Unavailable as why:
+        return str(why)
+    if not torch.cuda.is_available():
+        return "torch sees no CUDA device"
+    return None
+
+
+class Driver:
+    """Compiles, loads and launches; keeps what it loaded, for each device.
+
+    Raises:
+        EngineError: there is no compiler or no GPU.
+    """
+
+    kind = "cuda"
+
+    def __init__(self) -> None:
+        why = missing()
+        if why is not None:
+            raise EngineError(
+                "engine 'cuda'",
+                why,
+                "a CUDA device, and NVRTC (through cuda-bindings) or nvcc",
+                "Install fragprune-plugins[cuda12] or [cuda13], as your torch has it "
+                "(torch.version.cuda), or use the engine 'reference'.",
+            )
+        from cuda.bindings import driver
+
+        self._driver: Any = driver
+        self._lock = threading.Lock()
+        self._contexts: dict[int, Any] = {}
+        self._modules: dict[tuple[Any, ...], Any] = {}
+        self._functions: dict[tuple[Any, ...], Any] = {}
+
+    def launch(
+        self,
+        where: torch.device,
+        source: str,
+        macros: dict[str, int],
+        kernel: str,
+        blocks: int,
+        arguments: ctypes.Structure,
+    ) -> None:
+        """Run a kernel on the current stream of a device; see ``engines.frames.Device``.
+
+        Raises:
+            EngineError: it does not compile, load or start.
+        """
+        index = torch.cuda.current_device() if where.index is None else where.index
+        self._enter(index)
+        function = self._function(index, source, macros, kernel)
+        stream = torch.cuda.current_stream(index).cuda_stream
+        parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
+        self._call(
+            "cuLaunchKernel",
+            *(function, blocks, 1, 1, THREADS, 1, 1, 0, stream),
+            *(ctypes.addressof(parameters), 0),
+        )
+
+    def capturing(self) -> bool:
+        """Whether the current stream records a graph."""
+        return bool(torch.cuda.is_current_stream_capturing())
+
+    def _enter(self, index: int) -> None:
+        """Makes torch's context current in this thread, which may never have met it."""
+        with self._lock:
+            if index not in self._contexts:
+                torch.cuda.init()  # type: ignore[no-untyped-call]
+                self._call("cuInit", 0)
+                device = self._call("cuDeviceGet", index)
+                self._contexts[index] = self._call("cuDevicePrimaryCtxRetain", device)
+        self._call("cuCtxSetCurrent", self._contexts[index])
+
+    def _function(self, index: int, source: str, macros: dict[str, int], kernel: str) -> Any:
+        module_key = (index, source, *sorted(macros.items()))
+        key = (kernel, *module_key)
+        function = self._functions.get(key)
+        if function is None:
+            with self._lock:
+                if module_key not in self._modules:
+                    self._modules[module_key] = self._load(index, source, macros)
+                function = self._call(
+                    "cuModuleGetFunction", self._modules[module_key], kernel.encode()
+                )
+                self._functions[key] = function
+        return function
+
+    def _load(self, index: int, source: str, macros: dict[str, int]) -> Any:
+        """Machine code for this GPU, or PTX where its driver wants none of that."""
+        major, minor = torch.cuda.get_device_capability(index)
+        capability = 10 * major + minor
+        compiler = kernels.compiler()
+        try:
+            target = kernels.target_of(capability, compiler.architectures)
+            tries = [target, target.replace("sm_", "compute_")]
+            failures = []
+            for way in dict.fromkeys(tries):
+                image, _ = kernels.image_of(source, macros, way, compiler)
+                try:
+                    return self._call("cuModuleLoadData", image.code)
+                except EngineError as error:
+                    failures.append(f"{way}: {error.found}")
+            why = "; ".join(failures)
+        except kernels.Unavailable as error:
+            why = str(error)
+        raise EngineError(
+            f"kernels of {source}.cu",
+            why,
+            f"code for compute capability {major}.{minor}",
+            f"Match {compiler.name} {compiler.version} with the GPU's driver: "
+            "update the driver, or install an older toolkit.",
+        )
+
+    def _call(self, function: str, *arguments: Any) -> Any:
+        """One call of the driver: its only result, if it has one."""
+        status, *results = getattr(self._driver, function)(*arguments)
+        if int(status) != 0:
+            raise EngineError(
+                f"CUDA driver, {function}",
+                status.name,
+                "CUDA_SUCCESS",
+                "Run again with CUDA_LAUNCH_BLOCKING=1 to find the kernel that failed.",
+            )
+        return results[0] if results else None
+
+
+def describe() -> dict[str, Any]:
+    """For ``fragprune doctor``: which way kernels take to this machine's GPU, or why none."""
+    try:
+        found = kernels.compiler()
+    except kernels.Unavailable:
+        route = None
+    else:
+        route = f"{found.name} {found.version}"
+    seen = torch.cuda.is_available()
+    return {
+        "available": missing() is None,
+        "compiler": route,
+        "device": torch.cuda.get_device_name() if seen else None,
+        "capability": ".".join(map(str, torch.cuda.get_device_capability())) if seen else None,
+        "kept": str(kernels.cache_folder()),
+        "reason": missing(),
+    }

@@ -1,0 +1,587 @@
+"""What is launched on a GPU for one rasterization, in which order and in whose memory.
+
+All memory is torch's and all work goes to torch's current stream. Nothing here knows the driver: a
+``Device`` runs a kernel by name, a GPU (``native.driver``) or, in tests, an emulation of one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol, get_args
+
+import torch
+
+from fragprune_plugins.constants import TILE
+from fragprune_plugins.engines.arrays import address, plain
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.types import Compensation, Footprints, Splats
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs
+
+Wanted = frozenset[str]
+"""Inputs that gradients are wanted of, by the names of fragprune_input_grads."""
+
+# What native/cuda/frame.h says.
+THREADS: Final = 256
+SORT_KEYS: Final = 16 * THREADS
+PASSES: Final = 4
+DIGITS: Final = 256
+BRUSH: Final = 12
+PACKED_BRUSH: Final = 8
+COUNTERS: Final = 4 * 8 + 4 * (2 + 2 * PASSES)
+
+ENTRIES_MAX: Final = (1 << 30) - 1
+"""Most entries of all tiles' lists: the sort counts with 30 bits."""
+
+OFFSET_MAX: Final = 1e6
+"""Farthest that a pixel may be sampled from its place, as in the cpu engine."""
+
+_GEOMETRY: Final = frozenset(
+    ("means", "hook", "scales", "rotations", "cov3d", "means2d", "conics", "depths")
+)
+
+
+def _fields(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, kind) for name in names.split())
+
+
+class Frame(ctypes.Structure):
+    """fp::Frame: what the kernels of a forward pass are handed."""
+
+    _fields_ = (
+        ("inputs", binding.Inputs),
+        ("outputs", binding.Outputs),
+        ("spread", ctypes.c_void_p),
+        ("capacity", ctypes.c_uint32),
+        *_fields(ctypes.c_int32, "tiles_x tiles_y tile_passes"),
+        *_fields(ctypes.c_void_p, "counters project_words emit_words depth_histogram"),
+        *_fields(ctypes.c_void_p, "tile_histogram ranges"),
+        *_fields(ctypes.c_void_p, "brushes rects tiles first_slot depth_keys depth_ids"),
+        *_fields(ctypes.c_void_p, "entry_keys entry_values owners reached transmittance"),
+        *_fields(ctypes.c_void_p, "stop weights"),
+    )
+
+
+class Sort(ctypes.Structure):
+    """fp::Sort: one pass of the radix sort."""
+
+    _fields_ = (
+        ("count", ctypes.c_void_p),
+        ("capacity", ctypes.c_uint32),
+        ("shift", ctypes.c_int32),
+        *_fields(ctypes.c_void_p, "histogram words ticket keys values sorted_keys sorted_values"),
+    )
+
+
+class Undraw(ctypes.Structure):
+    """fp::Undraw: what the kernels of a backward pass are handed."""
+
+    _fields_ = (
+        ("frame", Frame),
+        ("by", binding.OutputGrads),
+        ("to", binding.InputGrads),
+        *_fields(ctypes.c_void_p, "by_fragments background sums"),
+        ("ceiling", ctypes.c_float),
+    )
+
+
+class Slicing(ctypes.Structure):
+    """fp::Slicing: what the kernels are handed that cut Gaussians at a moment, and back."""
+
+    _fields_ = (
+        ("given", binding.Spacetime),
+        ("sliced", binding.Sliced),
+        ("to", binding.SpacetimeGrads),
+    )
+
+
+MACROS: Final = {
+    "FP_FRAME_SIZE": ctypes.sizeof(Frame),
+    "FP_SORT_SIZE": ctypes.sizeof(Sort),
+    "FP_SLICING_SIZE": ctypes.sizeof(Slicing),
+    "FP_UNDRAW_SIZE": ctypes.sizeof(Undraw),
+}
+"""What every source is compiled with, to check that it knows the same structs."""
+
+
+def blend_macros(
+    features: int = 0, *, counts: bool = False, scores: bool = False, packed: bool = False
+) -> dict[str, int]:
+    """What native/cuda/blend.cu is compiled with."""
+    return {
+        "FP_FEATURES": features,
+        "FP_COUNTS": int(counts),
+        "FP_SCORES": int(scores),
+        "FP_PACKED": int(packed),
+    }
+
+
+def unblend_macros(
+    wanted: Wanted,
+    *,
+    sh_turns: bool,
+    invdepth: bool = False,
+    absolute: bool = False,
+    offsets: bool = False,
+    features: int = 0,
+) -> dict[str, int]:
+    """What native/cuda/unblend.cu is compiled with.
+
+    Args:
+        wanted: inputs that gradients are wanted of.
+        sh_turns: colours depend on where the mean is seen from.
+        invdepth: a gradient of inverse depth came.
+        absolute: the hook's third column is filled.
+        offsets: pixels are sampled off their places.
+        features: channels of which a gradient came.
+    """
+    colour = bool(wanted & {"colors", "sh"}) or ("means" in wanted and sh_turns)
+    return {
+        "FP_GEOMETRY": int(bool(wanted & _GEOMETRY)),
+        "FP_COLOUR": int(colour),
+        "FP_THRESHOLD": int("thresholds" in wanted),
+        "FP_DEPTH": int(invdepth),
+        "FP_ABSOLUTE": int("hook" in wanted and absolute),
+        "FP_OFFSETS": int(offsets),
+        "FP_FEATURES": features,
+    }
+
+
+_TRAINED: Final = frozenset(("means", "hook", "opacities", "scales", "rotations", "sh"))
+
+VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
+    ("scene", {"FP_PACKED": 0}),
+    ("slice", {}),
+    ("blend", blend_macros()),
+    ("blend", blend_macros(counts=True)),
+    *(
+        ("unblend", unblend_macros(frozenset(wanted), sh_turns=True, invdepth=invdepth))
+        for wanted in (_TRAINED, _TRAINED | {"thresholds"}, {"opacities", "thresholds"})
+        for invdepth in (False, True)
+    ),
+)
+"""Sources with macros that training and fine-tuning usually ask for, to be built beforehand."""
+
+
+class Device(Protocol):
+    """Whatever runs kernels.
+
+    Attributes:
+        kind: torch's name for the type of device that the tensors live on.
+    """
+
+    kind: str
+
+    def launch(
+        self,
+        where: torch.device,
+        source: str,
+        macros: dict[str, int],
+        kernel: str,
+        blocks: int,
+        arguments: ctypes.Structure,
+    ) -> None:
+        """Run a kernel of native/cuda/``source``.cu, compiled with these macros.
+
+        Asynchronous, on the current stream; ``arguments`` is copied before this returns.
+        """
+
+    def capturing(self) -> bool:
+        """Whether the current stream records a graph, so that nothing can be read back."""
+
+
+class _Arena:
+    """Named arrays in one tensor, each at a multiple of 256 bytes."""
+
+    def __init__(self, where: torch.device, **sizes: int) -> None:
+        places, total = {}, 0
+        for name, size in sizes.items():
+            places[name] = total
+            total += -(-size // 256) * 256
+        self.memory = torch.empty(total + 255, dtype=torch.uint8, device=where)
+        first = -self.memory.data_ptr() % 256
+        self._at = {name: first + place for name, place in places.items()}
+
+    def __getitem__(self, name: str) -> int:
+        return self.memory.data_ptr() + self._at[name]
+
+    def tensor(self, name: str, count: int, dtype: torch.dtype) -> Tensor:
+        """An array as a tensor."""
+        return self.memory[self._at[name] :][: count * dtype.itemsize].view(dtype)
+
+
+def _blocks(count: int, per_block: int = THREADS) -> int:
+    return -(-count // per_block)
+
+
+def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
+    """The tensors of a rasterization that gradients can be wanted of, but for thresholds."""
+    splats = inputs.splats
+    names = ["opacities", "colors", "features"]
+    if isinstance(splats, Splats):
+        names += ["means", "scales", "rotations", "cov3d", "sh"]
+    else:
+        names += ["means2d", "conics", "depths"]
+    tensors = {name: getattr(splats, name) for name in names}
+    tensors |= {"hook": inputs.means2d_hook, "background": inputs.view.background}
+    return {name: tensor for name, tensor in tensors.items() if tensor is not None}
+
+
+class Drawing:
+    """One rasterization: a forward pass, what it leaves behind, a backward pass.
+
+    Attributes:
+        image: and the other outputs, as in ``RasterOutputs``.
+        evaluated: lanes spent on (Gaussian, pixel) pairs; NaN until it is read.
+    """
+
+    image: Tensor
+    invdepth: Tensor
+    alpha: Tensor
+    radii: Tensor
+    fragments_per_pixel: Tensor
+    evaluated: float
+    features: Tensor | None = None
+    fragments: Tensor | None = None
+    fragments_per_gaussian: Tensor | None = None
+    weights_per_gaussian: Tensor | None = None
+    wins_per_gaussian: Tensor | None = None
+    winners: Tensor | None = None
+
+    def __init__(self, device: Device, inputs: RasterInputs, thresholds: Tensor | None) -> None:
+        self._device, self._inputs, self._n = device, inputs, len(inputs.splats)
+        self._where = inputs.splats.device
+        view = inputs.view
+        given = {
+            **learnable(inputs),
+            **{name: getattr(view, name) for name in ("viewmatrix", "projmatrix", "campos")},
+            "sample_offsets": inputs.sample_offsets,
+            "thresholds": thresholds,
+            "hook": None,  # its values are not used
+        }
+        self._arrays = {k: plain(t, self._where) for k, t in given.items() if t is not None}
+        if isinstance(inputs.splats, Footprints):
+            self._arrays["tiles"] = plain(inputs.splats.tiles, self._where, torch.int32)
+        offsets = self._arrays.get("sample_offsets")
+        self._spread = None if offsets is None else offsets.abs().amax()
+        self._across, self._down = -(-view.width // TILE), -(-view.height // TILE)
+        self._channels = 0 if inputs.splats.features is None else inputs.splats.features.shape[1]
+
+    # ---- forward -------------------------------------------------------------------------------
+
+    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool, packed: bool) -> int:
+        """Run the forward pass; void when it returns more than the capacity.
+
+        Args:
+            capacity: entries of all tiles' lists that there shall be room for.
+            wanted: gradients that will be wanted.
+            deterministic: give each entry a slot, for backward to add up in order.
+            packed: keep less of each Gaussian, where no gradients are wanted.
+
+        Returns:
+            How many entries there are.
+
+        Raises:
+            EngineError: more entries than can be counted.
+        """
+        inputs, n, where = self._inputs, self._n, self._where
+        height, width = inputs.view.height, inputs.view.width
+        tiles, pixels = self._across * self._down, width * height
+        passes = max(1, _blocks((tiles - 1).bit_length(), 8))
+        keep, slots = bool(wanted), bool(wanted) and deterministic
+        packed = packed and not keep
+        scene = {"FP_PACKED": int(packed)}
+        cleared = _Arena(
+            where,
+            counters=COUNTERS,
+            project_words=8 * _blocks(n),
+            emit_words=8 * _blocks(n),
+            depth_histogram=4 * PASSES * DIGITS,
+            tile_histogram=4 * PASSES * DIGITS,
+            depth_sort=4 * PASSES * DIGITS * _blocks(n, SORT_KEYS),
+            tile_sort=4 * passes * DIGITS * _blocks(capacity, SORT_KEYS),
+            ranges=8 * tiles,
+        )
+        cleared.memory.zero_()
+        scratch = _Arena(
+            where,
+            rects=8 * n,
+            **dict.fromkeys(("depth_keys", "depth_ids", "keys_2", "ids_2"), 4 * n),
+            **dict.fromkeys(("entry_keys", "entry_keys_2", "entry_values_2"), 4 * capacity),
+        )
+        kept = _Arena(
+            where,
+            brushes=4 * (PACKED_BRUSH if packed else BRUSH) * n,
+            tiles=4 * n,
+            first_slot=4 * n * slots,
+            entry_values=4 * capacity,
+            owners=4 * capacity * slots,
+            reached=capacity * keep,
+            transmittance=4 * pixels * keep,
+            stop=4 * pixels * keep,
+        )
+        weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
+        # The last pass of sorting entries shall end in `kept`.
+        keys = [scratch["entry_keys"], scratch["entry_keys_2"]]
+        values = [kept["entry_values"], scratch["entry_values_2"]]
+        if passes % 2:
+            values.reverse()
+        frame = Frame(
+            inputs=self._c_inputs("thresholds" in wanted),
+            outputs=self._new_outputs(),
+            spread=address(self._spread),
+            capacity=capacity,
+            tiles_x=self._across,
+            tiles_y=self._down,
+            tile_passes=passes,
+            counters=cleared["counters"],
+            project_words=cleared["project_words"],
+            emit_words=cleared["emit_words"],
+            depth_histogram=cleared["depth_histogram"],
+            tile_histogram=cleared["tile_histogram"],
+            ranges=cleared["ranges"],
+            brushes=kept["brushes"],
+            rects=scratch["rects"],
+            tiles=kept["tiles"],
+            first_slot=kept["first_slot"] if slots else None,
+            depth_keys=scratch["depth_keys"],
+            depth_ids=scratch["depth_ids"],
+            entry_keys=keys[0],
+            entry_values=values[0],
+            owners=kept["owners"] if slots else None,
+            reached=kept["reached"] if keep else None,
+            transmittance=kept["transmittance"] if keep else None,
+            stop=kept["stop"] if keep else None,
+            weights=address(weights),
+        )
+        counters = cleared["counters"]
+        by_depth = Sort(
+            count=counters,
+            capacity=n,
+            histogram=cleared["depth_histogram"],
+            words=cleared["depth_sort"],
+            ticket=counters + 4 * 8 + 4 * 2,
+        )
+        by_tile = Sort(
+            count=counters + 8,
+            capacity=capacity,
+            histogram=cleared["tile_histogram"],
+            words=cleared["tile_sort"],
+            ticket=counters + 4 * 8 + 4 * (2 + PASSES),
+        )
+        self._launch("scene", scene, "fp_project", _blocks(n), frame)
+        ids = [scratch["depth_ids"], scratch["ids_2"]]
+        self._sort(scene, by_depth, [scratch["depth_keys"], scratch["keys_2"]], ids, PASSES)
+        self._launch("scene", scene, "fp_emit", _blocks(n), frame)
+        if n:
+            self._sort(scene, by_tile, keys, values, passes)
+            frame.entry_keys, frame.entry_values = keys[passes % 2], values[passes % 2]
+            self._launch("scene", scene, "fp_ranges", _blocks(capacity), frame)
+        macros = blend_macros(
+            self._channels, counts=inputs.counts, scores=inputs.scores, packed=packed
+        )
+        self._launch("blend", macros, "fp_blend", tiles, frame)
+        found = cleared.tensor("counters", 4, torch.int64)
+        self.fragments_per_pixel = (found[2].double() / pixels).float()
+        if weights is not None:
+            self.weights_per_gaussian = (weights.double() * 2.0**-32).float()
+        self._frame = frame if keep else None
+        self._memory = (cleared, kept)
+        self._found = found
+        if self._device.capturing():
+            self.evaluated = math.nan
+            return 0
+        return self.read()
+
+    def read(self) -> int:
+        """Waits for the GPU; entries of the lists.
+
+        Raises:
+            EngineError: what the kernels could not draw.
+        """
+        _, entries, _, self.evaluated = map(int, self._found.tolist())
+        if entries > ENTRIES_MAX:
+            raise EngineError(
+                "engine 'cuda'",
+                f"{entries} entries in the tiles' lists",
+                f"at most {ENTRIES_MAX}",
+                "Draw fewer Gaussians or a smaller image.",
+            )
+        if self._spread is not None and not float(self._spread) <= OFFSET_MAX:
+            raise EngineError(
+                "engine 'cuda'",
+                f"sample_offsets up to {float(self._spread)}",
+                f"at most {OFFSET_MAX:g} pixels",
+                "Check the offsets.",
+            )
+        return entries
+
+    def _c_inputs(self, widen: bool) -> binding.Inputs:
+        inputs, view = self._inputs, self._inputs.view
+        sh = self._arrays.get("sh")
+        return binding.Inputs(
+            width=view.width,
+            height=view.height,
+            tan_fov_x=view.tan_fov_x,
+            tan_fov_y=view.tan_fov_y,
+            scale_modifier=inputs.scale_modifier,
+            dilation=inputs.dilation,
+            near=inputs.near,
+            alpha_max=inputs.alpha_max,
+            compensation=get_args(Compensation).index(inputs.compensation),
+            cap_gradient=inputs.cap_gradient,
+            absolute_gradient=inputs.absolute_gradient,
+            sh_degree=inputs.splats.sh_degree if isinstance(inputs.splats, Splats) else 0,
+            sh_coefficients=0 if sh is None else sh.shape[1],
+            feature_count=self._channels,
+            widen=widen,
+            count=self._n,
+            **{name: address(array) for name, array in self._arrays.items()},
+        )
+
+    def _new_outputs(self) -> binding.Outputs:
+        """Makes the output tensors; their addresses."""
+        inputs, n = self._inputs, self._n
+        size = (inputs.view.height, inputs.view.width)
+
+        def new(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.empty(shape, dtype=dtype, device=self._where)
+
+        def zeros() -> Tensor:
+            return torch.zeros(n, dtype=torch.int32, device=self._where)
+
+        self.image, self.invdepth, self.alpha = new(3, *size), new(1, *size), new(1, *size)
+        self.radii = new(n, dtype=torch.int32)
+        if self._channels:
+            self.features = new(self._channels, *size)
+        if inputs.counts:
+            self.fragments, self.fragments_per_gaussian = new(*size, dtype=torch.int32), zeros()
+        if inputs.scores:
+            self.winners, self.wins_per_gaussian = new(*size, dtype=torch.int32), zeros()
+        names = "image invdepth alpha radii features fragments fragments_per_gaussian"
+        names += " wins_per_gaussian winners"
+        return binding.Outputs(**{name: address(getattr(self, name)) for name in names.split()})
+
+    def _sort(
+        self,
+        scene: dict[str, int],
+        arguments: Sort,
+        keys: list[int],
+        values: list[int],
+        passes: int,
+    ) -> None:
+        """Sorts by 8 bits a pass, to and fro between two pairs of arrays."""
+        blocks = _blocks(arguments.capacity, SORT_KEYS)
+        for k in range(passes):
+            arguments.keys, arguments.sorted_keys = keys[k % 2], keys[1 - k % 2]
+            arguments.values, arguments.sorted_values = values[k % 2], values[1 - k % 2]
+            self._launch("scene", scene, "fp_sort", blocks, arguments)
+            arguments.shift += 8
+            arguments.histogram += 4 * DIGITS
+            arguments.words += 4 * DIGITS * blocks
+            arguments.ticket += 4
+
+    def _launch(
+        self,
+        source: str,
+        macros: dict[str, int],
+        kernel: str,
+        blocks: int,
+        arguments: ctypes.Structure,
+    ) -> None:
+        if blocks:
+            self._device.launch(
+                self._where, source, {**MACROS, **macros}, kernel, blocks, arguments
+            )
+
+    # ---- backward ------------------------------------------------------------------------------
+
+    def undraw(
+        self,
+        wanted: Wanted,
+        by_image: Tensor | None,
+        by_invdepth: Tensor | None,
+        by_alpha: Tensor | None,
+        by_features: Tensor | None,
+        by_fragments: Tensor | None,
+    ) -> dict[str, Tensor]:
+        """Run the backward pass for gradients by the outputs; gradients by the inputs, by name."""
+        assert self._frame is not None
+        inputs, frame, n, where = self._inputs, self._frame, self._n, self._where
+        upstream = {
+            "image": by_image,
+            "invdepth": by_invdepth,
+            "alpha": by_alpha,
+            "features": by_features,
+            "fragments": by_fragments,
+        }
+        by = {k: plain(g, where) for k, g in upstream.items() if g is not None}
+        macros = unblend_macros(
+            wanted,
+            sh_turns="sh" in self._arrays and frame.inputs.sh_degree > 0,
+            invdepth="invdepth" in by,
+            absolute=inputs.absolute_gradient,
+            offsets=self._spread is not None,
+            features=self._channels if "features" in by else 0,
+        )
+        sums = 1 + sum(macros[f"FP_{k}"] for k in ("THRESHOLD", "DEPTH", "ABSOLUTE", "FEATURES"))
+        sums += 5 * macros["FP_GEOMETRY"] + 3 * macros["FP_COLOUR"]
+        tiles = self._across * self._down
+        shapes = {name: array.shape for name, array in self._arrays.items()}
+        shapes["hook"] = torch.Size((n, 3))
+        grads = {name: torch.empty(shapes[name], device=where) for name in wanted - {"background"}}
+        by_tile = torch.empty(tiles, 3, device=where) if "background" in wanted else None
+        per_gaussian = n > 0 and bool(grads)
+        rows = frame.capacity if frame.owners else n
+        room = torch.zeros(rows * sums, device=where) if per_gaussian else None
+        if "features" in grads and "features" not in by:
+            grads["features"].zero_()
+        arguments = Undraw(
+            frame=frame,
+            by=binding.OutputGrads(
+                **{k: address(by.get(k)) for k in ("image", "invdepth", "alpha", "features")}
+            ),
+            to=binding.InputGrads(**{name: address(grad) for name, grad in grads.items()}),
+            by_fragments=address(by.get("fragments")),
+            background=address(by_tile),
+            sums=address(room),
+            ceiling=math.inf if inputs.cap_gradient else inputs.alpha_max,
+        )
+        self._launch("unblend", macros, "fp_unblend", tiles, arguments)
+        if per_gaussian:
+            self._launch("unblend", macros, "fp_chain", _blocks(n), arguments)
+        if by_tile is not None:
+            grads["background"] = by_tile.sum(0, dtype=torch.float64).float()
+        return grads
+
+
+@dataclass(frozen=True)
+class KernelBlade:
+    """Cuts Gaussians in space and time on a device; see ``engines.slicing``."""
+
+    device: Device
+    where: torch.device
+
+    def empty(self, *shape: int) -> Tensor:
+        """Memory for float32."""
+        return torch.empty(shape, device=self.where)
+
+    def slice(self, given: binding.Spacetime, to: binding.Sliced) -> None:
+        """Launch fp_slice."""
+        self._launch("fp_slice", Slicing(given=given, sliced=to))
+
+    def unslice(
+        self, given: binding.Spacetime, by: binding.Sliced, to: binding.SpacetimeGrads
+    ) -> None:
+        """Launch fp_unslice."""
+        self._launch("fp_unslice", Slicing(given=given, sliced=by, to=to))
+
+    def _launch(self, kernel: str, arguments: Slicing) -> None:
+        if blocks := _blocks(arguments.given.count):
+            self.device.launch(self.where, "slice", MACROS, kernel, blocks, arguments)

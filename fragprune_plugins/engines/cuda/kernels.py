@@ -1,0 +1,367 @@
+"""Compiles the GPU's kernels when they are first used, and keeps what came of it.
+
+The compiler is NVRTC, the copy that torch's own wheels bring, reached through ``cuda.bindings``; or
+nvcc, where one is on the path. Neither Python's nor torch's headers are involved.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from fragprune_plugins import native
+
+ENVIRONMENT: Final = "FRAGPRUNE_CUDA"
+"""Set to off, nvrtc or nvcc to override the choice of compiler."""
+
+CACHE: Final = "FRAGPRUNE_CACHE"
+"""Names a folder for compiled kernels, instead of the platform's cache folder."""
+
+SOURCES: Final = Path(native.__file__).parent / "cuda"
+
+OLDEST: Final = 75
+"""Compute capability, major times ten plus minor: warps' matching and independent lanes."""
+
+_OPTIONS: Final = ("-std=c++17", "-fmad=false")
+"""Nothing is contracted but what is spelled out: see native/cuda/numbers.cuh."""
+
+_STDINT: Final = b"""
+typedef signed char int8_t; typedef unsigned char uint8_t;
+typedef short int16_t; typedef unsigned short uint16_t;
+typedef int int32_t; typedef unsigned int uint32_t;
+typedef long long int64_t; typedef unsigned long long uint64_t;
+"""
+
+
+class Unavailable(Exception):  # noqa: N818 - a state of this machine, reported by describe()
+    """Kernels cannot be compiled here; the message says why."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """A compiled source.
+
+    Attributes:
+        code: machine code, or PTX that the driver compiles further.
+        log: what the compiler said; resources among it.
+    """
+
+    code: bytes
+    log: str
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a kernel needs of a multiprocessor.
+
+    Attributes:
+        registers: per thread.
+        stack: bytes of local memory per thread; arrays that found no registers.
+        spills: bytes stored to local memory and loaded again.
+        shared: bytes of shared memory per block.
+    """
+
+    registers: int
+    stack: int
+    spills: int
+    shared: int
+
+
+class Compiler(Protocol):
+    """A way from source to image.
+
+    Attributes:
+        name: nvrtc or nvcc.
+        version: of the toolkit.
+        architectures: compute capabilities that it makes machine code for, ascending.
+    """
+
+    name: str
+    version: str
+    architectures: tuple[int, ...]
+
+    def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
+        """Compile native/cuda/``source``.cu for a target like sm_90 or compute_90."""
+
+
+class Nvrtc:
+    """The run-time compiler, a shared library."""
+
+    name = "nvrtc"
+
+    def __init__(self) -> None:
+        try:
+            from cuda.bindings import nvrtc
+        except ImportError as error:
+            raise Unavailable(f"cuda-bindings is not installed ({error})") from error
+        self._nvrtc: Any = nvrtc
+        try:
+            major, minor = self._call("nvrtcVersion")
+            found = self._call("nvrtcGetSupportedArchs")[0]
+        except Unavailable:
+            raise
+        except Exception as error:  # of several types, by version: the library cannot be found
+            raise Unavailable(f"no NVRTC library: {error}") from error
+        self.version = f"{major}.{minor}"
+        self.architectures = tuple(sorted(int(a) for a in found if a >= OLDEST))
+
+    def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
+        """As the protocol says.
+
+        Raises:
+            Unavailable: it does not compile; the message has the log.
+        """
+        text = (SOURCES / f"{source}.cu").read_bytes()
+        program = self._call(
+            "nvrtcCreateProgram", text, f"{source}.cu".encode(), 1, [_STDINT], [b"stdint.h"]
+        )[0]
+        options = [
+            *(option.replace("-std", "--std").replace("-fmad", "--fmad") for option in _OPTIONS),
+            *(f"-D{name}={value}" for name, value in macros.items()),
+            f"--gpu-architecture={target}",
+            f"--include-path={SOURCES}",
+            "--device-as-default-execution-space",
+            "--ptxas-options=-v",
+        ]
+        try:
+            failure = None
+            try:
+                encoded = [option.encode() for option in options]
+                self._call("nvrtcCompileProgram", program, len(encoded), encoded)
+            except Unavailable as error:
+                failure = error
+            log = self._text(program, "nvrtcGetProgramLogSize", "nvrtcGetProgramLog")
+            if failure is not None:
+                raise Unavailable(f"{source}.cu for {target}: {failure}\n{log.decode()}")
+            what = "CUBIN" if target.startswith("sm_") else "PTX"
+            code = self._text(program, f"nvrtcGet{what}Size", f"nvrtcGet{what}")
+        finally:
+            self._call("nvrtcDestroyProgram", program)
+        return Image(code, log.decode(errors="replace").rstrip("\0 \n"))
+
+    def _text(self, program: Any, size: str, get: str) -> bytes:
+        buffer = bytes(self._call(size, program)[0])
+        self._call(get, program, buffer)
+        return buffer
+
+    def _call(self, function: str, *arguments: Any) -> tuple[Any, ...]:
+        status, *results = getattr(self._nvrtc, function)(*arguments)
+        if int(status) != 0:
+            raise Unavailable(f"{function}: {status.name}")
+        return tuple(results)
+
+
+class Nvcc:
+    """The toolkit's compiler, a program."""
+
+    name = "nvcc"
+
+    def __init__(self) -> None:
+        path = shutil.which("nvcc")
+        if path is None:
+            raise Unavailable("no nvcc on the path")
+        self._path = path
+        found = re.search(r"release (\d+\.\d+)", self._run("--version").stdout)
+        if found is None:
+            raise Unavailable(f"{path} does not say its version")
+        self.version = found.group(1)
+        listed = self._run("--list-gpu-arch").stdout
+        codes = {int(code) for code in re.findall(r"compute_(\d+)\b", listed)}
+        self.architectures = tuple(sorted(code for code in codes if code >= OLDEST))
+
+    def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
+        """As the protocol says.
+
+        Raises:
+            Unavailable: it does not compile; the message has the log.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "image"
+            done = self._run(
+                *_OPTIONS,
+                *(f"-D{name}={value}" for name, value in macros.items()),
+                "-cubin" if target.startswith("sm_") else "-ptx",
+                f"-arch={target}",
+                "-Xptxas=-v",
+                *("-o", str(out), str(SOURCES / f"{source}.cu")),
+            )
+            if done.returncode or not out.is_file():
+                raise Unavailable(f"{source}.cu for {target}: {done.stderr}")
+            return Image(out.read_bytes(), done.stderr)
+
+    def _run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [self._path, *arguments]
+        try:
+            return subprocess.run(command, capture_output=True, text=True, check=False)
+        except OSError as error:
+            raise Unavailable(f"{self._path} cannot be run: {error}") from error
+
+
+_COMPILERS: Final[dict[str, Callable[[], Compiler]]] = {"nvrtc": Nvrtc, "nvcc": Nvcc}
+
+
+@cache
+def _choose(wanted: str) -> Compiler | str:
+    """The compiler, or why there is none."""
+    if wanted in ("off", "0"):
+        return f"switched off by {ENVIRONMENT}={wanted}"
+    if wanted and wanted not in _COMPILERS:
+        return f"{ENVIRONMENT}={wanted} is none of {', '.join(['off', *_COMPILERS])}"
+    reasons = []
+    for name in [wanted] if wanted else _COMPILERS:
+        try:
+            return _COMPILERS[name]()
+        except Unavailable as why:
+            reasons.append(str(why))
+    return "; ".join(reasons)
+
+
+def compiler() -> Compiler:
+    """The compiler to use, decided once for each value of the environment.
+
+    Raises:
+        Unavailable: there is none; the message says why.
+    """
+    answer = _choose(os.environ.get(ENVIRONMENT, "").strip().lower())
+    if isinstance(answer, str):
+        raise Unavailable(answer)
+    return answer
+
+
+def target_of(capability: int, architectures: tuple[int, ...]) -> str:
+    """What to compile for: machine code where the toolkit knows the GPU, else PTX for an older one.
+
+    Args:
+        capability: of the GPU, major times ten plus minor.
+        architectures: that the toolkit knows.
+
+    Raises:
+        Unavailable: older than anything that can run the kernels.
+    """
+    if capability in architectures:
+        return f"sm_{capability}"
+    older = [code for code in architectures if code <= capability]
+    if not older:
+        raise Unavailable(
+            f"compute capability {capability / 10} is older than "
+            f"{min(architectures, default=OLDEST) / 10}"
+        )
+    return f"compute_{max(older)}"
+
+
+# ---- what was compiled before ------------------------------------------------------------------
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: $FRAGPRUNE_CACHE, or the platform's cache folder."""
+    named = os.environ.get(CACHE, "")
+    if named:
+        return Path(named)
+    try:
+        from platformdirs import user_cache_path
+    except ImportError:  # without the extra: nvcc alone needs none of it
+        return Path.home() / ".cache" / "fragprune" / "kernels"
+    return user_cache_path("fragprune") / "kernels"
+
+
+@cache
+def digest_of_sources() -> bytes:
+    """Of everything that kernels may include."""
+    digest = hashlib.sha256()
+    parent = SOURCES.parent
+    for folder in ("cuda", "cpu", "include"):
+        for path in sorted((parent / folder).iterdir()):
+            if path.suffix in (".cu", ".cuh", ".h"):
+                digest.update(f"{path.name}\0".encode() + path.read_bytes())
+    return digest.digest()
+
+
+def _name_of(by: Compiler, source: str, macros: dict[str, int], target: str) -> str:
+    what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
+    digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]
+    return f"{source}-{target}-{digest}"
+
+
+def image_of(
+    source: str, macros: dict[str, int], target: str, by: Compiler | None = None
+) -> tuple[Image, bool]:
+    """A compiled source, and whether it was there already.
+
+    Processes that want the same at the same time wait for the first of them. Where the folder
+    cannot be written, nothing is kept.
+
+    Args:
+        source: a name in native/cuda, without .cu.
+        macros: to define.
+        target: sm_90 for machine code, compute_90 for PTX.
+        by: the compiler; ``compiler()`` when None.
+
+    Raises:
+        Unavailable: no compiler, or it does not compile.
+    """
+    by = compiler() if by is None else by
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return by.compile(source, macros, target), False
+    from filelock import FileLock, Timeout
+
+    path = folder / f"{_name_of(by, source, macros, target)}.bin"
+    try:
+        with FileLock(f"{path}.lock", timeout=300):
+            kept = _read(path)
+            if kept is not None:
+                return kept, True
+            image = by.compile(source, macros, target)
+            _write(path, image)
+            return image, False
+    except (OSError, Timeout):  # read-only, or held by a process that hangs
+        return by.compile(source, macros, target), False
+
+
+def _read(path: Path) -> Image | None:
+    """An image that was kept; None when there is none, or it is damaged."""
+    try:
+        digest, log_size, rest = path.read_bytes().split(b"\n", 2)
+    except (OSError, ValueError):
+        return None
+    if hashlib.sha256(rest).hexdigest().encode() != digest:
+        return None
+    size = int(log_size)
+    return Image(rest[size:], rest[:size].decode())
+
+
+def _write(path: Path, image: Image) -> None:
+    """Keeps an image; readers see all of it or nothing."""
+    log = image.log.encode()
+    rest = log + image.code
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        file.write(f"{hashlib.sha256(rest).hexdigest()}\n{len(log)}\n".encode() + rest)
+    os.replace(file.name, path)
+
+
+def resources(log: str) -> dict[str, Resources]:
+    """What each kernel needs, as ptxas -v reported it."""
+    found = {}
+    for part in re.split(r"Compiling entry function '", log)[1:]:
+        name = part.split("'", 1)[0]
+        stack, stores, loads = re.findall(r"(\d+) bytes (?:stack|spill)", part)[:3]
+        registers = re.search(r"Used (\d+) registers", part)
+        shared = re.search(r"(\d+) bytes smem", part)
+        found[name] = Resources(
+            registers=int(registers.group(1)) if registers else 0,
+            stack=int(stack),
+            spills=int(stores) + int(loads),
+            shared=int(shared.group(1)) if shared else 0,
+        )
+    return found

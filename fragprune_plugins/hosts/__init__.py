@@ -1,0 +1,6 @@
+"""What a host is: its source read without importing it, the adapter that describes it.
+
+source    reads a checkout              findings  what reading brings to light
+seams     where a host is entered       adapter   what every adapter says of its host
+choosing  which adapter fits            graphdeco what all descendants of 3DGS share
+"""

@@ -1,0 +1,414 @@
+"""What an adapter is: a description of one host. Patching and un-patching are the session's."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from fragprune_plugins.hosts.findings import Finding, Match
+from fragprune_plugins.hosts.seams import Seam
+from fragprune_plugins.hosts.source import HostRepo, check_seams
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.storage.ply import SplatFile
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+
+@dataclass(frozen=True)
+class HostInfo:
+    """Who the host is, for people.
+
+    Attributes:
+        title: the method's name.
+        repo: owner/name of its public repository.
+        states: the revisions this adapter was written for.
+        limits: what will not work with this host, or is refused; a sentence each.
+    """
+
+    title: str
+    repo: str
+    states: str = ""
+    limits: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class HostCall:
+    """The host's call of its rasterizer as data: positional or keyword, no matter.
+
+    Attributes:
+        settings: what the host configured its rasterizer with.
+        arguments: of the call, by name.
+        entry: the function called, "module:attribute" as seams spell it.
+    """
+
+    settings: Any
+    arguments: Mapping[str, Any]
+    entry: str = ""
+
+    @classmethod
+    def bind(
+        cls,
+        function: Callable[..., Any],
+        settings: Any,
+        args: Sequence[Any],
+        kwargs: dict[str, Any],
+        entry: str = "",
+    ) -> HostCall:
+        """Name every argument by the function's signature; what it takes as ``**more`` as given."""
+        bound = inspect.signature(function).bind(*args, **kwargs)
+        bound.apply_defaults()
+        named = bound.arguments
+        return cls(settings, named | named.get("more", {}), entry)
+
+    def get(self, name: str) -> Tensor | None:
+        """A tensor argument; None when it is absent, None or empty (hosts pass all three)."""
+        value: Tensor | None = self.arguments.get(name)
+        return None if value is None or value.numel() == 0 else value
+
+    def __getitem__(self, name: str) -> Tensor:
+        value: Tensor = self.arguments[name]
+        return value
+
+
+@dataclass
+class RowTrace:
+    """Where rows came from, once a host has rearranged them.
+
+    Attributes:
+        origins: (M,) int64, for each row of the model as it is now, the row it was or was copied
+            from; None where nothing happened.
+        fresh: (M,) bool, True for rows that are new Gaussians or were made over.
+    """
+
+    origins: Tensor | None = None
+    fresh: Tensor | None = None
+
+
+class Dialect(ABC):
+    """A host's rasterizer call contract, for one revision of the host."""
+
+    means: ClassVar[str] = "means3D"
+    """What the call names the (N, 3) means."""
+
+    @abstractmethod
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """The host's call as core values."""
+
+    @abstractmethod
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
+        """What the host expects back, arity and all."""
+
+    def answer(
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
+    ) -> Any:
+        """Draw and pack; a dialect may draw several times where one picture does not say it all.
+
+        Args:
+            call: the host's.
+            inputs: what ``unpack`` made of it.
+            draw: rasterizes inputs, with the thresholds that apply to this call; where one call
+                is of several cameras, a second argument numbers them from 0.
+        """
+        return self.pack(draw(inputs), call)
+
+    @abstractmethod
+    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
+        """Stand-ins for the host's compiled packages, by import name.
+
+        Args:
+            draw: answers a host call without thresholds.
+        """
+
+    def stands_in(self, call: HostCall) -> bool:
+        """Whether ours must answer a call because the host's own function could not."""
+        return False
+
+    def present(self, package: str) -> bool:
+        """Whether the host can import this compiled package of its own here."""
+        try:
+            return find_spec(package) is not None
+        except ValueError:  # a module without a spec is a stand-in somebody else put there
+            return True
+
+    def spares(self) -> dict[str, ModuleType]:
+        """Stand-ins for what the host imports and can do without, used on a CPU where absent."""
+        return {}
+
+
+@dataclass(frozen=True)
+class ConfigFile:
+    """A file whose values win over a host's command line; JSON, one object.
+
+    Attributes:
+        flag: that names it.
+    """
+
+    flag: str
+
+    def read(self, path: Path) -> dict[str, Any]:
+        """Values by argument name; OSError or ValueError where there is nothing to be read."""
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return values
+
+    def overrule(self, text: str, values: dict[str, Any]) -> str:
+        """The file's text with these values in place of its own."""
+        return json.dumps(json.loads(text) | values)
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """How a host's training script is told what we need to tell it.
+
+    Attributes:
+        scripts: paths of training scripts in the checkout, the usual one first; others (render.py)
+            only get thresholds applied.
+        iterations: flag, or its several spellings, of the total number of iterations.
+        output: flags of the output folder.
+        source: flags of the data folder.
+        save_checkpoints: flag listing iterations to checkpoint at.
+        resume: flag, or its several spellings, naming the file to resume from.
+        default_iterations: of the host, read from its source.
+        continues: those of the scripts that work on a checkpoint they are given: where ``resume``
+            names one it is stage 1's, not ours to start stage 2 from.
+        config: the file whose values the host puts over its command line, where it has one.
+        checkpoints_only: no other file holds the model, so every stage asks for a last one.
+        skipped: iterations that a run, fresh or resumed, counts and does not execute.
+        restarts: there are no checkpoints: ``resume`` names a model's PLY, from which a new run
+            begins. It counts from 0 and empties its output folder, so stage 2 gets one of its own.
+    """
+
+    scripts: tuple[str, ...]
+    iterations: str | tuple[str, ...]
+    output: tuple[str, ...]
+    source: tuple[str, ...]
+    save_checkpoints: str
+    resume: str | tuple[str, ...]
+    default_iterations: int
+    continues: tuple[str, ...] = ()
+    config: ConfigFile | None = None
+    checkpoints_only: bool = False
+    skipped: int = 0
+    restarts: bool = False
+
+    def spellings(self, field: str) -> tuple[str, ...]:
+        """Every spelling of a flag, the one to use last."""
+        flags = getattr(self, field)
+        return (flags,) if isinstance(flags, str) else flags
+
+
+class HostAdapter(ABC):
+    """Describes one host: what identifies it, where to wrap, how its tensors are named.
+
+    Subclasses are stateless; what depends on the revision comes from a ``HostRepo``.
+    """
+
+    name: str
+    info: HostInfo
+    seams: tuple[Seam, ...]
+    installed: tuple[str, ...] = ()
+    """Import names of the packages that are the host, where it is installed, not checked out."""
+    steps_by_rendering = False
+    """The host does not call the STEP seam in every iteration: where it did not, the first view
+    that it draws with gradients begins the step."""
+    gradients_read: frozenset[str] = frozenset()
+    """Param groups whose gradient the host reads in every iteration: frozen, they get zeros."""
+
+    def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
+        """The seams of this revision; all of ``seams`` unless a host says otherwise."""
+        return self.seams
+
+    @abstractmethod
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """What the source says about being this host; an error finding means it is not."""
+
+    def match(self, repo: HostRepo) -> Match:
+        """Fingerprint and seams together."""
+        findings = [*self.fingerprint(repo), *check_seams(repo, self.seams_for(repo))]
+        fits = not any(finding.level == "error" for finding in findings)
+        return Match(self.name, "known" if fits else "none", tuple(findings))
+
+    @abstractmethod
+    def dialect(self, repo: HostRepo) -> Dialect:
+        """The rasterizer's call contract in this revision."""
+
+    @abstractmethod
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """How to drive the host's training script."""
+
+    def use(self, repo: HostRepo) -> str:
+        """What a user of this host types, for people to read."""
+        script = self.command_line(repo).scripts[0]
+        if not repo.package:
+            return f"fragprune run -- python {repo.root / script} ..."
+        module = script.removesuffix(".py").replace("/", ".")
+        return f"fragprune run -- python -m {module} ..."
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """The command that can resume what a training script left; the same one by default."""
+        return script, arguments
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+        """How the finished model of a training command is drawn, beyond vanilla's rules.
+
+        Returns:
+            Fields of ``RasterInputs``; None where no held-out view is left, or the command asks
+            for what our own readers would draw or read otherwise.
+        """
+        return None
+
+    def read_model(self, ply: Path) -> SplatFile:
+        """The host's own PLY."""
+        from fragprune_plugins.storage.ply import read_ply
+
+        return read_ply(ply)
+
+    def view(self, camera: Any) -> int:
+        """Tells training views apart; by the object, unless a host draws through copies."""
+        return id(camera)
+
+    @abstractmethod
+    def rows(self, model: Any) -> int:
+        """How many Gaussians the model holds."""
+
+    @abstractmethod
+    def means(self, model: Any) -> Tensor:
+        """(N, 3) the tensor the host hands its rasterizer: identifies the model."""
+
+    @abstractmethod
+    def opacities(self, model: Any) -> Tensor:
+        """(N,) activated opacities."""
+
+    def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
+        """Rows (M,) int64 of the model that a rasterizer call draws, in its order; None for all.
+
+        Raises:
+            AlignmentError: the call's Gaussians cannot be told to be those rows.
+        """
+        return None
+
+    def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
+        """The model that a seam's call is about: what the method was called on, unless a host has
+        trainers, or functions, that change models.
+
+        The tensor of its means will do where a call has no more; None where it is of no concern.
+        """
+        return instance
+
+    @abstractmethod
+    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
+        """The host's optimizers of a model, the main one first.
+
+        Args:
+            model: that is trained.
+            arguments: of the ATTACH seam's call, which is over, "self" among them.
+        """
+
+    def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
+        """What a param group is called in ``trained_groups``; None for one without a name."""
+        return group.get("name")
+
+    @abstractmethod
+    def trained_groups(self, train: str) -> frozenset[str] | None:
+        """Names of param groups that stage 2 trains for ``--train``; None for all of them."""
+
+    def elsewhere(self, model: Any) -> list[Tensor]:
+        """Parameters moved by an optimizer that is out of our reach; frozen as the rest is."""
+        return []
+
+    def _lacks(self, method: str, reason: str) -> NotImplementedError:
+        return NotImplementedError(f"{type(self).__name__}.{method}: needed for {reason}")
+
+    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
+        """Rows that a densify method is about to copy, one per row it will append, in order."""
+        raise self._lacks("parents", "PARENTS seams")
+
+    def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
+        """Whether appended rows are copies of those parents; asked before they are appended."""
+        raise self._lacks("check_children", "PARENTS and COPY seams")
+
+    def stand_still(self, wrapped: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+        """What a STILL seam returns in stage 2 in place of the host's call, which is not made."""
+        return None
+
+    @contextmanager
+    def tracing(
+        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
+    ) -> Iterator[RowTrace]:
+        """Around the call of a REARRANGE seam: have the host's own code carry row numbers along.
+
+        Args:
+            model: whose rows change.
+            wrapped: the host's function.
+            arguments: of the call.
+
+        Yields:
+            The trace; it must be complete once the block is left.
+        """
+        raise self._lacks("tracing", "a REARRANGE seam")
+        yield
+
+    def file_at(self, method: str, path: Path) -> Path:
+        """The file that a SAVE or LOAD seam's path stands for: some hosts leave endings out.
+
+        Args:
+            method: the seam's function, without its class.
+            path: as the host passed it.
+        """
+        return path
+
+    def packed(self, arguments: Mapping[str, Any], result: Any) -> tuple[Path, Tensor] | None:
+        """The file that a PACK seam's call has written or an UNPACK seam's has read.
+
+        Args:
+            arguments: of the call, by name.
+            result: that it returned.
+
+        Returns:
+            The path and the means (M, 3) that are in it, in its order and bit for bit the model's;
+            None where the call was about something else.
+        """
+        return None
+
+    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
+        """The dict inside the host's checkpoint tuple that tolerates a key of ours."""
+        raise self._lacks("checkpoint_state", "CAPTURE and RESTORE seams")
+
+    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
+        """Write a checkpoint the host can resume from, made from its PLY."""
+        raise self._lacks("checkpoint_from_ply", "checkpoints")
+
+    def before_restore(self, model: Any, capture: Any) -> Any:
+        """A chance to complete a checkpoint that lacks something; returns it."""
+        return capture
+
+    def still_rate(self, rate: Any) -> Any:
+        """What the STEP seam tells the host in stage 2; a host that makes noise of it gets none."""
+        return rate
+
+    def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
+        """A chance to bring back state that the host's own resume loses."""
+
+    def save_model(self, model: Any, output: Path, iteration: int) -> Path:
+        """Have the host save its model as it would at this iteration; returns the file."""
+        path = self.model_file(output, iteration)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        model.save_ply(str(path))
+        return path
+
+    def model_file(self, output: Path, iteration: int) -> Path:
+        """Where the host saves its model at an iteration."""
+        raise self._lacks("model_file", "a training script")
+
+    def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
+        """Resumable files in an output folder, (iteration, checkpoint or PLY), oldest first."""
+        raise self._lacks("saved_iterations", "a training script")

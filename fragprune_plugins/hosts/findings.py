@@ -1,0 +1,43 @@
+"""What reading a host brings to light: findings, and how well an adapter fits."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing noticed about a host or an undone patch, fit to print and to serialise."""
+
+    level: Literal["info", "warning", "error"]
+    code: str
+    where: str
+    found: str
+    expected: str = ""
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        parts = [f"[{self.code}] {self.where}: {self.found}"]
+        if self.expected:
+            parts.append(f"expected {self.expected}")
+        return "; ".join(parts) + (f". {self.remedy}" if self.remedy else "")
+
+    def as_dict(self) -> dict[str, str]:
+        """Plain values, for ``--json``."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Match:
+    """How well one adapter fits one folder, and why."""
+
+    adapter: str
+    confidence: Literal["known", "none"]
+    findings: tuple[Finding, ...] = ()
+    details: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def fits(self) -> bool:
+        """True when every seam holds and nothing speaks against it."""
+        return self.confidence != "none"

@@ -1,0 +1,6 @@
+"""What all descendants of the 2023 3DGS training code share."""
+
+from fragprune_plugins.hosts.graphdeco.adapter import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco.contract import Contract
+
+__all__ = ["Contract", "GraphdecoAdapter", "GraphdecoDialect"]

@@ -1,0 +1,374 @@
+"""The lineage's adapter base: model seams, optimizer groups, row order, files, rasterizer call."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.hosts.adapter import CommandLine, Dialect, HostAdapter, HostCall
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco.contract import Contract, read_calls
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.source import HostRepo
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
+
+GROUPS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+"""Names and order of the host optimizer's param groups; load_state_dict matches by position."""
+
+
+def _model(role: Role, method: str, *needs: str) -> Seam:
+    return Seam(role, MODEL, f"GaussianModel.{method}", needs)
+
+
+MODEL_SEAMS: tuple[Seam, ...] = (
+    Seam(Role.SCENE, "scene", "Scene.__init__", ("args", "gaussians")),
+    _model(Role.ATTACH, "training_setup", "training_args"),
+    _model(Role.STEP, "update_learning_rate", "iteration"),
+    _model(Role.PARENTS, "densify_and_clone", "grads", "grad_threshold", "scene_extent"),
+    _model(Role.PARENTS, "densify_and_split", "grads", "grad_threshold", "scene_extent", "N"),
+    _model(Role.KEEP, "_prune_optimizer", "mask"),
+    _model(Role.APPEND, "cat_tensors_to_optimizer", "tensors_dict"),
+    _model(Role.STILL, "densify_and_prune"),
+    _model(Role.STILL, "reset_opacity"),
+    _model(Role.STILL, "oneupSHdegree"),
+    _model(Role.SAVE, "save_ply", "path"),
+    _model(Role.LOAD, "load_ply", "path"),
+    _model(Role.CAPTURE, "capture"),
+    _model(Role.RESTORE, "restore", "model_args", "training_args"),
+)
+
+
+@dataclass(frozen=True)
+class GraphdecoDialect(Dialect):
+    """The call contract of diff_gaussian_rasterization and its forks.
+
+    Attributes:
+        package: import name of the rasterizer.
+        settings: field names of GaussianRasterizationSettings, as this revision passes them.
+        outputs: arity of what the host unpacks: 2 (colour, radii) or 3 (and inverse depth).
+        sparse_adam: the revision looks for SparseGaussianAdam in the package.
+    """
+
+    package: str
+    settings: tuple[str, ...]
+    outputs: int
+    sparse_adam: bool = False
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Matrices are already transposed for row vectors, as the core wants them."""
+        import torch
+
+        from fragprune_plugins.types import RasterInputs, Splats, View
+
+        s = call.settings
+        sh, dc = call.get("shs"), call.get("dc")
+        if dc is not None:  # the accelerated rasterizer takes the constant band on its own
+            sh = dc if sh is None else torch.cat([dc, sh], dim=1)
+        return RasterInputs(
+            view=View(
+                width=int(s.image_width),
+                height=int(s.image_height),
+                tan_fov_x=float(s.tanfovx),
+                tan_fov_y=float(s.tanfovy),
+                viewmatrix=s.viewmatrix,
+                projmatrix=s.projmatrix,
+                campos=s.campos,
+                background=s.bg,
+            ),
+            splats=Splats(
+                means=call["means3D"],
+                opacities=call["opacities"].reshape(-1),
+                scales=call.get("scales"),
+                rotations=call.get("rotations"),
+                cov3d=call.get("cov3D_precomp"),
+                sh=sh,
+                colors=call.get("colors_precomp"),
+                sh_degree=0 if sh is None else int(s.sh_degree),
+            ),
+            means2d_hook=call.get("means2D"),
+            scale_modifier=float(s.scale_modifier),
+            compensation="antialiasing" if getattr(s, "antialiasing", False) else "none",
+        )
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
+        """(colour (3, H, W), radii (P,) int32) or, with it, inverse depth (1, H, W)."""
+        return (outputs.image, outputs.radii, outputs.invdepth)[: self.outputs]
+
+    def present(self, package: str) -> bool:
+        """A rasterizer that is a module of the host is compiled when it is imported, if it can."""
+        if not self.package.startswith(f"{package}."):
+            return super().present(package)
+        from torch.cuda import is_available
+        from torch.utils.cpp_extension import CUDA_HOME
+
+        return CUDA_HOME is not None and is_available()
+
+    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
+        """Stand-ins for the rasterizer and simple_knn."""
+        from fragprune_plugins.hosts.graphdeco import stand_ins
+
+        rasterizer = stand_ins.rasterizer(self.package, self.settings, self.sparse_adam, draw)
+        return {self.package: rasterizer, **stand_ins.simple_knn()}
+
+
+class GraphdecoAdapter(HostAdapter):
+    """Base of every adapter of this lineage; a subclass adds name, fingerprint and what differs."""
+
+    package = "diff_gaussian_rasterization"
+    contracts: tuple[Contract, ...] = (Contract(),)
+    """Calls of the rasterizer that the dialect answers; a function may make any one of its own."""
+    scripts: tuple[str, ...] = ("train.py",)
+    optimizer = "Adam"
+    """The host's, by its name in ``torch.optim``."""
+    seams = (
+        *MODEL_SEAMS,
+        Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
+        Seam(Role.VIEW, RENDERER, "render", ("viewpoint_camera", "pc")),
+        Seam(
+            Role.RASTERIZE,
+            package,
+            "GaussianRasterizer.forward",
+            ("means3D", "means2D", "opacities"),
+            external=True,
+        ),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """What every descendant has: a rasterizer called as the dialect knows it."""
+        functions = dict.fromkeys(contract.function for contract in self.contracts)
+        there = [name for name in functions if repo.function(RENDERER, name)]  # else a missing seam
+        return [finding for name in there for finding in self._differences(repo, name)]
+
+    def _differences(self, repo: HostRepo, function: str) -> list[Finding]:
+        """What one drawing function does otherwise than any contract of it says."""
+        known = [contract for contract in self.contracts if contract.function == function]
+        calls = read_calls(repo, RENDERER, function)
+        found = [
+            (repo.at(RENDERER, call.line), str(call.contract), "Use the adapter of that host.")
+            for call in calls
+            if call.contract not in known
+        ]
+        if not calls:
+            nothing = "no call of GaussianRasterizationSettings with keywords"
+            remedy = "Check that this is the folder of the training script."
+            found.append((repo.place(RENDERER, function), nothing, remedy))
+        return [
+            Finding(
+                "error",
+                "rasterizer-call",
+                f"{RENDERER}:{function} ({at})",
+                what,
+                " or ".join(map(str, known)),
+                remedy,
+            )
+            for at, what, remedy in found
+        ]
+
+    def other_host(self, repo: HostRepo, found: list[str]) -> list[Finding]:
+        """An error that says all of what speaks against this host, if anything does."""
+        if not found:
+            return []
+        return [
+            Finding(
+                "error",
+                "other-host",
+                str(repo.root),
+                ", ".join(found),
+                f"a {self.info.title} checkout",
+                "Use the adapter of that host.",
+            )
+        ]
+
+    def dialect(self, repo: HostRepo) -> GraphdecoDialect:
+        """Read from the source of ``render``: what it passes and how many values it unpacks."""
+        call = next(iter(read_calls(repo, RENDERER, "render")), None)
+        return GraphdecoDialect(
+            package=self.package,
+            settings=call.settings if call else (),
+            outputs=(call.contract.outputs if call else None) or 2,
+            sparse_adam=bool(repo.mentions(["train"], ["SparseGaussianAdam"]))
+            or bool(repo.mentions([MODEL], ["SparseGaussianAdam"])),
+        )
+
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """The flags of ``train.py``; the iteration count's default is read from the source."""
+        return CommandLine(
+            scripts=self.scripts,
+            iterations="--iterations",
+            output=("-m", "--model_path"),
+            source=("-s", "--source_path"),
+            save_checkpoints="--checkpoint_iterations",
+            resume="--start_checkpoint",
+            default_iterations=int(default(repo, "OptimizationParams", "iterations", 30_000)),
+        )
+
+    def rows(self, model: Any) -> int:
+        """From the means."""
+        return len(model.get_xyz)
+
+    def means(self, model: Any) -> Tensor:
+        """``get_xyz`` returns the parameter object itself."""
+        means: Tensor = model.get_xyz
+        return means
+
+    def opacities(self, model: Any) -> Tensor:
+        """(N,) after the sigmoid."""
+        opacities: Tensor = model.get_opacity
+        return opacities.detach().reshape(-1)
+
+    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
+        """The main one, and the exposures' where the revision has it."""
+        extra = getattr(model, "exposure_optimizer", None)
+        return [model.optimizer, *([extra] if extra is not None else [])]
+
+    def trained_groups(self, train: str) -> frozenset[str] | None:
+        """opacity, or with both SH groups; None for all."""
+        return {
+            "opacity": frozenset({"opacity"}),
+            "appearance": frozenset({"opacity", "f_dc", "f_rest"}),
+            "all": None,
+        }[train]
+
+    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
+        """The masks of densify_and_clone and densify_and_split, worked out before they draw."""
+        import torch
+
+        size = model.get_scaling.detach().max(dim=1).values
+        limit = model.percent_dense * arguments["scene_extent"]
+        clones = method == "densify_and_clone"
+        grown = self.needy(arguments, len(size), torch.norm if clones else torch.squeeze)
+        selected = grown & (size <= limit if clones else size > limit)
+        rows: Tensor = selected.nonzero()[:, 0]
+        return rows.repeat(arguments.get("N", 1))
+
+    def needy(self, arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
+        """(rows,) bool: whose gradient on the screen asks a densify method for more Gaussians.
+
+        Args:
+            arguments: the method's.
+            rows: of the model now.
+            flat: (n, 1) -> (n,), as the method itself does it: rounded alike, whatever is equal to
+                the threshold for the host is so for us.
+        """
+        return reaches(flat(arguments["grads"], dim=-1), arguments["grad_threshold"], rows)
+
+    def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
+        """Clones and split children carry their parent's colour and rotation bit for bit."""
+        import torch
+
+        return torch.equal(tensors["f_dc"], model._features_dc[parents]) and torch.equal(
+            tensors["rotation"], model._rotation[parents]
+        )
+
+    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
+        """The optimizer's state dict: load_state_dict ignores keys it does not know."""
+        return next(part for part in capture if isinstance(part, dict) and "param_groups" in part)
+
+    def before_restore(self, model: Any, capture: Any) -> Any:
+        """A checkpoint made from a PLY lacks the scene's extent; the fresh model knows it."""
+        *rest, spatial_lr_scale = capture
+        return (*rest, spatial_lr_scale or model.spatial_lr_scale)
+
+    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
+        """The 12-tuple of ``capture``, fresh moments, and the thresholds of the PLY's sidecar."""
+        import torch
+
+        from fragprune_plugins.storage import sidecar
+        from fragprune_plugins.storage.atomic import replacing
+
+        m = self.read_model(ply)
+        rows = len(m.xyz)
+        tensors = dict(
+            zip(
+                GROUPS,
+                (m.xyz, m.f_dc, m.f_rest, m.opacity, m.scaling, m.rotation),
+                strict=True,
+            )
+        )
+        parameters = {name: torch.nn.Parameter(tensor) for name, tensor in tensors.items()}
+        optimizer = getattr(torch.optim, self.optimizer)(
+            [{"params": [p], "lr": 0.0, "name": name} for name, p in parameters.items()],
+            lr=0.0,
+            eps=1e-15,
+        )
+        state: dict[str, Any] = optimizer.state_dict()
+        if sidecar.path_beside(ply).exists():
+            state["fragprune"] = sidecar.load(ply)[0].state_dict()
+        capture = (
+            m.sh_degree,
+            parameters["xyz"],
+            parameters["f_dc"],
+            parameters["f_rest"],
+            parameters["scaling"],
+            parameters["rotation"],
+            parameters["opacity"],
+            torch.zeros(rows),
+            torch.zeros(rows, 1),
+            torch.zeros(rows, 1),
+            state,
+            0.0,
+        )
+        with replacing(target) as temporary:
+            torch.save((capture, iteration), temporary)
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+        """As vanilla draws, where the command holds views out (``--eval``)."""
+        foreign = {"--antialiasing", "--train_test_exp"} & set(arguments)
+        return {} if "--eval" in arguments and not foreign else None
+
+    def model_file(self, output: Path, iteration: int) -> Path:
+        """Where ``scene.save`` writes."""
+        return output / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+    def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
+        """``chkpnt*.pth`` and PLYs; a checkpoint comes after the PLY of the same iteration."""
+        found = [
+            (int(path.parent.name.removeprefix("iteration_")), 0, path)
+            for path in output.glob("point_cloud/iteration_*/point_cloud.ply")
+            if path.parent.name.removeprefix("iteration_").isdigit()
+        ] + [
+            (int(path.stem.removeprefix("chkpnt")), 1, path)
+            for path in output.glob("chkpnt*.pth")
+            if path.stem.removeprefix("chkpnt").isdigit()
+        ]
+        return [(iteration, path) for iteration, _, path in sorted(found)]
+
+
+def reaches(grads: Tensor, threshold: Any, rows: int) -> Tensor:
+    """(rows,) bool: gradients (n,) at or above it; rows appended just now have none."""
+    padded = grads.new_zeros(rows)
+    padded[: len(grads)] = grads
+    reached: Tensor = padded >= threshold
+    return reached
+
+
+def default(repo: HostRepo, group: str, name: str, otherwise: float) -> float:
+    """A number that an argument group's ``__init__`` assigns to ``self.name``; else ``otherwise``.
+
+    Args:
+        repo: the checkout.
+        group: class in ``arguments``, such as OptimizationParams.
+        name: of the attribute.
+        otherwise: where it is not spelled so.
+    """
+    function = repo.function("arguments", f"{group}.__init__")
+    for node in ast.walk(function) if function else ():
+        if (
+            isinstance(node, ast.Assign)
+            and isinstance(node.targets[0], ast.Attribute)
+            and node.targets[0].attr == name
+            and isinstance(node.value, ast.Constant)
+            and isinstance(node.value.value, int | float)
+        ):
+            return node.value.value
+    return otherwise

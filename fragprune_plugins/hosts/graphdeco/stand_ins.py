@@ -1,0 +1,197 @@
+"""Modules of ours under the import names of the lineage's compiled packages.
+
+They answer where the compiled package cannot be imported, or the run has no GPU; same call
+contract, our engine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from fragprune_plugins.constants import NEAR
+from fragprune_plugins.hosts.adapter import HostCall
+
+
+def rasterizer(
+    package: str,
+    settings: tuple[str, ...],
+    sparse_adam: bool,
+    draw: Callable[[HostCall], Any],
+    also: tuple[str, ...] = (),
+) -> ModuleType:
+    """The rasterizer package: settings, rasterizer and, for late revisions, the sparse Adam.
+
+    Args:
+        package: its import name.
+        settings: field names of the settings tuple, in order.
+        sparse_adam: whether to offer SparseGaussianAdam.
+        draw: answers a bound call.
+        also: further methods of the rasterizer that are called as ``forward`` is.
+    """
+    fields = [(name, Any) for name in settings]
+    settings_type = NamedTuple("GaussianRasterizationSettings", fields)  # type: ignore[misc]
+
+    class GaussianRasterizer(nn.Module):
+        """Stand-in of fragprune for the compiled rasterizer."""
+
+        def __init__(self, raster_settings: Any) -> None:
+            super().__init__()
+            self.raster_settings = raster_settings
+
+        def markVisible(self, positions: Tensor) -> Tensor:  # noqa: N802 - the host's name
+            """(P,) bool: in front of the near plane."""
+            viewmatrix = self.raster_settings.viewmatrix
+            depth = positions.detach() @ viewmatrix[:3, 2] + viewmatrix[3, 2]
+            visible: Tensor = depth > NEAR
+            return visible
+
+    def entry(name: str) -> Callable[..., Any]:
+        def call(
+            self: GaussianRasterizer,
+            means3D: Tensor,
+            means2D: Tensor,
+            opacities: Tensor,
+            shs: Tensor | None = None,
+            colors_precomp: Tensor | None = None,
+            scales: Tensor | None = None,
+            rotations: Tensor | None = None,
+            cov3D_precomp: Tensor | None = None,
+            dc: Tensor | None = None,
+            **more: Any,
+        ) -> Any:
+            """Draw; see the adapter's dialect for what comes back."""
+            arguments = {
+                "means3D": means3D,
+                "means2D": means2D,
+                "opacities": opacities,
+                "shs": shs,
+                "colors_precomp": colors_precomp,
+                "scales": scales,
+                "rotations": rotations,
+                "cov3D_precomp": cov3D_precomp,
+                "dc": dc,
+                **more,
+            }
+            where = f"{package}:GaussianRasterizer.{name}"
+            return draw(HostCall(self.raster_settings, arguments, where))
+
+        return call
+
+    for name in ("forward", *also):
+        setattr(GaussianRasterizer, name, entry(name))
+
+    module = ModuleType(package, "Stand-in of fragprune for a compiled rasterizer.")
+    members: dict[str, Any] = {
+        "GaussianRasterizationSettings": settings_type,
+        "GaussianRasterizer": GaussianRasterizer,
+    }
+    if sparse_adam:
+        members["SparseGaussianAdam"] = SparseGaussianAdam
+    vars(module).update(members)
+    return module
+
+
+def simple_knn() -> dict[str, ModuleType]:
+    """``simple_knn._C.distCUDA2``."""
+    package = ModuleType("simple_knn", "Stand-in of fragprune.")
+    package.__path__ = []
+    extension = ModuleType("simple_knn._C", "Stand-in of fragprune.")
+    vars(extension)["distCUDA2"] = mean_squared_neighbour_distance
+    vars(package)["_C"] = extension
+    return {"simple_knn": package, "simple_knn._C": extension}
+
+
+def mean_squared_neighbour_distance(points: Tensor) -> Tensor:
+    """(N, 3) -> (N,) mean of the squared distances to the three nearest other points.
+
+    Points with fewer than three neighbours average over those they have; a lone point gives 0.
+    """
+    from scipy.spatial import cKDTree
+
+    cloud = points.detach().cpu().double().numpy()
+    neighbours = min(4, len(cloud))
+    if neighbours < 2:
+        return torch.zeros(len(cloud), device=points.device)
+    distances, _ = cKDTree(cloud).query(cloud, k=neighbours)
+    mean = np.square(distances[:, 1:]).mean(axis=1)
+    return torch.from_numpy(mean).float().to(points.device)
+
+
+def compute_relocation(
+    opacity_old: Tensor, scale_old: Tensor, N: Tensor, binoms: Tensor, n_max: int
+) -> tuple[Tensor, Tensor]:
+    """N equal Gaussians in place of one, such that together they look like it (3DGS-MCMC, eq. 9).
+
+    At the centre ``1 - (1 - o)^N`` must be the old opacity, which gives o. The widths then make the
+    integrals of ``1 - (1 - o g)^N`` and of ``o_old g_old`` along a line agree; expanded, the former
+    is the width times the sum over j of ``C(N, j) (-1)^(j-1) o^j / sqrt(j)``.
+
+    Args:
+        opacity_old: (P,) activated.
+        scale_old: (P, 3) activated.
+        N: (P,) integers in [1, n_max).
+        binoms: the caller's table of binomials, unused: in single precision it is too coarse.
+        n_max: bound of N.
+
+    Returns:
+        New opacity (P,) and scales, flat (3 P,), of each of the N.
+    """
+    total, old = N.long(), opacity_old.double()
+    opacity = -torch.expm1(torch.log1p(-old) / total)
+    j = torch.arange(1, n_max, device=old.device)
+    table = torch.tensor(
+        [
+            [math.comb(n, k) * (-1) ** (k - 1) / math.sqrt(k) for k in range(1, n_max)]
+            for n in range(n_max)
+        ],
+        dtype=torch.float64,
+        device=old.device,
+    )
+    width = (table[total] * opacity[:, None] ** j).sum(dim=1)
+    scale = scale_old.double() * (old / width)[:, None]
+    return opacity.to(opacity_old), scale.to(scale_old).reshape(-1)
+
+
+class SparseGaussianAdam(torch.optim.Adam):
+    """Adam on the rows a view shows; no bias correction (the accelerated rasterizer's optimizer).
+
+    Args:
+        params: param groups of one parameter each, every parameter with N rows.
+        lr: learning rate.
+        eps: added to the root of the second moment.
+    """
+
+    def __init__(self, params: Iterable[Any], lr: float, eps: float) -> None:
+        super().__init__(params=params, lr=lr, eps=eps)
+
+    @torch.no_grad()
+    def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]
+        """Update the visible rows.
+
+        Args:
+            visibility: (N,) bool.
+            N: number of Gaussians.
+        """
+        rows = visibility.nonzero()[:, 0]
+        for group in self.param_groups:
+            (parameter,) = group["params"]
+            if parameter.grad is None:
+                continue
+            state = self.state[parameter]
+            if not state:
+                state["step"] = torch.tensor(0.0)
+                state["exp_avg"] = torch.zeros_like(parameter)
+                state["exp_avg_sq"] = torch.zeros_like(parameter)
+            beta1, beta2 = group["betas"]
+            grad = parameter.grad[rows]
+            first = beta1 * state["exp_avg"][rows] + (1 - beta1) * grad
+            second = beta2 * state["exp_avg_sq"][rows] + (1 - beta2) * grad.square()
+            state["exp_avg"][rows], state["exp_avg_sq"][rows] = first, second
+            parameter[rows] -= group["lr"] * first / (second.sqrt() + group["eps"])

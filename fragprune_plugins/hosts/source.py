@@ -1,0 +1,213 @@
+"""Reads a host's source without importing it: its functions, calls and seams."""
+
+from __future__ import annotations
+
+import ast
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.seams import Seam
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def _definition(scope: ast.AST | None, name: str) -> ast.AST | None:
+    """The class or function of a name right inside a module or class."""
+    body: Sequence[ast.stmt] = getattr(scope, "body", ())
+    kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    return next((child for child in body if isinstance(child, kinds) and child.name == name), None)
+
+
+class HostRepo:
+    """A host's checkout, or installed package, read as text.
+
+    Args:
+        root: the folder its entry scripts lie in, or the one that its package lies in.
+        package: import name of the installed package; "" for a checkout.
+    """
+
+    def __init__(self, root: Path, package: str = "") -> None:
+        self.root, self.package = Path(root).resolve(), package
+        self._trees: dict[str, ast.Module | None] = {}
+
+    @classmethod
+    def installed(cls, package: str) -> HostRepo | None:
+        """The package that an import of this top-level name would find; None without one."""
+        spec = find_spec(package) if package.isidentifier() else None
+        folders = spec.submodule_search_locations if spec else None
+        return cls(Path(next(iter(folders))).parent, package) if folders else None
+
+    def path(self, module: str) -> Path | None:
+        """The file a dotted module name would be imported from, or None."""
+        base = self.root.joinpath(*module.split("."))
+        for candidate in (base / "__init__.py", base.with_suffix(".py")):
+            if candidate.is_file():
+                return candidate
+        return None
+
+    def tree(self, module: str) -> ast.Module | None:
+        """The module's syntax tree, or None when it is absent or not Python."""
+        if module not in self._trees:
+            path = self.path(module)
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # a host's invalid escapes are its own affair
+                    self._trees[module] = (
+                        ast.parse(path.read_text(encoding="utf-8", errors="replace"))
+                        if path
+                        else None
+                    )
+            except SyntaxError:
+                self._trees[module] = None
+        return self._trees[module]
+
+    def function(self, module: str, attribute: str) -> Function | None:
+        """The definition at a dotted path inside a module, or None."""
+        node: ast.AST | None = self.tree(module)
+        for name in attribute.split("."):
+            node = _definition(node, name)
+        return node if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else None
+
+    def place(self, module: str, attribute: str) -> str:
+        """The file:line of a definition; where it is absent, of as much of its path as exists."""
+        scope: ast.AST | None = self.tree(module)
+        line = 1
+        for name in attribute.split("."):
+            scope = _definition(scope, name)
+            line = getattr(scope, "lineno", line)
+        return self.at(module, line)
+
+    def at(self, module: str, line: int) -> str:
+        """A line of a module as file:line, the file relative to the checkout."""
+        path = self.path(module)
+        if path is None:
+            return f"no file {module.replace('.', '/')}.py"
+        return f"{path.relative_to(self.root)}:{line}"
+
+    def parameters(self, module: str, attribute: str) -> tuple[str, ...] | None:
+        """Parameter names of a function, ``self`` left out; None when it is not there."""
+        function = self.function(module, attribute)
+        if function is None:
+            return None
+        args = function.args
+        names = [a.arg for a in (*args.posonlyargs, *args.args, *args.kwonlyargs)]
+        return tuple(n for n in names if n != "self")
+
+    def calls(self, module: str, name: str) -> list[ast.Call]:
+        """Every call of a bare name in a module, in source order."""
+        tree = self.tree(module)
+        return [
+            node
+            for node in (ast.walk(tree) if tree else ())
+            if isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id == name
+        ]
+
+    def mentions(self, modules: Iterable[str], names: Iterable[str]) -> dict[str, str]:
+        """Which of the names occur as identifiers, attributes or parameters, and where."""
+        wanted = set(names)
+        seen: dict[str, str] = {}
+        for module in modules:
+            tree = self.tree(module)
+            for node in ast.walk(tree) if tree else ():
+                name = (
+                    getattr(node, "id", None)
+                    or getattr(node, "attr", None)
+                    or getattr(node, "name", None)
+                    or getattr(node, "arg", None)
+                )
+                if name in wanted:
+                    seen.setdefault(str(name), f"{module}:{getattr(node, 'lineno', 0)}")
+        return seen
+
+    def imports(self, package: str) -> bool:
+        """Whether a script right in the folder imports a top-level package."""
+        for script in self.root.glob("*.py"):
+            tree = self.tree(script.stem)
+            for node in ast.walk(tree) if tree else ():
+                if isinstance(node, ast.Import):
+                    names = [alias.name for alias in node.names]
+                else:
+                    names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+                if any(name.split(".")[0] == package for name in names):
+                    return True
+        return False
+
+    @cached_property
+    def commit(self) -> str:
+        """The checkout's commit, read from .git without running git; "" when there is none.
+
+        An installed package has its distributions and their versions instead.
+        """
+        if self.package:
+            names = packages_distributions().get(self.package, ())
+            return ", ".join(f"{name} {version(name)}" for name in sorted(set(names)))
+        git = self.root / ".git"
+        try:
+            head = (git / "HEAD").read_text().strip()
+            if not head.startswith("ref: "):
+                return head
+            reference = head.removeprefix("ref: ")
+            loose = git / reference
+            if loose.is_file():
+                return loose.read_text().strip()
+            for line in (git / "packed-refs").read_text().splitlines():
+                if line.endswith(reference):
+                    return line.split()[0]
+        except OSError:
+            pass
+        return ""
+
+
+@dataclass(frozen=True)
+class SeamState:
+    """A seam as the source has it.
+
+    Attributes:
+        seam: looked up.
+        status: "at import" where the source cannot tell, because the module is compiled.
+        at: "file:line" of the function, or of what it was expected in; "" at import.
+        finding: the error, where there is one.
+    """
+
+    seam: Seam
+    status: Literal["found", "changed", "missing", "at import"]
+    at: str = ""
+    finding: Finding | None = None
+
+
+def look_up(repo: HostRepo, seams: Iterable[Seam]) -> list[SeamState]:
+    """Each seam in the source, in order; nothing is imported."""
+    return [_look_up(repo, seam) for seam in seams]
+
+
+def _look_up(repo: HostRepo, seam: Seam) -> SeamState:
+    if seam.external:
+        return SeamState(seam, "at import")
+    at = repo.place(seam.module, seam.attribute)
+    have = repo.parameters(seam.module, seam.attribute)
+    where = f"{seam} ({at})"
+    if have is None:
+        broken = repo.path(seam.module) is not None and repo.tree(seam.module) is None
+        found = "source that is no Python" if broken else "no such function"
+        gone = Finding("error", "seam-missing", where, found, "one")
+        return SeamState(seam, "missing", at, gone)
+    missing = [name for name in seam.needs if name not in have]
+    if not missing:
+        return SeamState(seam, "found", at)
+    found, expected = f"parameters ({', '.join(have)})", f"also {', '.join(missing)}"
+    changed = Finding("error", "seam-signature", where, found, expected)
+    return SeamState(seam, "changed", at, changed)
+
+
+def check_seams(repo: HostRepo, seams: Iterable[Seam]) -> list[Finding]:
+    """An error for each seam that is missing or was changed."""
+    return [state.finding for state in look_up(repo, seams) if state.finding]

@@ -1,0 +1,618 @@
+"""Runs a host's script in this process as ``__main__``, with a session around it.
+
+A training run has two halves. Stage 1 is the host's own training, untouched but for being asked to
+write its checkpoint at the end. Stage 2 is the host's own script again, resumed from that
+checkpoint for more iterations, with thresholds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import logging
+import runpy
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NoReturn
+from unittest import mock
+
+from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
+from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter
+from fragprune_plugins.hosts.choosing import choose, locate
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings
+from fragprune_plugins.plugins.loading import load_plugins
+
+log = logging.getLogger("fragprune")
+
+Stage = Literal["auto", "finetune", "joint", "off"]
+
+
+class HostFailed(FragpruneError):  # noqa: N818 - the host's failure, reported
+    """The host's script ended with a non-zero exit code."""
+
+    code = "host-failed"
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How to run a host.
+
+    Attributes:
+        adapter: name, or None to detect it from the source.
+        stage: "auto" trains and then fine-tunes; "finetune" resumes what the output folder (or
+            ``--start_checkpoint``) holds; "joint" learns inside the host's training; "off" only
+            applies thresholds that are there.
+        settings: of the fine-tuning.
+        from_iter: with "finetune": learn and freeze from this iteration of a run that was not
+            resumed; with "joint": learn from it.
+        alternate: with "joint", learn for so many iterations, hold for as many, and so on.
+        engine: "auto", "reference", "cpu", "cuda".
+        device: "auto" or "cpu" to run a CUDA-only host on the CPU; "cuda" insists on a GPU.
+    """
+
+    adapter: str | None = None
+    stage: Stage = "auto"
+    settings: Settings = field(default_factory=Settings)
+    from_iter: int | None = None
+    alternate: int | None = None
+    engine: str = "auto"
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What a run did.
+
+    Attributes:
+        adapter: its name.
+        engine: that drew stage 2, "" when there was none.
+        device: "cpu" or "cuda".
+        stage: what was asked for.
+        iterations: learned in stage 2.
+        gaussians: of the trained model.
+        fragments_before: per pixel over training views, untruncated.
+        fragments_after: per pixel over training views, at each view's last visit.
+        model_before: the host's PLY of stage 1, when there is one.
+        model_after: the host's PLY after stage 2; its sidecar lies beside it.
+        train_seconds: wall time of both stages.
+        target_reached: whether a target speed-up was met within 5% on training views; None
+            without a target.
+        curves: a dict per learned step: step, loss, fragments_per_pixel, pressure,
+            threshold_median.
+        settings: of the fine-tuning.
+        drawing: fields of ``RasterInputs`` by which the host draws its model; None where its
+            command leaves no view out, or our readers do not draw what the host does.
+    """
+
+    adapter: str
+    engine: str
+    device: str
+    stage: str
+    iterations: int
+    gaussians: int
+    fragments_before: float | None
+    fragments_after: float | None
+    model_before: Path | None
+    model_after: Path | None
+    train_seconds: float
+    target_reached: bool | None
+    curves: list[dict[str, float]]
+    settings: dict[str, Any]
+    drawing: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class _Invocation:
+    """The host's command, taken apart; ``module`` where it was ``python -m module``."""
+
+    script: Path
+    arguments: list[str]
+    flags: argparse.Namespace
+    line: CommandLine
+    module: str = ""
+
+    def with_flags(self, scratch: Path, **extra: Any) -> list[str]:
+        """Arguments with flags appended; argparse lets the last one win.
+
+        Args:
+            scratch: folder for a copy of the host's configuration file, which wins over flags.
+            extra: values by fields of the command line.
+        """
+        given = {self.line.spellings(name)[-1]: value for name, value in extra.items()}
+        out = list(self.arguments)
+        if self.line.config and self.flags.config:
+            copy = scratch / self.flags.config.name
+            overrule(self.line.config, self.flags.config, copy, given)
+            return [*out, self.line.config.flag, str(copy)]
+        for flag, value in given.items():
+            values = value if isinstance(value, list) else [value]
+            out += [flag, *map(str, values)]
+        return out
+
+
+def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
+    """Run a host's command with fragment pruning.
+
+    Args:
+        command: as typed, ``["python", "train.py", "-s", "scene", ...]``; a leading python may be
+            left out.
+        options: how.
+
+    Raises:
+        UsageError: the command names no script.
+        UnknownHostError: no adapter fits the script's folder.
+        HostFailed: the host ended with an error code.
+        Interrupted: Ctrl-C in stage 2; what was learned has been saved.
+    """
+    import time
+
+    options = options or RunOptions()
+    script, arguments, module = _split(command)
+    plugins = load_plugins()
+    for finding in plugins.findings:
+        if finding.level != "info":
+            log.warning("%s", finding)
+    tie = plugins.manager.hook.fragprune_select_adapter
+    package = HostRepo.installed(module.split(".")[0]) if module else None
+    if package is not None:
+        repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
+    else:
+        repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
+    host = _parse(script, arguments, adapter.command_line(repo), module)
+    device = _device(options.device)
+    started = time.perf_counter()
+    trains = script in (repo.root / name for name in host.line.scripts)
+    with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
+        runner = _Runner(host, repo, adapter, plugins, options, device, Path(scratch))
+        if not trains or options.stage == "off":
+            runner.observe()
+        elif options.stage == "joint":
+            runner.joint()
+        elif options.stage == "finetune":
+            runner.finetune()
+        else:
+            runner.train_then_finetune()
+    return runner.summary(time.perf_counter() - started)
+
+
+class _Runner:
+    """One command's stages; holds what the summary needs."""
+
+    def __init__(
+        self,
+        host: _Invocation,
+        repo: HostRepo,
+        adapter: HostAdapter,
+        plugins: Any,
+        options: RunOptions,
+        device: str,
+        scratch: Path,
+    ) -> None:
+        self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
+        self.options, self.device, self.scratch = options, device, scratch
+        self.output = Path(host.flags.output) if host.flags.output else None
+        self.trained: int | None = None  # iterations of stage 1, once it is over
+        self.before: Path | None = None
+        self.after: Path | None = None
+        self.learned: Any = None
+        self.curves: list[dict[str, float]] = []
+
+    def observe(self) -> None:
+        """The command as it is; thresholds of sidecars are applied."""
+        self._execute(self.host.arguments, learn=False)
+
+    def joint(self) -> None:
+        """Thresholds learn beside everything else."""
+        resumed, start, total = self._learning(self.options.from_iter)
+        steps = total - resumed - self.host.line.skipped
+        settings = _with_iterations(self.options.settings, steps)
+        schedule = JointSchedule(settings, max(1, start - resumed), self.options.alternate)
+        self._execute(
+            self._saving(total),
+            learn=True,
+            freeze=False,
+            start=resumed,
+            schedule=schedule,
+            settings=settings,
+        )
+        self._note_after(total)
+
+    def train_then_finetune(self) -> None:
+        """Stage 1 with a checkpoint at its end, then stage 2 from there."""
+        if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
+            return self.finetune()
+        self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
+        total = self._iterations()
+        log.info("stage 1: the host's own training, %d iterations", total)
+        arguments = self.host.with_flags(self.scratch, save_checkpoints=self._checkpoints(total))
+        self._execute(arguments, learn=False)
+        saved = self.adapter.saved_iterations(self.output) if self.output else []
+        if total not in (iteration for iteration, _ in saved):  # hosts refuse with exit code 0 too
+            raise HostFailed(
+                self.host.script.name,
+                f"ended without a checkpoint of iteration {total}",
+                "its own training to come to its end",
+                "Read the host's own message above.",
+            )
+        self.trained = total
+        self.finetune()
+
+    def finetune(self) -> None:
+        """Stage 2: resume, or wait for ``from_iter`` inside one run."""
+        settings = self.options.settings
+        if self.options.from_iter is not None:
+            resumed, after, total = self._learning(self.options.from_iter)
+            settings = _with_iterations(settings, total - after - self.host.line.skipped)
+            passed = after - resumed
+            self._execute(
+                self._saving(total), learn=True, from_step=passed, start=resumed, settings=settings
+            )
+            self._note_after(total)
+            return
+        again = self.adapter.resumed_by(self.host.script, self.host.arguments)
+        self.host = _parse(*again, self.host.line, self.host.module)
+        if self.output is None and self.host.flags.output:
+            self.output = Path(self.host.flags.output)
+        with self._checkpoint() as (iteration, checkpoint):
+            self._note_before(iteration)
+            start = 0 if self.host.line.restarts else iteration
+            total = start + settings.iterations + self.host.line.skipped
+            log.info("stage 2: %d iterations from %s", settings.iterations, checkpoint)
+            extra = {"iterations": total, "resume": str(checkpoint)}
+            if self.host.line.restarts and self.output is not None:
+                self.output = self.output / "finetuned"
+            if self.output is not None and str(self.output) != self.host.flags.output:
+                extra["output"] = str(self.output)
+            self._execute(self._saving(total, **extra), learn=True, start=start)
+            self._note_after(total)
+
+    @contextlib.contextmanager
+    def _checkpoint(self) -> Iterator[tuple[int, Path]]:
+        """The checkpoint to resume from; one made from a PLY is removed afterwards."""
+        if self.host.flags.resume and self.trained is None:
+            path = Path(self.host.flags.resume)
+            yield self._iteration_of(path), path
+            return
+        saved = self.adapter.saved_iterations(self.output) if self.output else []
+        if self.trained is not None:  # the folder may hold later ones of another run
+            saved = [each for each in saved if each[0] == self.trained]
+        if not saved:
+            raise UsageError(
+                "--stage finetune",
+                f"nothing to start from in {self.output or 'no output folder'}",
+                f"{self.host.line.spellings('resume')[-1]} FILE, or {self.host.line.output[-1]} "
+                "DIR of a finished training",
+                "Name one of them in the host's command.",
+            )
+        iteration, path = saved[-1]
+        if path.suffix != ".ply" or self.host.line.restarts:
+            yield iteration, path
+            return
+        made = path.with_name(f".fragprune_{iteration}.pth")
+        self.adapter.checkpoint_from_ply(path, iteration, made)
+        try:
+            yield iteration, made
+        finally:
+            made.unlink(missing_ok=True)
+
+    def _execute(
+        self,
+        arguments: list[str],
+        *,
+        learn: bool,
+        freeze: bool = True,
+        from_step: int = 0,
+        start: int = 0,
+        schedule: Schedule | None = None,
+        settings: Settings | None = None,
+    ) -> None:
+        from fragprune_plugins.injection.session import Session
+
+        session = Session(
+            self.adapter,
+            self.repo,
+            self.plugins,
+            settings or self.options.settings,
+            learn=learn,
+            freeze=freeze,
+            from_step=from_step,
+            start=start,
+            schedule=schedule,
+            engine=self.options.engine,
+            drop_in=True if self.device == "cpu" else None,
+            output=self.output,
+        )
+        known = set(sys.modules)
+        try:
+            folder = Path.cwd() if self.host.module else self.host.script.parent
+            with session, _host_process(self.host.script, arguments, self.device, folder):
+                try:
+                    if self.host.module:
+                        runpy.run_module(self.host.module, run_name="__main__", alter_sys=True)
+                    else:
+                        runpy.run_path(str(self.host.script), run_name="__main__")
+                except KeyboardInterrupt as error:  # here, where saving still writes the sidecar
+                    saved = session.save_interrupted() if learn else None
+                    raise Interrupted(
+                        self.host.script.name,
+                        "Ctrl-C" + (f"; thresholds so far are beside {saved}" if saved else ""),
+                        "the run to end",
+                        "Resume with fragprune run --stage finetune."
+                        if saved
+                        else "Start it again.",
+                    ) from error
+            session.expect_drawn()
+        except SystemExit as error:
+            if error.code not in (None, 0):
+                raise HostFailed(
+                    self.host.script.name,
+                    f"ended with exit code {error.code}",
+                    "0",
+                    "Read the host's own message above.",
+                ) from error
+        finally:
+            self.output = session.output or self.output
+            _forget_modules(self.repo.root, known, self.adapter.installed)
+            if learn:
+                self.learned = session.finish()
+                self.curves = session.curves
+
+    def summary(self, seconds: float) -> RunSummary:
+        """Everything the command line prints."""
+        learned = self.learned
+        return RunSummary(
+            adapter=self.adapter.name,
+            engine=learned.engine if learned else "",
+            device=self.device,
+            stage=self.options.stage,
+            iterations=learned.steps if learned else 0,
+            gaussians=learned.gaussians if learned else 0,
+            fragments_before=learned.fragments_before if learned else None,
+            fragments_after=learned.fragments_after if learned else None,
+            model_before=self.before,
+            model_after=self.after,
+            train_seconds=seconds,
+            target_reached=learned.target_reached if learned else None,
+            curves=self.curves,
+            settings=self.options.settings.as_dict(),
+            drawing=self.adapter.drawing(self.repo, self.host.arguments),
+        )
+
+    def _iteration_of(self, resumed: Path) -> int:
+        """The iteration that a run from this file goes on after."""
+        return 0 if self.host.line.restarts else _iteration_of(resumed)
+
+    def _learning(self, from_iter: int | None) -> tuple[int, int, int]:
+        """Iterations of the host: the one this run goes on after, where learning begins, the last.
+
+        Args:
+            from_iter: as asked for; half of the training where it is not.
+
+        Raises:
+            UsageError: nothing would be learned.
+        """
+        total, file = self._iterations(), self.host.flags.resume
+        resumed = self._iteration_of(Path(file)) if file else 0
+        start = max(resumed, total // 2 if from_iter is None else from_iter)
+        if start < total - self.host.line.skipped:
+            return resumed, start, total
+        flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
+        raise UsageError(
+            f"--stage {self.options.stage}",
+            f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
+            f"some after {start}, where learning begins",
+            f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
+        )
+
+    def _checkpoints(self, total: int) -> list[int]:
+        """Iterations to write a checkpoint at: the command's, and the last."""
+        return sorted({*(self.host.flags.save_checkpoints or []), total})
+
+    def _saving(self, total: int, **extra: Any) -> list[str]:
+        """The host's arguments with more flags, and told to save its model in the end."""
+        if self.host.line.checkpoints_only:
+            extra["save_checkpoints"] = self._checkpoints(total)
+        return self.host.with_flags(self.scratch, **extra) if extra else self.host.arguments
+
+    def _iterations(self) -> int:
+        return self.host.flags.iterations or self.host.line.default_iterations
+
+    def _note_before(self, iteration: int) -> None:
+        path = self.adapter.model_file(self.output, iteration) if self.output else None
+        self.before = path if path and path.exists() else None
+
+    def _note_after(self, iteration: int) -> None:
+        path = self.adapter.model_file(self.output, iteration) if self.output else None
+        self.after = path if path and path.exists() else None
+
+
+def _split(command: list[str]) -> tuple[Path, list[str], str]:
+    """Script, its arguments, and the module where it is one; a leading interpreter is dropped."""
+    words = list(command)
+    if words and Path(words[0]).name.startswith("python"):
+        words = words[1:]
+    if words[:1] == ["-m"] and len(words) > 1:
+        return _script_of(words[1]), words[2:], words[1]
+    if not words or not words[0].endswith(".py"):
+        raise UsageError(
+            "command",
+            repr(" ".join(command)) if command else "none",
+            "-- python train.py ... (a script of the host), or -- python -m package.module ...",
+            "Put the host's own training command after --.",
+        )
+    script = Path(words[0]).resolve()
+    if not script.is_file():
+        raise UsageError(
+            str(script), "no such file", "the host's training script", "Check the path."
+        )
+    return script, words[1:], ""
+
+
+def _script_of(module: str) -> Path:
+    """The file of an installed module, found without importing its package."""
+    repo = HostRepo.installed(module.split(".")[0])
+    script = repo.path(module) if repo else None
+    if script is None:
+        raise UsageError(
+            f"python -m {module}",
+            "no such module",
+            "one of an installed package",
+            "Install the package, or check the name.",
+        )
+    return script
+
+
+class _Flags(argparse.ArgumentParser):
+    """Says what is wrong with a flag as we say everything."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(
+            "the host's command", message, "flags the host understands", "Correct the command."
+        )
+
+
+def _parse(script: Path, arguments: list[str], line: CommandLine, module: str = "") -> _Invocation:
+    """Read the few flags we need; the host parses them all itself."""
+    parser = _Flags(add_help=False)
+    parser.add_argument(*line.spellings("iterations"), dest="iterations", type=int)
+    parser.add_argument(*line.output, dest="output")
+    parser.add_argument(*line.source, dest="source")
+    parser.add_argument(line.save_checkpoints, dest="save_checkpoints", type=int, nargs="*")
+    parser.add_argument(*line.spellings("resume"), dest="resume")
+    if line.config:
+        parser.add_argument(line.config.flag, dest="config", type=Path)
+    flags, _ = parser.parse_known_args(arguments)
+    if line.config and flags.config:
+        values = read_config(line.config, flags.config)
+        for name in set(vars(flags)) - {"config"}:
+            key = line.spellings(name)[-1].lstrip("-")
+            setattr(flags, name, values.get(key, getattr(flags, name)))
+    return _Invocation(script, arguments, flags, line, module)
+
+
+def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
+    """What a configuration file says, by argument name."""
+    try:
+        return config.read(path)
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"{config.flag} {path}", str(error), "a file the host can read", "Correct the command."
+        ) from error
+
+
+def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) -> None:
+    """Write a copy of a configuration file with other values, and see that it says so."""
+    values = {flag.lstrip("-"): value for flag, value in given.items()}
+    copy.write_text(config.overrule(path.read_text(encoding="utf-8"), values), encoding="utf-8")
+    said = read_config(config, copy)
+    if ignored := sorted(name for name in values if said.get(name) != values[name]):
+        raise UsageError(
+            f"{config.flag} {path}",
+            f"a layout that {', '.join(ignored)} cannot be added to",
+            "that of the host's own examples",
+            "Write it like these.",
+        )
+
+
+def _device(wanted: str) -> str:
+    import torch
+
+    if wanted == "cpu":
+        return "cpu"
+    if torch.cuda.is_available():
+        return "cuda"
+    if wanted == "cuda":
+        raise UsageError(
+            "--device cuda", "no CUDA device", "one", "Use --device cpu for small scenes."
+        )
+    return "cpu"
+
+
+def _with_iterations(settings: Settings, iterations: int) -> Settings:
+    from dataclasses import replace
+
+    return replace(settings, iterations=iterations)
+
+
+def _iteration_of(checkpoint: Path) -> int:
+    """The iteration a checkpoint was written at: hosts save (capture, iteration)."""
+    import torch
+
+    if not checkpoint.is_file():
+        raise UsageError(str(checkpoint), "no such file", "a checkpoint", "Check the path.")
+    with _host_checkpoints():
+        content = torch.load(checkpoint, map_location="cpu")
+    return int(content[-1])
+
+
+@contextlib.contextmanager
+def _host_checkpoints() -> Iterator[None]:
+    """Let torch's safe loader read the hosts' checkpoints: they hold NumPy scalars, no more."""
+    import numpy as np
+    import torch
+
+    scalar: Any = np.float64(0).__reduce__()[0]
+    kinds: list[Any] = [type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8")]
+    with torch.serialization.safe_globals([scalar, np.dtype, *kinds]):
+        yield
+
+
+@contextlib.contextmanager
+def _host_pictures() -> Iterator[None]:
+    """Let Pillow take signed bytes, as hosts that read Blender scenes give it; it used to."""
+    import numpy as np
+    from PIL import Image
+
+    fromarray = Image.fromarray
+
+    def from_bytes(array: Any, mode: str | None = None) -> Any:
+        signed = isinstance(array, np.ndarray) and array.dtype == np.int8
+        return fromarray(array.view(np.uint8) if signed else array, mode)
+
+    with mock.patch.object(Image, "fromarray", from_bytes):
+        yield
+
+
+@contextlib.contextmanager
+def _host_process(
+    script: Path, arguments: list[str], device: str, folder: Path | None = None
+) -> Iterator[None]:
+    """What a fresh interpreter would give the script, put back afterwards."""
+    from fragprune_plugins.injection.cpu_only import cpu_only
+
+    saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
+    sys.argv = [str(script), *arguments]
+    sys.path.insert(0, str(folder or script.parent))
+    try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(_host_checkpoints())
+            stack.enter_context(_host_pictures())
+            if device == "cpu":
+                stack.enter_context(cpu_only())
+            yield
+    finally:
+        sys.argv, sys.path[:], sys.stdout, sys.stderr = saved
+
+
+def _forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) -> None:
+    """Drop the host's own modules, so that its script runs again as if for the first time.
+
+    Args:
+        root: of a checkout, which may hold an environment with packages that are not its own.
+        known: names of modules that were there before the host ran.
+        packages: that are the host, where it is installed; their compiled modules stay.
+    """
+    for name in sys.modules.keys() - known:
+        file = getattr(sys.modules[name], "__file__", None) or ""
+        if name.split(".")[0] in packages:
+            own = not file or file.endswith(".py")
+        else:
+            own = file != "" and Path(file).is_relative_to(root) and "site-packages" not in file
+        if own:
+            del sys.modules[name]
+    gc.collect()  # closes what module globals held, the viewer's socket among them

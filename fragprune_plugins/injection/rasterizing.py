@@ -1,0 +1,190 @@
+"""Drawing with thresholds where the host draws, and the fragment pressure in its loss."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.hosts.adapter import HostCall
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.injection.saving import adopt
+from fragprune_plugins.injection.state import ModelState, Picture, named
+from fragprune_plugins.injection.stepping import begin_step
+from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+if TYPE_CHECKING:
+    from fragprune_plugins.injection.session import Session
+
+log = logging.getLogger("fragprune")
+
+
+class _AddToLoss(torch.autograd.Function):
+    """Passes the image on; in the backward pass the term counts as if added to the loss."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, term: Tensor) -> Tensor:
+        ctx.term_shape = term.shape
+        return image.view_as(image)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
+        (grad,) = grads
+        return grad, torch.ones(ctx.term_shape, dtype=grad.dtype, device=grad.device)
+
+
+def on_view(
+    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
+) -> Any:
+    """Remember which model is drawn for which camera while the host's function runs."""
+    arguments = named(wrapped, args, kwargs)
+    camera = arguments[seam.needs[0]]
+    own = len(seam.needs) > 1  # a function's; a method's is what it was called on
+    model = arguments[seam.needs[1]] if own else session.model_of(instance, arguments)
+    if model is None:
+        if session.learn and torch.is_grad_enabled():
+            warn_unknown(session, seam)
+        return wrapped(*args, **kwargs)
+    if session.unpacked is not None and model not in session.models:
+        adopt(session, model, *session.unpacked)
+    state, view = session.models.get(model), session.adapter.view(camera)
+    begins = session.adapter.steps_by_rendering and session.learn and torch.is_grad_enabled()
+    if begins and state is not None and not state.begun:
+        begin_step(session, model, state)
+    again = partial(draw_view, session, wrapped, model, view, args, kwargs)
+    measured = session.settings.target_speedup is not None  # keeps the model alive: only if needed
+    if measured and state is not None and state.plan is not None and torch.is_grad_enabled():
+        state.views[view] = again
+    return again()
+
+
+def warn_unknown(session: Session, seam: Seam) -> None:
+    """Say once that a view is drawn without thresholds."""
+    if not session.warned:
+        session.warned = True
+        log.warning("%s draws Gaussians that no seam attached: without thresholds", seam)
+
+
+def draw_view(session: Session, render: Any, model: Any, view: int, args: Any, kwargs: Any) -> Any:
+    """The host's function, with its model and view known to the rasterizer's seam."""
+    token = session.rendering.set((model, view))
+    try:
+        return render(*args, **kwargs)
+    finally:
+        session.rendering.reset(token)
+
+
+def on_rasterize(
+    session: Session, seam: Seam, wrapped: Any, rasterizer: Any, args: Any, kwargs: Any
+) -> Any:
+    """Draw with thresholds, or leave it to the host while there are none."""
+    rendering = session.rendering.get()
+    state = session.models.get(rendering[0]) if rendering else None
+    settings = getattr(rasterizer, "raster_settings", None)
+    call = HostCall.bind(wrapped, settings, args, kwargs, str(seam))
+    if session.dialect.stands_in(call):
+        wrapped, args, kwargs = session.draw, (call,), {}
+    if rendering is None or state is None or session.pausing.get():
+        return wrapped(*args, **kwargs)
+    rows = session.adapter.rows_drawn(rendering[0], call)
+    if rows is not None:
+        session.expect_rows(rendering[0], state, f"{session.adapter.name}: rasterizer call")
+    means, expected = call[session.dialect.means], len(state.store if rows is None else rows)
+    if len(means) != expected:
+        raise AlignmentError(
+            f"{session.adapter.name}: rasterizer call",
+            f"{len(means)} Gaussians",
+            f"{expected} of {len(state.store)}, one per threshold that is drawn",
+            "Report this with the host's commit.",
+        )
+    if state.store.neutral:
+        return wrapped(*args, **kwargs)
+    inputs = session.dialect.unpack(call)
+    thresholds = session.hook.fragprune_truncate(inputs=inputs, store=state.store)
+    if thresholds is None:
+        return wrapped(*args, **kwargs)
+    thresholds = thresholds if rows is None else thresholds[rows]
+    draw = partial(rasterize, session, state, rendering[1], thresholds)
+    return session.dialect.answer(call, inputs, draw)
+
+
+def rasterize(
+    session: Session,
+    state: ModelState,
+    view: int,
+    thresholds: Tensor,
+    inputs: RasterInputs,
+    part: int = 0,
+) -> RasterOutputs:
+    """With thresholds; learning, with the fragment pressure in the loss."""
+    picture = view, part
+    engine = session.engine(inputs.splats.device)
+    outputs = engine.rasterize(inputs, thresholds)
+    learns = torch.is_grad_enabled() and state.plan is not None and state.plan.learn
+    if learns and picture not in state.baseline:
+        with torch.no_grad():
+            untruncated = engine.rasterize(inputs, None)
+        state.baseline[picture] = float(untruncated.fragments_per_pixel)
+    if picture in state.baseline:
+        state.drawn[picture] = float(outputs.fragments_per_pixel.detach())
+    return press(session, state, picture, outputs) if learns else outputs
+
+
+def press(
+    session: Session, state: ModelState, picture: Picture, outputs: RasterOutputs
+) -> RasterOutputs:
+    """Put the fragment pressure into the host's loss and keep this step's figures."""
+    plan = state.plan
+    assert plan is not None
+    state.step_views.draw(state.drawn[picture], state.baseline[picture])
+    state.stats = StepStats(
+        step=state.steps - session.from_step,
+        fragments_per_pixel=state.step_views.fragments,
+        pressure=session.pressure.value,
+        threshold_median=float(state.store.values.detach().median()),
+        loss=state.step_views.loss,
+    )
+    if session.pressure.value == 0 or state.held or not outputs.image.requires_grad:
+        return outputs
+    term = outputs.fragments_per_pixel * (session.pressure.value / state.step_views.expected)
+    return replace(outputs, image=_AddToLoss.apply(outputs.image, term))  # type: ignore[no-untyped-call]
+
+
+def on_loss(session: Session, seam: Seam, wrapped: Any, tensor: Any, args: Any, kwargs: Any) -> Any:
+    """Keep the host's own loss for the curves."""
+    state = session.last_state
+    if state is not None and tensor.numel() == 1:
+        state.begun = False
+        if state.stats is not None:
+            state.step_views.lose(float(tensor.detach()))
+            state.stats = replace(state.stats, loss=state.step_views.loss)
+    return wrapped(*args, **kwargs)
+
+
+def on_metric(
+    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
+) -> Any:
+    """A metric whose weights cannot be had is NaN, not the end of the run."""
+    if seam not in session.absent:
+        try:
+            return wrapped(*args, **kwargs)
+        except OSError as error:  # the download failed; a run of hours should not end on it
+            log.warning("%s: its weights cannot be had (%s); NaN stands for it", seam, error)
+            session.absent.add(seam)
+    return torch.tensor(math.nan)
+
+
+OF_CALLS: dict[Role, Callable[..., Any]] = {
+    Role.VIEW: on_view,
+    Role.RASTERIZE: on_rasterize,
+    Role.LOSS: on_loss,
+    Role.METRIC: on_metric,
+}

@@ -1,0 +1,156 @@
+"""Thresholds go where the host's files go: beside its models, inside its checkpoints."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from inspect import signature
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.injection.state import ModelState, named
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import sidecar
+
+if TYPE_CHECKING:
+    from fragprune_plugins.injection.session import Session
+
+
+def on_save(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+    """Thresholds beside the file that the host wrote."""
+    result = wrapped(*args, **kwargs)
+    path = named(wrapped, args, kwargs)[seam.needs[0]]
+    if model in session.models and path is not None:
+        session.save(model, file_at(session, seam, path))
+    return result
+
+
+def file_at(session: Session, seam: Seam, path: Any) -> Path:
+    """The file that a path of the host stands for."""
+    return session.adapter.file_at(seam.attribute.split(".")[-1], Path(path))
+
+
+def on_load(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+    """Thresholds from beside the file that the host read."""
+    result = wrapped(*args, **kwargs)
+    path = file_at(session, seam, named(wrapped, args, kwargs)[seam.needs[0]])
+    if sidecar.path_beside(path).exists():
+        session.load(model, path)
+    else:
+        session.models.pop(model, None)  # another population: what we knew is not about it
+    return result
+
+
+def on_pack(
+    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
+) -> Any:
+    """Thresholds beside a file that holds the Gaussians in an order of its own."""
+    result = wrapped(*args, **kwargs)
+    packed = session.adapter.packed(named(wrapped, args, kwargs), result)
+    model = session.last() if session.last else None
+    state = session.models.get(model) if model is not None else None
+    if packed is None or state is None or state.store.neutral:
+        return result
+    path, means = packed
+    rows = rows_of(means, session.adapter.means(model), str(seam))
+    store = ThresholdStore(0)
+    store.load_state_dict(state.store.state_dict())
+    store.rearrange(rows, torch.zeros(len(rows), dtype=torch.bool))
+    session.write_sidecar(path, store)
+    return result
+
+
+def on_unpack(
+    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
+) -> Any:
+    """Keep the thresholds of an unpacked file for the model that will be made of it."""
+    result = wrapped(*args, **kwargs)
+    packed = session.adapter.packed(named(wrapped, args, kwargs), result)
+    if packed is not None and sidecar.path_beside(packed[0]).exists():
+        session.unpacked = packed[1], sidecar.load(packed[0])[0]
+    return result
+
+
+def adopt(session: Session, model: Any, expected: Tensor, store: ThresholdStore) -> None:
+    """Thresholds of an unpacked file go to the model made of it, which is drawn next."""
+    means = session.adapter.means(model)
+    if not torch.equal(means.detach().cpu(), expected):
+        raise AlignmentError(
+            f"{session.adapter.name}: unpacked model",
+            f"{len(means)} Gaussians that are not the unpacked file's",
+            f"its {len(expected)}, in its order",
+            "Report this with the host's commit: it draws another model after unpacking.",
+        )
+    placed = ThresholdStore(0, means.device)
+    placed.load_state_dict(store.state_dict())
+    session.models[model] = ModelState(placed, loaded=weakref.ref(means))
+    session.follow(model, session.models[model])
+    session.hook.fragprune_attached(model=model, store=placed)
+    session.unpacked = None
+
+
+def on_capture(
+    session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any
+) -> Any:
+    """Thresholds inside the host's checkpoint."""
+    result = wrapped(*args, **kwargs)
+    state = session.models.get(model)
+    if state is not None and not state.store.neutral:
+        session.expect_rows(model, state, str(seam))
+        session.adapter.checkpoint_state(result)["fragprune"] = state.store.state_dict()
+    return result
+
+
+def on_restore(
+    session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any
+) -> Any:
+    """Thresholds out of the host's checkpoint."""
+    bound = signature(wrapped).bind(*args, **kwargs)
+    capture = session.adapter.before_restore(model, bound.arguments[seam.needs[0]])
+    bound.arguments[seam.needs[0]] = capture
+    saved = session.adapter.checkpoint_state(capture).pop("fragprune", None)
+    result = wrapped(*bound.args, **bound.kwargs)
+    state = session.models.get(model)
+    if saved is not None:
+        if state is None:
+            device = session.adapter.means(model).device
+            state = session.models[model] = ModelState(ThresholdStore(0, device))
+        state.store.load_state_dict(saved)
+        session.expect_rows(model, state, str(seam))
+    return result
+
+
+def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
+    """(M,) for each mean (M, 3) the first row among (N, 3) with the same bits."""
+    known, wanted = among.detach().cpu().numpy(), means.numpy()
+    both = np.concatenate([known, wanted])
+    _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    rows = first[which.reshape(-1)[len(known) :]]
+    if (rows >= len(known)).any():
+        raise AlignmentError(
+            where,
+            f"{int((rows >= len(known)).sum())} of {len(wanted)} positions that no Gaussian has",
+            f"positions of the {len(known)} Gaussians",
+            "Report this with the host's commit: it packs another model.",
+        )
+    return torch.from_numpy(rows)
+
+
+OF_CALLS: dict[Role, Callable[..., Any]] = {
+    Role.PACK: on_pack,
+    Role.UNPACK: on_unpack,
+}
+
+
+OF_MODELS: dict[Role, Callable[..., Any]] = {
+    Role.SAVE: on_save,
+    Role.LOAD: on_load,
+    Role.CAPTURE: on_capture,
+    Role.RESTORE: on_restore,
+}

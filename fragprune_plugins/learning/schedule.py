@@ -1,0 +1,134 @@
+"""When thresholds learn, how fast, and under what pressure."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.pressure import (
+    ElasticPressure,
+    FixedPressure,
+    Pressure,
+    PressureController,
+)
+
+Train = Literal["opacity", "appearance", "all"]
+
+FINETUNE_ITERATIONS = 5000
+QUICK_ITERATIONS = 1000
+_DECAY = 0.1  # learning rates fall to this share over the run, exponentially
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a fine-tuning is asked to do; recorded in the sidecar.
+
+    Attributes:
+        iterations: optimizer steps of stage 2.
+        train: what moves beside the thresholds: "opacity", "appearance" (opacity and SH) or "all".
+        pressure: lambda, weight of drawn fragments per pixel in the loss; None for one that
+            follows the loss per fragment.
+        target_speedup: fragments before over after to steer for; overrides pressure.
+        threshold_lr: initial learning rate of threshold logits.
+        opacity_lr: initial learning rate of opacity logits in stage 2.
+        truncate: False trains without thresholds, the honest control for a comparison.
+        seed: of the view order where ours is used.
+    """
+
+    iterations: int = FINETUNE_ITERATIONS
+    train: Train = "opacity"
+    pressure: float | None = None
+    target_speedup: float | None = None
+    threshold_lr: float = 0.05
+    opacity_lr: float = 0.01
+    truncate: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise UsageError("iterations", str(self.iterations), "1 or more", "Raise --iters.")
+        if self.pressure is not None and not 0 <= self.pressure < 1:
+            raise UsageError(
+                "pressure", f"{self.pressure:g}", "0 <= X < 1 (1e-4 is usual)", "Change --pressure."
+            )
+        if self.target_speedup is not None and not 1 < self.target_speedup <= 20:
+            raise UsageError(
+                "target speed-up",
+                f"{self.target_speedup:g}",
+                "1 < X <= 20, fragments before over after",
+                "Change --target-speedup.",
+            )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for the sidecar and ``--json``."""
+        return asdict(self)
+
+    def make_pressure(self) -> Pressure:
+        """The pressure these settings ask for."""
+        if not self.truncate:
+            return FixedPressure(0.0)
+        if self.target_speedup is not None:
+            return PressureController(self.target_speedup)
+        return ElasticPressure() if self.pressure is None else FixedPressure(self.pressure)
+
+
+@dataclass(frozen=True)
+class StepPlan:
+    """What one step does.
+
+    Attributes:
+        learn: thresholds are learned and applied.
+        threshold_lr: learning rate of their logits.
+        opacity_lr: learning rate the opacity group gets, None to leave the host's.
+        progress: share of the learning that is over, 0 to 1.
+    """
+
+    learn: bool
+    threshold_lr: float
+    opacity_lr: float | None
+    progress: float
+
+
+class Schedule:
+    """Stage 2 after training: learn from the first step, learning rates decay tenfold.
+
+    Subclass and return an instance from ``fragprune_create_schedule`` to change it.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+
+    def at(self, step: int) -> StepPlan:
+        """The plan of a step, counted from 1 by the session."""
+        progress = min(1.0, max(0.0, (step - 1) / max(1, self.settings.iterations - 1)))
+        decay = _DECAY**progress
+        return StepPlan(
+            learn=True,
+            threshold_lr=self.settings.threshold_lr * decay,
+            opacity_lr=self.settings.opacity_lr * decay,
+            progress=progress,
+        )
+
+
+class JointSchedule(Schedule):
+    """Thresholds learn inside the host's own training, from one iteration on.
+
+    Args:
+        settings: ``iterations`` is the host's whole run.
+        from_step: first step that learns.
+        every: when set, learning alternates: ``every`` steps on, ``every`` steps held.
+    """
+
+    def __init__(self, settings: Settings, from_step: int, every: int | None = None) -> None:
+        super().__init__(settings)
+        self.from_step, self.every = from_step, every
+
+    def at(self, step: int) -> StepPlan:
+        """Neutral before ``from_step``; the opacity rate stays the host's."""
+        span = max(1, self.settings.iterations - self.from_step)
+        progress = min(1.0, max(0.0, (step - self.from_step) / span))
+        on = step >= self.from_step and (
+            self.every is None or ((step - self.from_step) // self.every) % 2 == 0
+        )
+        return StepPlan(on, self.settings.threshold_lr * _DECAY**progress, None, progress)

@@ -1,0 +1,1 @@
+"""Plugins: the hooks they may answer, how they are found, and our own answers."""

@@ -1,0 +1,268 @@
+"""Trained splats on disk: the PLY layout that all descendants of 3DGS share.
+
+One ``vertex`` element of float32 columns, values before activation: x y z, nx ny nz (zeros),
+f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
+(logit), scale_0..2 (log), rot_0..3 (w x y z, any length). ``fragprune export`` adds one column,
+``trunc_threshold``: the threshold itself, in falloff, in (0, 1). Unknown columns are ignored,
+except Mip-Splatting's ``filter_3D``: its models are drawn by rules of their own, so only who knows
+these may read them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import InputError, ModelFileError
+from fragprune_plugins.storage.atomic import replacing
+from fragprune_plugins.types import Splats
+
+THRESHOLD_COLUMN = "trunc_threshold"
+
+_XYZ = ("x", "y", "z")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_FILTER = "filter_3D"
+_REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
+_REMEDY = "Pass the point_cloud.ply that a 3DGS training saved."
+
+
+@dataclass(frozen=True, eq=False)
+class SplatFile:
+    """A splat as its file holds it: N Gaussians, before activation, float32.
+
+    Attributes:
+        xyz: (N, 3) means, world.
+        f_dc: (N, 1, 3) first SH coefficient.
+        f_rest: (N, K - 1, 3) the others, K = (degree + 1)^2.
+        opacity: (N, 1) logits.
+        scaling: (N, 3) logarithms of standard deviations.
+        rotation: (N, 4) quaternions w, x, y, z of any length.
+        thresholds: (N,) truncation thresholds in (0, 1) where the file carries them.
+        filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units: it widens
+            every axis and dims what it widens.
+    """
+
+    xyz: Tensor
+    f_dc: Tensor
+    f_rest: Tensor
+    opacity: Tensor
+    scaling: Tensor
+    rotation: Tensor
+    thresholds: Tensor | None = None
+    filter_3d: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz)
+        shapes = {
+            "xyz": (n, 3),
+            "f_dc": (n, 1, 3),
+            "f_rest": (n, self.f_rest.shape[1] if self.f_rest.ndim == 3 else 0, 3),
+            "opacity": (n, 1),
+            "scaling": (n, 3),
+            "rotation": (n, 4),
+        }
+        for name, shape in shapes.items():
+            if tuple(getattr(self, name).shape) != shape:
+                found = tuple(getattr(self, name).shape)
+                raise InputError(f"SplatFile.{name}", f"shape {found}", f"{shape}", "Check it.")
+        if 3 * self.f_rest.shape[1] not in _REST_COUNTS:
+            raise InputError(
+                "SplatFile.f_rest",
+                f"{self.f_rest.shape[1]} coefficients",
+                "0, 3, 8 or 15 (SH degree 0 to 3)",
+                "Check it.",
+            )
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def sh_degree(self) -> int:
+        """0 to 3, from the number of coefficients."""
+        return _REST_COUNTS[3 * self.f_rest.shape[1]]
+
+    def splats(self) -> Splats:
+        """The Gaussians activated, as engines take them; differentiable."""
+        opacities, scales = torch.sigmoid(self.opacity[:, 0]), torch.exp(self.scaling)
+        if self.filter_3d is not None:
+            wider = (scales.square() + self.filter_3d.square()).sqrt()
+            opacities = opacities * (scales / wider).prod(dim=1)
+            scales = wider
+        return Splats(
+            means=self.xyz,
+            opacities=opacities,
+            scales=scales,
+            rotations=torch.nn.functional.normalize(self.rotation),
+            sh=torch.cat([self.f_dc, self.f_rest], dim=1),
+            sh_degree=self.sh_degree,
+        )
+
+
+def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
+    """Read a trained splat; SH degree follows from the number of f_rest columns.
+
+    Args:
+        path: the file.
+        filtered: accept a model with a 3D filter; the caller draws it by Mip-Splatting's rules.
+
+    Raises:
+        ModelFileError: missing, truncated, not a PLY, not a Gaussian splat, empty or not finite.
+    """
+    path = Path(path)
+    rows = _read_vertices(path)
+    names = rows.dtype.names or ()
+    missing = [name for name in (*_XYZ, *_DC, "opacity", *_SCALES, *_ROTATION) if name not in names]
+    if missing == list(_DC):
+        raise ModelFileError(
+            str(path),
+            "Gaussians without colours, as codebases save them that keep colours in a network: "
+            "activated already",
+            "a splat that holds its colours, before activation",
+            "Fine-tune with fragprune run inside that host.",
+        )
+    if missing:
+        raise ModelFileError(
+            str(path),
+            f"a PLY without {', '.join(missing)}",
+            "the columns of a Gaussian splat",
+            "A point cloud or mesh is not a trained splat. " + _REMEDY,
+        )
+    if _FILTER in names and not filtered:
+        raise ModelFileError(
+            str(path),
+            "a Mip-Splatting model, whose 3D filter (filter_3D) changes shapes and opacities",
+            "a splat that is drawn as it is stored",
+            "Fuse the filter first (create_fused_ply.py there), or fine-tune with fragprune run.",
+        )
+    rest = sorted(
+        (name for name in names if name.startswith("f_rest_") and name[7:].isdigit()),
+        key=lambda name: int(name[7:]),
+    )
+    if len(rest) not in _REST_COUNTS or rest != [f"f_rest_{i}" for i in range(len(rest))]:
+        raise ModelFileError(
+            str(path),
+            f"{len(rest)} f_rest columns",
+            "0, 9, 24 or 45 (SH degree 0 to 3), numbered from 0",
+            _REMEDY,
+        )
+    if len(rows) == 0:
+        raise ModelFileError(str(path), "0 Gaussians", "at least one", _REMEDY)
+
+    def column(*wanted: str) -> Tensor:
+        data = np.stack([np.asarray(rows[name], dtype=np.float32) for name in wanted], axis=1)
+        _require_finite(path, wanted, data)
+        return torch.from_numpy(data)
+
+    return SplatFile(
+        xyz=column(*_XYZ),
+        f_dc=column(*_DC)[:, None, :],
+        f_rest=(
+            column(*rest).reshape(len(rows), 3, -1).transpose(1, 2).contiguous()
+            if rest
+            else torch.zeros(len(rows), 0, 3)
+        ),
+        opacity=column("opacity"),
+        scaling=column(*_SCALES),
+        rotation=column(*_ROTATION),
+        thresholds=(
+            _checked_thresholds(path, column(THRESHOLD_COLUMN)[:, 0])
+            if THRESHOLD_COLUMN in names
+            else None
+        ),
+        filter_3d=column(_FILTER) if _FILTER in names else None,
+    )
+
+
+def write_ply(path: Path, model: SplatFile, thresholds: Tensor | None = None) -> None:
+    """Write a splat as hosts do, bit for bit what ``read_ply`` gave; atomically.
+
+    Args:
+        path: the file; an existing one is replaced only when the new one is complete.
+        model: the Gaussians.
+        thresholds: (N,) written as the last column ``trunc_threshold`` when given.
+
+    Raises:
+        OutputError: the place cannot be written.
+    """
+    from plyfile import PlyData, PlyElement
+
+    n = len(model)
+    rest = model.f_rest.transpose(1, 2).reshape(n, -1)
+    columns: list[tuple[tuple[str, ...], Tensor]] = [
+        (_XYZ, model.xyz),
+        (("nx", "ny", "nz"), torch.zeros(n, 3)),
+        (_DC, model.f_dc[:, 0]),
+        (tuple(f"f_rest_{i}" for i in range(rest.shape[1])), rest),
+        (("opacity",), model.opacity),
+        (_SCALES, model.scaling),
+        (_ROTATION, model.rotation),
+    ]
+    if model.filter_3d is not None:
+        columns.append(((_FILTER,), model.filter_3d))
+    if thresholds is not None:
+        columns.append(((THRESHOLD_COLUMN,), thresholds.reshape(n, 1)))
+    names = [name for group, _ in columns for name in group]
+    table = torch.cat([values.detach().cpu().float() for _, values in columns], dim=1)
+    rows = np.ascontiguousarray(table.numpy()).view([(name, "<f4") for name in names])[:, 0]
+    with replacing(path) as temporary:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+
+
+def _read_vertices(path: Path) -> np.ndarray[Any, Any]:
+    from plyfile import PlyData, PlyParseError
+
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise ModelFileError(str(path), found, "a trained splat (.ply)", _REMEDY)
+    if path.suffix == ".pth":
+        raise ModelFileError(
+            str(path),
+            "a training codebase's checkpoint, which only that codebase can draw",
+            "a trained splat (.ply)",
+            "Pass its PLY; a host without one (4D models among them) is fine-tuned and drawn "
+            "through its own script, with fragprune run.",
+        )
+    try:
+        file = PlyData.read(str(path))
+        return np.asarray(file["vertex"].data)
+    except KeyError as error:
+        found = "a PLY without a vertex element"
+        raise ModelFileError(str(path), found, "a Gaussian splat", _REMEDY) from error
+    except (PlyParseError, ValueError, OSError) as error:
+        raise ModelFileError(
+            str(path),
+            f"not readable as PLY ({error})",
+            "a complete PLY file",
+            "The file is of another kind or was cut off: copy or save it again.",
+        ) from error
+
+
+def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, Any]) -> None:
+    bad = ~np.isfinite(data)
+    if bad.any():
+        where = ", ".join(n for n, b in zip(names, bad.any(axis=0), strict=True) if b)
+        raise ModelFileError(
+            str(path),
+            f"NaN or infinity in {int(bad.any(axis=1).sum())} of {len(data)} rows ({where})",
+            "finite numbers",
+            "The training that wrote it diverged; use an earlier checkpoint.",
+        )
+
+
+def _checked_thresholds(path: Path, values: Tensor) -> Tensor:
+    outside = int(((values <= 0) | (values >= 1)).sum())
+    if outside:
+        raise ModelFileError(
+            str(path),
+            f"{THRESHOLD_COLUMN} outside (0, 1) in {outside} rows",
+            "falloff thresholds in (0, 1)",
+            "Export the model again with fragprune export.",
+        )
+    return values

@@ -1,0 +1,125 @@
+"""The sidecar: a safetensors file beside the host's own that carries a threshold store.
+
+``point_cloud.ply`` gets ``point_cloud.fragprune.safetensors``. Its metadata names the model file's
+digest and row count, so a stale pair is refused; the host's file stays as the host wrote it.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.errors import SidecarError
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage.atomic import digest, replacing
+
+SUFFIX = ".fragprune.safetensors"
+FORMAT = "fragprune-thresholds-1"
+
+
+@dataclass(frozen=True)
+class SidecarInfo:
+    """What a sidecar says of itself.
+
+    Attributes:
+        rows: number of Gaussians.
+        model_sha256: digest of the model file it belongs to.
+        adapter: name of the adapter that wrote it, "" when written without a host.
+        host_commit: the host checkout's commit, "" when unknown.
+        settings: what the fine-tuning was asked to do.
+    """
+
+    rows: int
+    model_sha256: str
+    adapter: str = ""
+    host_commit: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def path_beside(model: Path) -> Path:
+    """Where a model file's sidecar lies."""
+    return Path(model).with_suffix(SUFFIX)
+
+
+def save(
+    model: Path,
+    store: ThresholdStore,
+    *,
+    adapter: str = "",
+    host_commit: str = "",
+    settings: dict[str, Any] | None = None,
+) -> Path:
+    """Write the store beside a model file that is already there; returns the sidecar's path.
+
+    Raises:
+        OutputError: the place cannot be written.
+    """
+    from safetensors.torch import save_file
+
+    state = store.state_dict()
+    tensors = {k: v.cpu().contiguous() for k, v in state.items() if isinstance(v, torch.Tensor)}
+    metadata = {
+        "format": FORMAT,
+        "rows": str(len(store)),
+        "model_sha256": digest(model),
+        "adam_step": repr(state["adam_step"]),
+        "steps": str(state["steps"]),
+        "adapter": adapter,
+        "host_commit": host_commit,
+        "settings": json.dumps(settings or {}, sort_keys=True),
+    }
+    target = path_beside(model)
+    with replacing(target) as temporary:
+        save_file(tensors, temporary, metadata=metadata)
+    return target
+
+
+def load(model: Path, store: ThresholdStore | None = None) -> tuple[ThresholdStore, SidecarInfo]:
+    """Read the sidecar of a model file, into ``store`` or a new one on the CPU.
+
+    Raises:
+        SidecarError: missing, unreadable, or written for another model file.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = path_beside(model)
+    remedy = f"Remove {path.name}, or write it again with fragprune finetune."
+    if not path.exists():
+        raise SidecarError(str(path), "no such file", "a sidecar beside the model", remedy)
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        if metadata.get("format") != FORMAT:
+            raise KeyError("format")
+        info = SidecarInfo(
+            rows=int(metadata["rows"]),
+            model_sha256=metadata["model_sha256"],
+            adapter=metadata["adapter"],
+            host_commit=metadata["host_commit"],
+            settings=json.loads(metadata["settings"]),
+        )
+        state = tensors | {
+            "adam_step": float(metadata["adam_step"]),
+            "steps": int(metadata["steps"]),
+        }
+        if not {"logits", "exp_avg", "exp_avg_sq"} <= tensors.keys():
+            raise KeyError("logits")
+    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        raise SidecarError(
+            str(path), f"unreadable ({error})", f"a file of format {FORMAT}", remedy
+        ) from error
+    if digest(model) != info.model_sha256 or tuple(tensors["logits"].shape) != (info.rows,):
+        raise SidecarError(
+            str(path),
+            f"thresholds of another model (sha256 {info.model_sha256[:12]}, {info.rows} rows)",
+            f"those of {Path(model).name} (sha256 {digest(model)[:12]})",
+            remedy,
+        )
+    store = ThresholdStore(info.rows) if store is None else store  # an empty store is false
+    store.load_state_dict(state)
+    return store, info
