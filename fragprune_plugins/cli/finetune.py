@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -21,9 +21,6 @@ from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage.models import load_model, load_store
-
-if TYPE_CHECKING:
-    from fragprune_plugins.finetuning.loop import Record
 
 
 @click.command("finetune", cls=Command)
@@ -81,40 +78,43 @@ def command(
     store = None if thresholds is None else load_store(model, splat)
 
     result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
+    done = result.progress
     save(out, result)
-    if curves is not None and result.records:
-        from fragprune_plugins.measure.pictures import save_curves
+    rows = [asdict(point) for point in result.curves]
+    if curves is not None and result.thresholds is not None:
+        from fragprune_plugins.measure.report_page import save_learning
 
-        save_curves(curves, result.records)
+        save_learning(curves, rows, result.thresholds)
     before, after = measure(
         [Candidate(splat, thresholds), Candidate(result.model, result.thresholds)],
         dataset.test,
         engine=rasterizer,
     )
-    pressure = f" at pressure {result.records[-1].pressure:.2g}" if result.records else ""
+    pressure = f" at pressure {done.pressure:.2g}" if settings.truncate else ""
     quote = (
         f"{gain(before, after)} that were held out ({after['engine']} engine, "
-        f"{result.iterations} iterations{pressure} in {result.train_seconds:.0f} s)."
+        f"{done.steps} iterations{pressure} in {result.train_seconds:.0f} s)."
     )
     lines = [describe({"before": before, "after": after}), "", quote]
-    if result.target_reached is False:
+    if done.target_reached is False:
         lines.append(
-            f"The target of {settings.target_speedup:g}x was missed: {result.speedup:.2f}x fewer "
-            "fragments than untruncated. More --iters or another target may help."
+            f"The target of {settings.target_speedup:g}x was missed: "
+            f"{done.speedup or 1:.2f}x fewer fragments on the training views. "
+            "More --iters or another target may help."
         )
     if result.interrupted:
-        lines.append(f"Interrupted at {result.iterations} of {settings.iterations} iterations.")
+        lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations.")
     lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.")
     report = {
         "model": str(model),
         "out": str(out),
         "before": before,
         "after": after,
-        "speedup": result.speedup,
-        "target_reached": result.target_reached,
+        "speedup": done.speedup,
+        "target_reached": done.target_reached,
         "interrupted": result.interrupted,
-        "iterations": result.iterations,
-        "pressure": result.records[-1].pressure if result.records else None,
+        "iterations": done.steps,
+        "pressure": done.pressure if settings.truncate else None,
         "train_seconds": result.train_seconds,
         "engine": result.engine,
         "device": after["device"],
@@ -123,7 +123,7 @@ def command(
         "settings": settings.as_dict(),
     }
     more = {
-        "curves": [_row(record) for record in result.records],
+        "curves": rows,
         "photographs": {
             "folder": str(data.resolve()),
             "resolution": resolution,
@@ -135,14 +135,3 @@ def command(
     }
     records.leave(out, "finetune", report | more)
     return Report(report, "\n".join(lines), exit_code=130 if result.interrupted else 0)
-
-
-def _row(record: Record) -> dict[str, float]:
-    """A point of the curves as a host's run records it."""
-    return {
-        "step": record.step,
-        "loss": record.loss,
-        "fragments_per_pixel": record.fragments_per_pixel,
-        "pressure": record.pressure,
-        "threshold_median": record.thresholds[len(record.thresholds) // 2],
-    }

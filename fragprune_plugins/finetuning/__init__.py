@@ -1,6 +1,6 @@
 """Fine-tuning a trained splat on its photographs, without a host."""
 
 from fragprune_plugins.datasets.dataset import Dataset, Shot, load_dataset
-from fragprune_plugins.finetuning.loop import FinetuneResult, Record, finetune, save
+from fragprune_plugins.finetuning.loop import FinetuneResult, finetune, save
 
-__all__ = ["Dataset", "FinetuneResult", "Record", "Shot", "finetune", "load_dataset", "save"]
+__all__ = ["Dataset", "FinetuneResult", "Shot", "finetune", "load_dataset", "save"]

@@ -15,7 +15,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from fragprune_plugins.learning.thresholds import ThresholdStore
+
+    Figure = float | Tensor
 
 LEAST_PRESSURE = 1e-4
 """What a loss per fragment too small to matter (an overfitted model's) gets by default."""
@@ -111,28 +115,29 @@ class StepViews:
 
     It divides each view's loss by their number, so the pressure must be their mean as well. How
     many there will be shows only in the end: the step before tells, and the first step takes one.
+    Figures may be scalars on a device: they are waited for when they are read, not before.
 
     Attributes:
         expected: views a step.
     """
 
     expected: int = 1
-    _fragments: list[float] = field(default_factory=list)
-    _untruncated: list[float] = field(default_factory=list)
-    _losses: list[float] = field(default_factory=list)
+    _fragments: list[Figure] = field(default_factory=list)
+    _untruncated: list[Figure] = field(default_factory=list)
+    _losses: list[Figure] = field(default_factory=list)
 
     def begin(self) -> None:
         """A new step."""
         self.expected = self.drawn or self.expected
         self._fragments, self._untruncated, self._losses = [], [], []
 
-    def draw(self, fragments: float, untruncated: float) -> None:
+    def draw(self, fragments: Figure, untruncated: Figure) -> None:
         """A view was drawn with gradients: fragments per pixel, and those before learning."""
         self._fragments.append(fragments)
         self._untruncated.append(untruncated)
         self._losses.append(math.nan)
 
-    def lose(self, loss: float) -> None:
+    def lose(self, loss: Figure) -> None:
         """The loss of the view drawn last went backward."""
         self._losses[-1:] = [loss]
 
@@ -144,18 +149,22 @@ class StepViews:
     @property
     def fragments(self) -> float:
         """Per pixel, the mean over the views so far."""
-        return sum(self._fragments) / len(self._fragments)
+        return _mean(self._fragments)
 
     @property
     def untruncated(self) -> float:
         """Per pixel before learning, likewise."""
-        return sum(self._untruncated) / len(self._untruncated)
+        return _mean(self._untruncated)
 
     @property
     def loss(self) -> float:
         """The sum over the views so far, of those whose loss is known."""
-        known = [loss for loss in self._losses if not math.isnan(loss)]
+        known = [loss for loss in map(float, self._losses) if not math.isnan(loss)]
         return sum(known) if known else math.nan
+
+
+def _mean(figures: list[Figure]) -> float:
+    return sum(map(float, figures)) / len(figures)
 
 
 class PressureController:

@@ -82,12 +82,14 @@ class StepPlan:
         threshold_lr: learning rate of their logits.
         opacity_lr: learning rate the opacity group gets, None to leave the host's.
         progress: share of the learning that is over, 0 to 1.
+        decay: share of its initial learning rate that every other group gets which trains.
     """
 
     learn: bool
     threshold_lr: float
     opacity_lr: float | None
     progress: float
+    decay: float = 1.0
 
 
 class Schedule:
@@ -108,6 +110,7 @@ class Schedule:
             threshold_lr=self.settings.threshold_lr * decay,
             opacity_lr=self.settings.opacity_lr * decay,
             progress=progress,
+            decay=decay,
         )
 
 

@@ -14,7 +14,6 @@ from fragprune_plugins.storage.atomic import replacing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fragprune_plugins.finetuning.loop import Record
 
 COLOURS = "inferno"
 LABEL = "drawn fragments per pixel"
@@ -82,41 +81,6 @@ def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float)
                 interpolation="nearest",
             )
             grid.cbar_axes[0].colorbar(shown, label=LABEL)
-    _save(path, figure)
-
-
-def save_curves(path: Path, records: Sequence[Record]) -> None:
-    """Write loss, fragments and threshold quantiles over the steps of a fine-tuning."""
-    from matplotlib.figure import Figure
-
-    from fragprune_plugins.finetuning.loop import QUANTILES
-
-    steps = [record.step for record in records]
-    figure = Figure(figsize=(12, 3.4), layout="constrained")
-    loss, fragments, thresholds = figure.subplots(1, 3)
-    loss.plot(steps, [record.loss for record in records], color="tab:blue")
-    loss.set_ylabel("0.8 L1 + 0.2 (1 - SSIM)")
-    fragments.plot(steps, [r.fragments_per_pixel for r in records], color="tab:red")
-    fragments.set_ylabel(LABEL)
-    fragments.set_ylim(bottom=0)
-    rows = np.array([record.thresholds for record in records]).T
-    middle = len(QUANTILES) // 2
-    for low, shade in zip(range(middle), (0.2, 0.35), strict=True):
-        thresholds.fill_between(
-            steps,
-            rows[low],
-            rows[-1 - low],
-            color="tab:green",
-            alpha=shade,
-            linewidth=0,
-            label=f"{QUANTILES[low]:.0%} to {QUANTILES[-1 - low]:.0%}",
-        )
-    thresholds.plot(steps, rows[middle], color="tab:green", label="median")
-    thresholds.set_ylabel("truncation threshold (falloff)")
-    thresholds.legend(fontsize=8)
-    for axes in (loss, fragments, thresholds):
-        axes.set_xlabel("step")
-        axes.grid(alpha=0.25)
     _save(path, figure)
 
 

@@ -83,7 +83,7 @@ def save_learning(path: Path, curves: Sequence[dict[str, float]], thresholds: Te
     steps = np.array([row["step"] for row in curves])
     window = max(1, min(50, len(steps) // 4))
     for axes, key, color, label in (
-        (loss, "loss", "tab:purple", "loss of the host"),
+        (loss, "loss", "tab:purple", "loss, without the pressure"),
         (fragments, "fragments_per_pixel", "tab:red", "drawn fragments per pixel"),
     ):
         values = np.array([row[key] for row in curves])

@@ -64,7 +64,7 @@ def test_target_control_and_curves(scene, tmp_path):
     assert report["target_reached"] == (abs(1.5 / report["speedup"] - 1) <= 0.05)
     assert curves.exists()
     report = run_json(*arguments, "--control")
-    assert report["speedup"] == 1
+    assert report["speedup"] == pytest.approx(1, abs=0.02)  # opacities alone move
     assert sidecar.load(out)[0].neutral
 
 

@@ -8,9 +8,8 @@ from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.finetuning import Record
 from fragprune_plugins.measure import Candidate, evaluate, measure
-from fragprune_plugins.measure.pictures import save_curves, save_heatmap, save_image, save_panel
+from fragprune_plugins.measure.pictures import save_heatmap, save_image, save_panel
 
 NAMES = {
     "psnr",
@@ -71,17 +70,15 @@ def test_images_are_written_as_seen(tmp_path):
         assert picture.getpixel((1, 0)) == (255, 128, 64)
 
 
-def test_maps_panels_and_curves(tmp_path):
+def test_maps_and_panels(tmp_path):
     counts = torch.arange(12 * 16).reshape(12, 16)
     save_heatmap(tmp_path / "heat.png", counts, 191.0)
     save_panel(tmp_path / "panel.png", [("photo", torch.rand(3, 12, 16)), ("map", counts)], 191.0)
-    records = [Record(i, 1 / i, 40 / i, 1e-4, (0.01, 0.02, 0.03, 0.04, 0.05)) for i in (1, 2, 3)]
-    save_curves(tmp_path / "curves.png", records)
-    for name in ("heat", "panel", "curves"):
+    for name in ("heat", "panel"):
         with Image.open(tmp_path / f"{name}.png") as picture:
             assert min(picture.size) > 100
             assert len(picture.convert("RGB").getcolors(1 << 20)) > 20
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_unwritable_place(tmp_path):

@@ -1,0 +1,265 @@
+"""Stage 2: thresholds learn beside what else trains, whoever drives the training.
+
+This module knows neither a host nor a data set. A driver, which owns the views, the loss and the
+optimizer of everything but the thresholds, tells it what happens, in this order in every step:
+
+    begin       the step is counted and planned; new thresholds open; a due target is met
+    thresholds  what one rasterization is drawn with
+    drew        what came of it; the fragment pressure, a term for the driver's loss, comes back
+    lost        the loss of the view drawn last went backward
+    end         the driver's optimizer stepped; the thresholds step too
+
+Fragments "before" are those of a view drawn without thresholds at its first visit, fragments
+"after" those it was last drawn with. A speed-up is the one over the other, summed over views that
+were learned from. Results on held-out views are for the driver to measure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.pressure import (
+    CALIBRATE_AT,
+    CALIBRATION_VIEWS,
+    TARGET_TOLERANCE,
+    Observation,
+    StepViews,
+    calibrate,
+)
+from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+CURVE_POINTS = 100
+"""Thresholds' median, a sort of all rows, is taken this often in a run."""
+
+Truncate = Callable[[RasterInputs, ThresholdStore], Tensor | None]
+"""Gives the thresholds (N,) to draw one rasterization with; None draws without."""
+
+
+def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
+    """The store's own, none while it is neutral."""
+    return None if store.neutral else store.values
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a stage 2 has done so far.
+
+    Attributes:
+        steps: begun.
+        gaussians: N.
+        fragments_before: per pixel, mean over views; None where no view was drawn.
+        fragments_after: likewise.
+        speedup: before over after; where a target was met, as measured when it was met.
+        target_reached: ``speedup`` is within 5 % of the target; None without a target.
+        pressure: lambda.
+    """
+
+    steps: int
+    gaussians: int
+    fragments_before: float | None
+    fragments_after: float | None
+    speedup: float | None
+    target_reached: bool | None
+    pressure: float
+
+
+class Stage2:
+    """One population of Gaussians learning its thresholds.
+
+    Args:
+        store: the thresholds; changed in place.
+        settings: what was asked for.
+        schedule: when what learns how fast; stage 2 as the paper has it when None.
+        truncate: gives the thresholds to draw with; the hook ``fragprune_truncate``.
+        redraw: draws a view again, without gradients, ending in ``drew``; needed for a target.
+        watch: told of every step that is over.
+    """
+
+    def __init__(
+        self,
+        store: ThresholdStore,
+        settings: Settings,
+        schedule: Schedule | None = None,
+        *,
+        truncate: Truncate = learned_thresholds,
+        redraw: Callable[[Any], object] | None = None,
+        watch: Callable[[StepStats], None] | None = None,
+    ) -> None:
+        self.store, self.settings = store, settings
+        self.schedule = schedule or Schedule(settings)
+        self.pressure = settings.make_pressure()
+        self.steps = 0
+        self.plan: StepPlan | None = None
+        self._truncate, self._redraw, self._watch = truncate, redraw, watch
+        self._held = False  # thresholds have met their target and stay
+        self._met: float | None = None  # the speed-up they met it with
+        self._before: dict[tuple[Hashable, int], Tensor] = {}
+        self._after: dict[tuple[Hashable, int], Tensor] = {}
+        self._views = StepViews()
+        self._median = math.nan
+
+    @property
+    def learning(self) -> bool:
+        """Whether this step moves thresholds."""
+        plan = self.plan
+        return plan is not None and plan.learn and self.settings.truncate and not self._held
+
+    @property
+    def viewed(self) -> bool:
+        """Whether any view was drawn with thresholds while they learned."""
+        return bool(self._after)
+
+    def begin(self, opacities: Callable[[], Tensor]) -> StepPlan:
+        """A step begins.
+
+        Args:
+            opacities: gives the activated opacities, (N,) or (N, 1), when they are needed.
+        """
+        self.close()
+        self.steps += 1
+        self.plan = self.schedule.at(self.steps)
+        self._views.begin()
+        if self.plan.learn and self.settings.truncate:
+            self.store.open(opacities())
+            self._meet_target(self.plan.progress)
+        return self.plan
+
+    def thresholds(self, inputs: RasterInputs) -> Tensor | None:
+        """(N,) to draw a rasterization with; differentiable where thresholds learn; or None."""
+        if not self.settings.truncate:
+            return None
+        values = self._truncate(inputs, self.store)
+        return values if values is None or self.learning else values.detach()
+
+    def drew(
+        self,
+        view: Hashable,
+        outputs: RasterOutputs,
+        untruncated: Callable[[], RasterOutputs],
+        part: int = 0,
+    ) -> Tensor | None:
+        """A rasterization was drawn with what ``thresholds`` gave.
+
+        Args:
+            view: tells views apart.
+            outputs: of the engine.
+            untruncated: draws the same without thresholds, at the view's first visit.
+            part: of a view whose driver draws several pictures at once.
+
+        Returns:
+            The fragment pressure, a scalar to add to the loss; None where nothing is to be added.
+        """
+        picture = view, part
+        learns = torch.is_grad_enabled() and self.plan is not None and self.plan.learn
+        if learns and picture not in self._before:
+            with torch.no_grad():
+                self._before[picture] = untruncated().fragments_per_pixel.detach()
+        if picture in self._before:
+            self._after[picture] = outputs.fragments_per_pixel.detach()
+        if not learns:
+            return None
+        self._views.draw(self._after[picture], self._before[picture])
+        if not self.learning or self.pressure.value == 0:
+            return None
+        return outputs.fragments_per_pixel * (self.pressure.value / self._views.expected)
+
+    def lost(self, loss: Tensor) -> None:
+        """The loss of the view drawn last, without the pressure, went backward."""
+        self._views.lose(loss.detach())
+
+    def rate(self, name: str, base: float) -> float:
+        """The learning rate in this step of a parameter group that the driver trains.
+
+        Args:
+            name: of the group; "opacity" has a rate of its own.
+            base: the rate that the group had when stage 2 began.
+        """
+        if self.plan is None:
+            return base
+        if name == "opacity" and self.plan.opacity_lr is not None:
+            return self.plan.opacity_lr
+        return base * self.plan.decay
+
+    def end(self) -> None:
+        """The driver's optimizer has stepped: so do the thresholds."""
+        if self.learning:
+            assert self.plan is not None
+            self.store.step(self.plan.threshold_lr)
+
+    def close(self) -> None:
+        """A step is over and known whole: tell the pressure and whoever watches. Once a step."""
+        plan, views = self.plan, self._views
+        if plan is None or not views.drawn:
+            return
+        every = max(1, self.settings.iterations // CURVE_POINTS)
+        if math.isnan(self._median) or self.steps % every == 0:
+            self._median = float(self.store.values.detach().median())
+        stats = StepStats(
+            step=self.steps,
+            fragments_per_pixel=views.fragments,
+            pressure=self.pressure.value,
+            threshold_median=self._median,
+            loss=views.loss,
+        )
+        if self.learning:
+            self.pressure.observe(
+                Observation(plan.progress, views.fragments, views.untruncated, views.loss)
+            )
+        views.begin()  # first, so that whoever watches may raise
+        if self._watch is not None:
+            self._watch(stats)
+
+    def progress(self) -> Progress:
+        """What was done so far."""
+        before, after = _mean(self._before), _mean(self._after)
+        speedup, target = self._met, self.settings.target_speedup
+        if speedup is None and before is not None and after:
+            speedup = before / after
+        reached = None
+        if target is not None:
+            reached = speedup is not None and abs(target / speedup - 1) <= TARGET_TOLERANCE
+        return Progress(
+            steps=self.steps,
+            gaussians=len(self.store),
+            fragments_before=before,
+            fragments_after=after,
+            speedup=speedup,
+            target_reached=reached,
+            pressure=self.pressure.value,
+        )
+
+    def _meet_target(self, progress: float) -> None:
+        """Late in the run, and again before its last step, shift all thresholds onto the target."""
+        target, views = (
+            self.settings.target_speedup,
+            list(dict.fromkeys(v for v, _ in self._before)),
+        )
+        due = progress >= 1.0 or (progress >= CALIBRATE_AT and not self._held)
+        if target is None or self._redraw is None or not due or not views:
+            return
+        views = views[:: -(-len(views) // CALIBRATION_VIEWS)]
+        pictures = [picture for picture in self._before if picture[0] in set(views)]
+        before = sum(float(self._before[picture]) for picture in pictures)
+        redraw = self._redraw
+
+        @torch.no_grad()
+        def speedup() -> float:
+            for view in views:
+                redraw(view)
+            return before / max(sum(float(self._after[each]) for each in pictures), 1e-9)
+
+        self._met = calibrate(self.store, speedup, target)
+        self._held = True
+
+
+def _mean(figures: dict[tuple[Hashable, int], Tensor]) -> float | None:
+    return float(torch.stack(list(figures.values())).mean()) if figures else None
