@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -165,7 +166,8 @@ class _Run:
         self.dataset, self.settings, self.engine = dataset, settings, engine
         self.curves: list[StepStats] = []
         self.done = 0
-        self.stage = Stage2(store, settings, schedule, redraw=self._draw, watch=self.curves.append)
+        again = {shot: partial(self._draw, shot) for shot in dataset.train}
+        self.stage = Stage2(store, settings, schedule, views=again, watch=self.curves.append)
         rates = {"opacity": settings.opacity_lr}
         if settings.train in ("appearance", "all"):
             rates |= _APPEARANCE

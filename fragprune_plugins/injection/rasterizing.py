@@ -16,9 +16,8 @@ from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.adapter import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.injection.saving import adopt
-from fragprune_plugins.injection.state import ModelState, Picture, named
+from fragprune_plugins.injection.state import ModelState, named
 from fragprune_plugins.injection.stepping import begin_step
-from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 if TYPE_CHECKING:
@@ -61,7 +60,8 @@ def on_view(
         begin_step(session, model, state)
     again = partial(draw_view, session, wrapped, model, view, args, kwargs)
     measured = session.settings.target_speedup is not None  # keeps the model alive: only if needed
-    if measured and state is not None and state.plan is not None and torch.is_grad_enabled():
+    learns = state is not None and state.stage is not None and state.stage.plan is not None
+    if measured and state is not None and learns and torch.is_grad_enabled():
         state.views[view] = again
     return again()
 
@@ -108,7 +108,10 @@ def on_rasterize(
     if state.store.neutral:
         return wrapped(*args, **kwargs)
     inputs = session.dialect.unpack(call)
-    thresholds = session.hook.fragprune_truncate(inputs=inputs, store=state.store)
+    stage = state.stage
+    thresholds = (
+        session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
+    )
     if thresholds is None:
         return wrapped(*args, **kwargs)
     thresholds = thresholds if rows is None else thresholds[rows]
@@ -125,37 +128,14 @@ def rasterize(
     part: int = 0,
 ) -> RasterOutputs:
     """With thresholds; learning, with the fragment pressure in the loss."""
-    picture = view, part
     engine = session.engine(inputs.splats.device)
     outputs = engine.rasterize(inputs, thresholds)
-    learns = torch.is_grad_enabled() and state.plan is not None and state.plan.learn
-    if learns and picture not in state.baseline:
-        with torch.no_grad():
-            untruncated = engine.rasterize(inputs, None)
-        state.baseline[picture] = float(untruncated.fragments_per_pixel)
-    if picture in state.baseline:
-        state.drawn[picture] = float(outputs.fragments_per_pixel.detach())
-    return press(session, state, picture, outputs) if learns else outputs
-
-
-def press(
-    session: Session, state: ModelState, picture: Picture, outputs: RasterOutputs
-) -> RasterOutputs:
-    """Put the fragment pressure into the host's loss and keep this step's figures."""
-    plan = state.plan
-    assert plan is not None
-    state.step_views.draw(state.drawn[picture], state.baseline[picture])
-    state.stats = StepStats(
-        step=state.steps - session.from_step,
-        fragments_per_pixel=state.step_views.fragments,
-        pressure=session.pressure.value,
-        threshold_median=float(state.store.values.detach().median()),
-        loss=state.step_views.loss,
-    )
-    if session.pressure.value == 0 or state.held or not outputs.image.requires_grad:
+    if state.stage is None:
         return outputs
-    term = outputs.fragments_per_pixel * (session.pressure.value / state.step_views.expected)
-    return replace(outputs, image=_AddToLoss.apply(outputs.image, term))  # type: ignore[no-untyped-call]
+    pressure = state.stage.drew(view, outputs, lambda: engine.rasterize(inputs, None), part)
+    if pressure is None or not outputs.image.requires_grad:
+        return outputs
+    return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure))  # type: ignore[no-untyped-call]
 
 
 def on_loss(session: Session, seam: Seam, wrapped: Any, tensor: Any, args: Any, kwargs: Any) -> Any:
@@ -163,9 +143,8 @@ def on_loss(session: Session, seam: Seam, wrapped: Any, tensor: Any, args: Any, 
     state = session.last_state
     if state is not None and tensor.numel() == 1:
         state.begun = False
-        if state.stats is not None:
-            state.step_views.lose(float(tensor.detach()))
-            state.stats = replace(state.stats, loss=state.step_views.loss)
+        if state.stage is not None:
+            state.stage.lost(tensor)
     return wrapped(*args, **kwargs)
 
 

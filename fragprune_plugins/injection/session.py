@@ -29,13 +29,14 @@ from fragprune_plugins.hosts.seams import Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import aligning, rasterizing, saving, stepping
 from fragprune_plugins.injection.patching import PatchLedger
-from fragprune_plugins.injection.state import ModelState, mean, named
-from fragprune_plugins.learning.events import PopulationChange, Summary
-from fragprune_plugins.learning.pressure import TARGET_TOLERANCE, FixedPressure, Pressure
+from fragprune_plugins.injection.state import ModelState, named
+from fragprune_plugins.learning.events import PopulationChange, StepStats, Summary
 from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.storage import sidecar
+from fragprune_plugins.types import RasterInputs
 
 log = logging.getLogger("fragprune")
 
@@ -92,7 +93,6 @@ class Session:
         self.learn, self.from_step, self.freeze = learn, from_step, freeze
         self.start = start
         self.schedule = schedule or self.hook.fragprune_create_schedule(settings=self.settings)
-        self.pressure: Pressure = self.settings.make_pressure() if learn else FixedPressure(0.0)
         self.output = output
         self.curves: list[dict[str, float]] = []
         self._engine_name = engine
@@ -195,21 +195,18 @@ class Session:
     def finish(self) -> Summary:
         """What was gained; observers are told."""
         state = self.last_state
-        if state is not None:
-            self.report(state)
-        before = mean(state.baseline) if state else None
-        after = mean(state.drawn) if state else None
-        target, reached = self.settings.target_speedup, None
-        if target is not None and before and after:
-            reached = abs(after * target / before - 1) <= TARGET_TOLERANCE
+        stage = state.stage if state else None
+        if stage is not None:
+            stage.close()
+        done = stage.progress() if stage else None
         summary = Summary(
             adapter=self.adapter.name,
             engine=self._engine.name if self._engine else "",
-            steps=self.learned(state) if state else 0,
+            steps=done.steps if done else 0,
             gaussians=len(state.store) if state else 0,
-            fragments_before=before,
-            fragments_after=after,
-            target_reached=reached,
+            fragments_before=done.fragments_before if done else None,
+            fragments_after=done.fragments_after if done else None,
+            target_reached=done.target_reached if done else None,
             settings=self.settings.as_dict(),
         )
         self.hook.fragprune_finished(summary=summary)
@@ -217,12 +214,11 @@ class Session:
 
     def expect_drawn(self) -> None:
         """Raise where steps were counted as learned and no view was drawn with thresholds."""
-        state = self.last_state
-        steps = self.learned(state) if state else 0
-        if steps and self.settings.truncate and not (state and state.drawn):
+        stage = self.last_state.stage if self.last_state else None
+        if stage and stage.steps and self.settings.truncate and not stage.viewed:
             raise SessionError(
                 self.adapter.name,
-                f"{steps} steps, and no view of the trained model drawn with its thresholds",
+                f"{stage.steps} steps, and no view of the trained model drawn with its thresholds",
                 "one or more in every step",
                 "Report this with the host's commit: it draws in a way that the adapter misses.",
             )
@@ -310,10 +306,6 @@ class Session:
         known = ((model, self.adapter.means(model)) for model in self.models)
         return next((m for m, means in known if means.data_ptr() == found.data_ptr()), None)
 
-    def learned(self, state: ModelState) -> int:
-        """Steps that learned."""
-        return max(0, state.steps - self.from_step) if self.learn else 0
-
     def standing_still(self, model: Any) -> bool:
         """Whether the model is frozen now: stage 2 has begun."""
         state = self.models.get(model)
@@ -332,12 +324,26 @@ class Session:
         """This model is the one that reports and summaries are about."""
         self.last, self.last_state = weakref.ref(model), state
 
-    def report(self, state: ModelState) -> None:
-        """Tell observers of a step that is over, once."""
-        stats, state.stats = state.stats, None  # first, so that an observer may raise
-        if stats is not None:
-            self.curves.append(asdict(stats))
-            self.hook.fragprune_step(stats=stats)
+    def stage2(self, state: ModelState) -> Stage2:
+        """Learning for a model's thresholds, as the plugins have it."""
+        return Stage2(
+            state.store,
+            self.settings,
+            self.schedule,
+            truncate=self.truncate,
+            views=state.views,
+            watch=self.report,
+        )
+
+    def truncate(self, inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
+        """The thresholds that plugins apply to one rasterization."""
+        thresholds: Tensor | None = self.hook.fragprune_truncate(inputs=inputs, store=store)
+        return thresholds
+
+    def report(self, stats: StepStats) -> None:
+        """Tell observers of a step that is over."""
+        self.curves.append(asdict(stats))
+        self.hook.fragprune_step(stats=stats)
 
     def changed(self, store: ThresholdStore, operation: str, before: int) -> None:
         """Tell observers that rows changed."""

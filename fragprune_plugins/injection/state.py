@@ -10,33 +10,29 @@ from typing import Any
 
 from torch import Tensor
 
-from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.learning.pressure import StepViews
-from fragprune_plugins.learning.schedule import StepPlan
+from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
-
-Picture = tuple[int, int]
-"""A view, and which of its cameras: some hosts draw several in one call."""
 
 
 @dataclass
 class ModelState:
-    """A model's store and everything counted for it."""
+    """A model's thresholds and everything that is known of its training.
+
+    Attributes:
+        store: its thresholds.
+        stage: that learns them; None where those of a sidecar are only applied.
+        steps: of the host, from the first that was seen.
+    """
 
     store: ThresholdStore
+    stage: Stage2 | None = None
     steps: int = 0
-    plan: StepPlan | None = None
     begun: bool = False  # a step whose loss has not gone backward yet
     pending_parents: Tensor | None = None
     prepared: bool = False
     base_rates: dict[str, float] = field(default_factory=dict)
-    baseline: dict[Picture, float] = field(default_factory=dict)  # untruncated fragments/px
-    drawn: dict[Picture, float] = field(default_factory=dict)  # fragments/px, last visit
     views: dict[int, Callable[[], Any]] = field(default_factory=dict)  # view -> its last render
-    step_views: StepViews = field(default_factory=StepViews)
-    held: bool = False  # thresholds met their target and stay
     loaded: weakref.ReferenceType[Any] | None = None  # the means a sidecar's thresholds came with
-    stats: StepStats | None = None
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
@@ -47,8 +43,3 @@ def named(function: Any, args: Any, kwargs: Any) -> dict[str, Any]:
     bound = signature(function).bind(*args, **kwargs)
     bound.apply_defaults()
     return {"self": getattr(function, "__self__", None), **bound.arguments}
-
-
-def mean(figures: dict[Picture, float]) -> float | None:
-    """Of the figures, or None."""
-    return sum(figures.values()) / len(figures) if figures else None

@@ -12,12 +12,6 @@ import torch
 
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.injection.state import ModelState, named
-from fragprune_plugins.learning.pressure import (
-    CALIBRATE_AT,
-    CALIBRATION_VIEWS,
-    Observation,
-    calibrate,
-)
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 if TYPE_CHECKING:
@@ -55,6 +49,8 @@ def on_attach(
             rows, session.adapter.means(model).device, session.settings.threshold_lr
         )
         state = session.models[model] = ModelState(store)
+    if state.stage is None:
+        state.stage = session.stage2(state)
     session.follow(model, state)
     state.base_rates = {name: group["lr"] for name, group in session.groups(model) if name}
     hook_optimizers(session, model, state)
@@ -89,18 +85,14 @@ def before_step(session: Session, reference: Any, optimizer: Any, *_: Any) -> No
     if model is None or not session.standing_still(model):
         return
     trained = session.adapter.trained_groups(session.settings.train)
-    plan = session.models[model].plan
-    rates = session.models[model].base_rates
-    decay = 0.1**plan.progress if plan else 1.0
+    stage, rates = session.models[model].stage, session.models[model].base_rates
     for group in optimizer.param_groups:
         name = session.adapter.group_name(model, group)
         if trained is not None and name not in trained:
             for parameter in group["params"]:
                 parameter.grad = None
-        elif name == "opacity" and plan and plan.opacity_lr is not None:
-            group["lr"] = plan.opacity_lr
-        elif name in rates and name != "xyz":  # the host sets xyz's rate every iteration
-            group["lr"] = rates[name] * decay
+        elif stage is not None and name in rates and name != "xyz":  # the host sets that one
+            group["lr"] = stage.rate(name, rates[name])
 
 
 def after_step(session: Session, reference: Any, *_: Any) -> None:
@@ -110,8 +102,8 @@ def after_step(session: Session, reference: Any, *_: Any) -> None:
     if state is None or state.stepped == state.steps:
         return
     state.stepped = state.steps
-    if state.plan and state.plan.learn and session.settings.truncate and not state.held:
-        state.store.step(state.plan.threshold_lr)
+    if state.stage is not None:
+        state.stage.end()
 
 
 def on_step(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
@@ -126,52 +118,18 @@ def on_step(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, k
 
 
 def begin_step(session: Session, model: Any, state: ModelState) -> None:
-    """Count a step; freeze, open or calibrate as the schedule has it."""
-    session.report(state)
-    observe_step(session, state)
-    state.step_views.begin()
+    """Count a step of the host; freeze what stands still, and let stage 2 begin its own."""
+    if state.stage is not None:
+        state.stage.close()  # before the count: whoever watches may end the run here
     state.begun = True
     state.steps += 1
-    step = state.steps - session.from_step
-    state.plan = session.schedule.at(step) if step > 0 else None
     if session.standing_still(model):
         if not state.prepared:
             session.adapter.prepare_stage2(model, session.output)
             state.prepared = True
         freeze(session, model)
-    if state.plan and state.plan.learn and session.settings.truncate:
-        state.store.open(session.adapter.opacities(model))
-        meet_target(session, state)
-
-
-def observe_step(session: Session, state: ModelState) -> None:
-    """The pressure learns of the step that is over, once it is known whole."""
-    views = state.step_views
-    if state.plan is not None and views.drawn:
-        session.pressure.observe(
-            Observation(state.plan.progress, views.fragments, views.untruncated, views.loss)
-        )
-
-
-def meet_target(session: Session, state: ModelState) -> None:
-    """Late in the run, and once more at its end, shift all thresholds onto the target."""
-    target, progress = session.settings.target_speedup, state.plan.progress if state.plan else 0.0
-    due = progress >= 1.0 or (progress >= CALIBRATE_AT and not state.held)
-    views = sorted({view for view, _ in state.baseline} & state.views.keys())
-    if target is None or not due or not views:
-        return
-    views = views[:: -(-len(views) // CALIBRATION_VIEWS)]
-    pictures = [picture for picture in state.baseline if picture[0] in views]
-    before = sum(state.baseline[picture] for picture in pictures)
-
-    @torch.no_grad()
-    def speedup() -> float:
-        for view in views:
-            state.views[view]()
-        return before / max(sum(state.drawn[picture] for picture in pictures), 1e-9)
-
-    calibrate(state.store, speedup, target)
-    state.held = True
+    if state.stage is not None and state.steps > session.from_step:
+        state.stage.begin(lambda: session.adapter.opacities(model))
 
 
 def freeze(session: Session, model: Any) -> None:

@@ -139,7 +139,8 @@ class StepViews:
 
     def lose(self, loss: Figure) -> None:
         """The loss of the view drawn last went backward."""
-        self._losses[-1:] = [loss]
+        if self._losses:
+            self._losses[-1] = loss
 
     @property
     def drawn(self) -> int:

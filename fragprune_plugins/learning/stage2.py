@@ -17,8 +17,9 @@ were learned from. Results on held-out views are for the driver to measure.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -80,7 +81,7 @@ class Stage2:
         settings: what was asked for.
         schedule: when what learns how fast; stage 2 as the paper has it when None.
         truncate: gives the thresholds to draw with; the hook ``fragprune_truncate``.
-        redraw: draws a view again, without gradients, ending in ``drew``; needed for a target.
+        views: by view, what draws it again, ending in ``drew``; those that a target is met on.
         watch: told of every step that is over.
     """
 
@@ -91,7 +92,7 @@ class Stage2:
         schedule: Schedule | None = None,
         *,
         truncate: Truncate = learned_thresholds,
-        redraw: Callable[[Any], object] | None = None,
+        views: Mapping[Any, Callable[[], object]] = MappingProxyType({}),
         watch: Callable[[StepStats], None] | None = None,
     ) -> None:
         self.store, self.settings = store, settings
@@ -99,7 +100,7 @@ class Stage2:
         self.pressure = settings.make_pressure()
         self.steps = 0
         self.plan: StepPlan | None = None
-        self._truncate, self._redraw, self._watch = truncate, redraw, watch
+        self._truncate, self._again, self._watch = truncate, views, watch
         self._held = False  # thresholds have met their target and stay
         self._met: float | None = None  # the speed-up they met it with
         self._before: dict[tuple[Hashable, int], Tensor] = {}
@@ -134,11 +135,13 @@ class Stage2:
         return self.plan
 
     def thresholds(self, inputs: RasterInputs) -> Tensor | None:
-        """(N,) to draw a rasterization with; differentiable where thresholds learn; or None."""
+        """(N,) to draw a rasterization with, or None; with gradients where they will be used."""
         if not self.settings.truncate:
             return None
         values = self._truncate(inputs, self.store)
-        return values if values is None or self.learning else values.detach()
+        if values is None or self.plan is None or self.learning:
+            return values
+        return values.detach()
 
     def drew(
         self,
@@ -239,22 +242,20 @@ class Stage2:
 
     def _meet_target(self, progress: float) -> None:
         """Late in the run, and again before its last step, shift all thresholds onto the target."""
-        target, views = (
-            self.settings.target_speedup,
-            list(dict.fromkeys(v for v, _ in self._before)),
-        )
+        target = self.settings.target_speedup
+        visited = dict.fromkeys(view for view, _ in self._before)
+        views = [view for view in visited if view in self._again]
         due = progress >= 1.0 or (progress >= CALIBRATE_AT and not self._held)
-        if target is None or self._redraw is None or not due or not views:
+        if target is None or not due or not views:
             return
         views = views[:: -(-len(views) // CALIBRATION_VIEWS)]
         pictures = [picture for picture in self._before if picture[0] in set(views)]
         before = sum(float(self._before[picture]) for picture in pictures)
-        redraw = self._redraw
 
         @torch.no_grad()
         def speedup() -> float:
             for view in views:
-                redraw(view)
+                self._again[view]()
             return before / max(sum(float(self._after[each]) for each in pictures), 1e-9)
 
         self._met = calibrate(self.store, speedup, target)

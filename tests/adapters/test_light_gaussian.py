@@ -427,7 +427,7 @@ def test_a_teacher_is_drawn_with_its_own_thresholds_and_never_trained(mini):
             assert not torch.equal(host.render(camera, teacher)["render"], pictures[0])
         state = host.last_state
         assert state.store is host.store(student)
-        assert list(state.baseline) == [(camera.uid, 0)]  # copies of a camera are one view
+        assert list(state.stage._before) == [(camera.uid, 0)]  # copies of a camera are one view
 
 
 def test_flags_of_distillation_are_left_out_of_what_resumes_it():

@@ -326,7 +326,7 @@ def test_a_target_is_met_without_views_drawn_before_rows_changed(session_on):
                 remove(params, optimizers, {}, torch.arange(40) < 5)
         summary = session.finish()
     assert summary.gaussians == 35
-    assert session.last_state.held
+    assert session.last_state.stage._held
 
 
 def test_thresholds_go_through_a_file_beside_ones_own_checkpoint(unmoved, tmp_path):
