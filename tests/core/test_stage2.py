@@ -1,0 +1,159 @@
+"""The core of stage 2, driven by hand: no host, no data set, no rasterizer."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
+from fragprune_plugins.learning.stage2 import Stage2
+from fragprune_plugins.learning.thresholds import ThresholdStore
+
+OPACITIES = torch.linspace(0.2, 0.9, 5)
+
+
+def drawing(store: ThresholdStore | None, fragments: float) -> SimpleNamespace:
+    """What an engine gives, as far as stage 2 looks at it; falls as thresholds rise."""
+    scale = 1.0 if store is None else 2 - store.values.mean()
+    return SimpleNamespace(fragments_per_pixel=torch.as_tensor(fragments * scale))
+
+
+class Turns(Schedule):
+    """Learns in every second step."""
+
+    def at(self, step: int) -> StepPlan:
+        return StepPlan(step % 2 == 1, 0.1, 0.02, step / 10, 0.25)
+
+
+def stage(**options) -> Stage2:
+    settings = options.pop("settings", Settings(iterations=10, pressure=1e-2))
+    return Stage2(ThresholdStore(5), settings, **options)
+
+
+def step(it: Stage2, *views: str, loss: float = 0.5):
+    it.begin(lambda: OPACITIES)
+    terms = []
+    for view in views:
+        it.thresholds(None)
+        term = it.drew(view, drawing(it.store, 10.0), lambda: drawing(None, 20.0))
+        it.lost(torch.tensor(loss))
+        terms.append(term)
+    pressure = [term for term in terms if term is not None]
+    if pressure:
+        sum(pressure).backward()
+    it.end()
+    return terms
+
+
+def test_a_step_is_told_once_with_what_its_views_drew_and_lost():
+    told = []
+    it = stage(watch=told.append)
+    step(it, "a", "b", loss=0.25)
+    assert told == []  # not known whole before the next one begins
+    step(it, "a")
+    it.close()
+    it.close()
+    assert [stats.step for stats in told] == [1, 2]
+    assert told[0].loss == pytest.approx(0.5)
+    assert told[0].pressure == 1e-2
+    progress = it.progress()
+    assert (progress.steps, progress.gaussians, progress.target_reached) == (2, 5, None)
+    assert progress.fragments_before == 20.0
+    assert progress.speedup == pytest.approx(progress.fragments_before / progress.fragments_after)
+
+
+def test_who_watches_may_end_the_run_and_is_not_told_twice():
+    def end(stats):
+        raise KeyboardInterrupt
+
+    it = stage(watch=end)
+    step(it, "a")
+    with pytest.raises(KeyboardInterrupt):
+        it.close()
+    it.close()
+
+
+def test_the_pressure_of_a_steps_views_is_their_mean():
+    it = stage()
+    step(it, "a", "b")  # how many views a step draws is known after the first
+    first, second = step(it, "a", "b")
+    assert first.detach() == pytest.approx(1e-2 / 2 * float(it._after["a", 0]))
+    assert second is not None
+
+
+def test_a_view_drawn_without_gradients_feels_no_pressure_and_is_no_first_visit():
+    it = stage()
+    it.begin(lambda: OPACITIES)
+    with torch.no_grad():
+        assert it.drew("a", drawing(it.store, 10.0), lambda: drawing(None, 20.0)) is None
+    assert not it.viewed
+    assert it.progress().fragments_before is None
+
+
+def test_a_step_that_does_not_learn_leaves_no_gradient_for_the_next():
+    it = stage(settings=Settings(iterations=10, pressure=1e-2))
+    it.schedule = Turns(it.settings)
+    step(it, "a")
+    before = it.store.logits.detach().clone()
+    it.begin(lambda: OPACITIES)
+    assert not it.thresholds(None).requires_grad
+    it.end()
+    assert torch.equal(it.store.logits.detach(), before)
+    assert it.store.logits.grad is None
+
+
+def test_rates_follow_the_schedule():
+    it = stage(schedule=Turns(Settings(iterations=10)))
+    assert it.rate("f_dc", 0.4) == 0.4
+    it.begin(lambda: OPACITIES)
+    assert it.rate("f_dc", 0.4) == pytest.approx(0.1)
+    assert it.rate("opacity", 0.4) == 0.02
+
+
+def test_a_control_draws_without_thresholds_and_still_counts():
+    told = []
+    it = stage(settings=Settings(iterations=10, truncate=False), watch=told.append)
+    it.begin(lambda: OPACITIES)
+    assert it.thresholds(None) is None
+    assert it.drew("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None
+    it.end()
+    it.close()
+    assert it.store.neutral
+    assert it.store.steps == 0
+    assert [stats.fragments_per_pixel for stats in told] == [20.0]
+
+
+def test_a_loss_without_a_view_is_nobodys():
+    it = stage()
+    it.begin(lambda: OPACITIES)
+    it.lost(torch.tensor(3.0))
+    it.close()
+    assert it.progress().fragments_before is None
+
+
+@pytest.mark.parametrize("target", [1.2, 1.8])
+def test_a_target_is_met_late_and_thresholds_then_stay(target):
+    views: dict[str, object] = {}
+    it = stage(settings=Settings(iterations=20, target_speedup=target), views=views)
+
+    def draw(view):
+        # fragments fall from 20 to 0 per pixel as thresholds rise from 0 to 1
+        drawn = 20 * (1 - it.store.values.mean())
+        outputs = SimpleNamespace(fragments_per_pixel=drawn)
+        return it.drew(view, outputs, lambda: drawing(None, 20.0))
+
+    views |= {view: lambda view=view: draw(view) for view in "abc"}
+    held = []
+    for number in range(20):
+        it.begin(lambda: OPACITIES)
+        term = draw("abc"[number % 3])
+        held.append(not it.learning)
+        if term is not None:
+            term.backward()
+        it.end()
+    progress = it.progress()
+    assert held == [number >= 17 for number in range(20)]  # from 85 per cent of the run on
+    assert progress.target_reached
+    assert progress.speedup == pytest.approx(target, rel=0.02)
