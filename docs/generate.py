@@ -1,0 +1,195 @@
+"""Writes the pages of docs/reference that are read off the code: ``python docs/generate.py``.
+
+Each page has a function that returns its Markdown; a test compares them with the files.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+REFERENCE = Path(__file__).parent / "reference"
+
+
+def hooks() -> str:
+    """What plugins may answer or be told."""
+    from fragprune_plugins.plugins import hookspecs
+
+    intro = """A plugin is a module or an object under the entry-point group `fragprune`. It
+marks functions with `hookimpl` and takes only the arguments it wants. Argument names are checked
+when it is registered, and an unknown hook name is an error. A plugin that fails is named and left
+out, and the others go on. `FRAGPRUNE_BLOCK` and `FRAGPRUNE_ONLY` take comma-separated entry-point
+names.
+
+Every command asks these hooks, and so does a host under `fragprune run`. Where a hook says that the
+first answer counts, `None` leaves the answer to the next plugin, and ours comes last."""
+    parts = []
+    for name, hook in _functions(hookspecs):
+        if not name.startswith("fragprune_"):
+            continue
+        options = getattr(hook, f"{hookspecs.PROJECT}_spec", {})
+        text = _parameters(inspect.getdoc(hook) or "")
+        first = "\n\nThe first answer counts." if options.get("firstresult") else ""
+        names = ", ".join(inspect.signature(hook).parameters)
+        parts.append(f"## `{name}({names})`\n\n{text}{first}")
+    return _page("Hooks", intro, *parts)
+
+
+def roles() -> str:
+    """What happens at a seam."""
+    from fragprune_plugins.hosts.seams import Role
+
+    intro = """A *seam* is one function of a host that is wrapped while fragprune is active. An
+adapter lists a host's seams and gives each a role. In every role but RASTERIZE the host's function
+runs unchanged, and fragprune follows. `fragprune check DIR` prints the seams of a checkout with
+file and line."""
+    rows = "\n".join(f"| `{role.name}` | {_sentence(role.value)} |" for role in Role)
+    return _page(
+        "Roles of seams", intro, f"| role | what fragprune does there |\n|---|---|\n{rows}"
+    )
+
+
+def adapters() -> str:
+    """What an adapter may say."""
+    from fragprune_plugins.hosts import adapter
+
+    intro = """An adapter is a class that describes one host. Required methods have no default. See
+[how to write one](../how-to/write-an-adapter.md)."""
+    kinds = [
+        c
+        for _, c in inspect.getmembers(adapter, inspect.isclass)
+        if c.__module__ == adapter.__name__
+    ]
+    kinds.sort(key=lambda kind: inspect.getsourcelines(kind)[1])
+    return _page("Adapters", intro, *(_class(kind) for kind in kinds))
+
+
+def python() -> str:
+    """The names of the package."""
+    import fragprune_plugins
+
+    intro = (
+        "Everything below is imported from `fragprune_plugins`; nothing else is promised to stay."
+    )
+    parts = []
+    for name in fragprune_plugins.__all__:
+        thing = getattr(fragprune_plugins, name)
+        if inspect.isclass(thing):
+            parts.append(_class(thing))
+        elif callable(thing):
+            parts.append(
+                f"## `{name}{_signature(thing)}`\n\n{_fields(inspect.getdoc(thing) or '')}"
+            )
+    return _page("Python", intro, *parts)
+
+
+def command_line() -> str:
+    """Every command's help."""
+    from fragprune_plugins.cli import cli
+
+    intro = """What `fragprune COMMAND --help` prints. Every command takes `--json`: one object on
+stdout, progress on stderr. Exit codes are listed in [errors](errors.md)."""
+    context = click.Context(cli, info_name="fragprune", terminal_width=96, max_content_width=96)
+    parts = []
+    for name in cli.list_commands(context):
+        command = cli.get_command(context, name)
+        assert command is not None
+        inner = click.Context(
+            command, parent=context, info_name=name, terminal_width=96, max_content_width=96
+        )
+        parts.append(f"## fragprune {name}\n\n```text\n{command.get_help(inner)}\n```")
+    return _page("Command line", intro, *parts)
+
+
+PAGES: dict[str, Callable[[], str]] = {
+    "hooks.md": hooks,
+    "roles.md": roles,
+    "adapters.md": adapters,
+    "python.md": python,
+    "command-line.md": command_line,
+}
+
+
+def _page(title: str, intro: str, *parts: str) -> str:
+    made = "<!-- Made from the code by docs/generate.py. -->"
+    return "\n\n".join([f"# {title}", made, intro, *parts]) + "\n"
+
+
+def _functions(module: Any) -> Iterator[tuple[str, Any]]:
+    found = inspect.getmembers(module, inspect.isfunction)
+    yield from sorted(found, key=lambda pair: inspect.getsourcelines(pair[1])[1])
+
+
+def _class(kind: type) -> str:
+    lines = [f"## `{kind.__name__}`", _fields(inspect.getdoc(kind) or "")]
+    for name, member in vars(kind).items():
+        function = member.__func__ if isinstance(member, classmethod | staticmethod) else member
+        wrapped = inspect.unwrap(function) if callable(function) else None
+        text = inspect.getdoc(wrapped or member) or ""
+        if name.startswith("_") or not text:
+            continue
+        if inspect.isfunction(wrapped):
+            needed = " **Required.**" if getattr(function, "__isabstractmethod__", False) else ""
+            lines.append(f"### `{name}{_signature(wrapped)}`\n\n{_fields(text)}{needed}")
+        elif isinstance(member, property):
+            lines.append(f"### `{name}`\n\n{_fields(text)}")
+    return "\n\n".join(lines)
+
+
+def _signature(function: Any) -> str:
+    """Without annotations: the text says what each argument is."""
+    signature = inspect.signature(function)
+    plain = [
+        parameter.replace(annotation=inspect.Parameter.empty)
+        for parameter in signature.parameters.values()
+        if parameter.name not in ("self", "cls")
+    ]
+    return str(signature.replace(parameters=plain, return_annotation=inspect.Signature.empty))
+
+
+def _parameters(text: str) -> str:
+    """A docstring with ``:param x:`` as a list."""
+    text = re.sub(r"\n\s+", " ", text) if ":param" in text else text
+    head, *given = re.split(r"\s*:param (\w+):\s*", text)
+    pairs = zip(given[::2], given[1::2], strict=True)
+    listed = "\n".join(f"* `{name}`: {_sentence(what)}" for name, what in pairs)
+    return f"{head.strip()}\n\n{listed}" if listed else head.strip()
+
+
+def _fields(text: str) -> str:
+    """A docstring with its sections of names as lists, and double backticks as single ones."""
+    out: list[str] = []
+    section = ""
+    for line in text.splitlines():
+        heading = re.fullmatch(r"(Args|Attributes|Raises|Returns|Yields):", line)
+        entry = re.fullmatch(r"    ([\w.*, ]+): (.*)", line) if section else None
+        if heading:
+            section = heading[1]
+            out.append(f"{section}:\n")
+        elif entry:
+            out.append(f"* `{entry[1]}`: {entry[2]}")
+        elif section and line.startswith("    "):
+            out.append(
+                f"  {line.strip()}" if out[-1].startswith(("*", " ")) else f"* {line.strip()}"
+            )
+        else:
+            section = "" if line.strip() else section
+            out.append(line)
+    return re.sub(r"``(.+?)``", r"`\1`", "\n".join(out))
+
+
+def _sentence(text: str) -> str:
+    text = text.strip()
+    return text if text.endswith(".") else f"{text}."
+
+
+if __name__ == "__main__":
+    for name, page in PAGES.items():
+        (REFERENCE / name).write_text(page(), encoding="utf-8")
+        print(f"docs/reference/{name}", file=sys.stderr)
