@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,9 @@ from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.hooks import select_adapter
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.plugins.loading import Plugins, load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("fragprune_")]
@@ -98,9 +100,9 @@ def test_hook_fragprune_select_adapter():
             assert repo.root == HOST
             return matches[-1].adapter
 
-    plugins = load_plugins()
-    plugins.manager.register(Plugin())
-    select = plugins.manager.hook.fragprune_select_adapter
+    plugins = Plugins()
+    plugins.register(Plugin(), "mine")
+    select = partial(select_adapter, plugins=plugins)
     chosen = choose(HostRepo(HOST), [Vanilla3DGS(), Fork()], select=select)
     assert chosen.name == "a-fork"
 
