@@ -126,7 +126,7 @@ def draw_panels(
             [
                 ("photograph", shot.image),
                 *((name, output.image) for name, output in outputs.items()),
-                *((f"{name}: {c.float().mean():.1f}/px", c) for name, c in heat.items()),
+                *((f"{name}: {float(c.float().mean()):.1f}/px", c) for name, c in heat.items()),
             ],
             max(float(fragments.max()) for fragments in heat.values()),
         )
