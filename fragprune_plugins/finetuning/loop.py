@@ -125,17 +125,13 @@ def finetune(
 
 @torch.no_grad()
 def mean_fragments(
-    model: SplatFile,
-    thresholds: Tensor | ThresholdStore | None,
-    shots: Sequence[Shot],
-    engine: Engine,
+    model: SplatFile, thresholds: Tensor | None, shots: Sequence[Shot], engine: Engine
 ) -> float:
     """Drawn fragments per pixel, averaged over views."""
     splats = model.splats()
     total = 0.0
     for shot in shots:
-        inputs = RasterInputs(shot.view, splats)
-        outputs = engine.rasterize(inputs, thresholds_for(inputs, thresholds))
+        outputs = engine.rasterize(RasterInputs(shot.view, splats), thresholds)
         total += float(outputs.fragments_per_pixel)
     return total / len(shots)
 

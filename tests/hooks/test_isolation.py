@@ -9,7 +9,8 @@ import pytest
 import torch
 from miniature import HOST, joint, running
 
-from fragprune_plugins.errors import InputError, PluginError
+from fragprune_plugins.errors import InputError, PluginError, UnknownHostError
+from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.findings import Match
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import Settings
@@ -19,6 +20,7 @@ from fragprune_plugins.plugins.hooks import engine_for, schedule_for, select_ada
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.testing import scenes
+from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = pytest.mark.usefixtures("single_thread")
 
@@ -136,6 +138,19 @@ def test_a_plugin_without_an_answer_leaves_it_to_us(hook):
 def test_an_answer_that_cannot_be_used_is_refused(hook, answer, words):
     with pytest.raises(PluginError, match=f"plugin mine, {hook}: .*{words}"):
         ASK[hook](with_one(hook, lambda: answer))
+
+
+def test_an_adapter_that_raises_while_it_reads_a_host_does_not_fit_and_stops_no_other():
+    class Broken(Vanilla3DGS):
+        name = "broken"
+
+        def fingerprint(self, repo):
+            raise KeyError("revision")
+
+    repo = HostRepo(HOST)
+    assert choose(repo, [Broken(), Vanilla3DGS()]).name == "vanilla-3dgs"
+    with pytest.raises(UnknownHostError, match="adapter broken: KeyError: 'revision'"):
+        choose(repo, [Broken()])
 
 
 def learn(plugins, tmp_path):
