@@ -58,14 +58,15 @@ class Plugins:
         loaded: the value of each entry point by its name.
         engines: that were created, by the name that was asked for and the device: an engine keeps
             memory and kernels that its next frame uses again.
+        _off: (plugin, hook) of observers that raised.
     """
 
     adapters: list[HostAdapter] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     loaded: dict[str, str] = field(default_factory=dict)
     engines: dict[tuple[str, torch.device], Engine] = field(default_factory=dict)
-    _manager: pluggy.PluginManager = field(default_factory=_manager)
-    _off: set[tuple[str, str]] = field(default_factory=set)  # (plugin, hook) that raised
+    _manager: pluggy.PluginManager = field(default_factory=_manager, init=False, repr=False)
+    _off: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
 
     def register(self, plugin: object, name: str) -> None:
         """Take a plugin and its adapters, or none of it.
@@ -87,6 +88,8 @@ class Plugins:
                     raise TypeError(f"{adapter!r} has no {attribute} ({kind.__name__})")
             offered.append(adapter)
 
+        if self._manager.has_plugin(name):
+            raise _broken(name, "", "two plugins of this name", "one")
         try:
             self._manager.register(plugin, name)
             self._manager.check_pending()
@@ -98,8 +101,7 @@ class Plugins:
                 if each.plugin is plugin:
                     _call(each, hookspecs.fragprune_register_adapters, {"register": offer})
         except BaseException as error:
-            if self._manager.get_plugin(name) is plugin:
-                self._manager.unregister(name=name)
+            self._manager.unregister(name=name)
             if not isinstance(error, pluggy.PluginValidationError | ValueError):
                 raise
             expected = "plain functions for hooks of fragprune, with their arguments"

@@ -174,10 +174,14 @@ def test_a_plugin_that_is_refused_leaves_its_name_free():
     loaded = Plugins()
     with pytest.raises(PluginError, match="fragprune_trunkate"):
         loaded.register(Misspelt(), "mine")
-    loaded.register(offering("a-host"), "mine")
+    first = offering("a-host")
+    loaded.register(first, "mine")
     assert names(loaded) == ["a-host"]
-    with pytest.raises(PluginError, match="mine"):
-        loaded.register(offering("b-host"), "mine")
+    for second in (offering("b-host"), first):
+        with pytest.raises(PluginError, match="plugin mine: two plugins of this name"):
+            loaded.register(second, "mine")
+    with pytest.raises(PluginError, match="already registered under a different name"):
+        loaded.register(first, "yours")
     assert names(loaded) == ["a-host"]
     assert loaded.answering(hookspecs.fragprune_register_adapters) == ["mine"]
 
