@@ -9,11 +9,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fragprune_plugins.engines import rasterize, slice_at
+    from fragprune_plugins.engines import slice_at
     from fragprune_plugins.finetuning import finetune
     from fragprune_plugins.injection.api import activate, deactivate, paused
     from fragprune_plugins.learning.schedule import Settings
     from fragprune_plugins.learning.thresholds import ThresholdStore
+    from fragprune_plugins.plugins.hooks import rasterize
     from fragprune_plugins.types import (
         Footprints,
         Moment,
@@ -42,7 +43,7 @@ _HOME = {
     "deactivate": "injection.api",
     "finetune": "finetuning",
     "paused": "injection.api",
-    "rasterize": "engines",
+    "rasterize": "plugins.hooks",
     "slice_at": "engines",
 }
 

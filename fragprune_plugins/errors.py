@@ -97,7 +97,7 @@ class InputError(FragpruneError):
 
 
 class PluginError(FragpruneError):
-    """A plugin that cannot be loaded or breaks a hook's contract."""
+    """A plugin that raised in a hook, or gave an answer that cannot be used."""
 
     code = "plugin"
 

@@ -91,6 +91,16 @@ class View:
         _check("View.campos", self.campos, 3)
         _check("View.background", self.background, 3)
 
+    def to(self, device: torch.device | str) -> View:
+        """The same camera with its tensors on a device."""
+        return replace(
+            self,
+            viewmatrix=self.viewmatrix.to(device),
+            projmatrix=self.projmatrix.to(device),
+            campos=self.campos.to(device),
+            background=self.background.to(device),
+        )
+
     @classmethod
     def pinhole(
         cls,

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,19 @@ def single_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def plug() -> Iterator[Callable[..., None]]:
+    """Register plugins in this process, for the length of a test."""
+    from fragprune_plugins.plugins.loading import installed
+
+    def register(plugin: object, name: str = "mine") -> None:
+        installed().register(plugin, name)
+
+    installed.cache_clear()
+    yield register
+    installed.cache_clear()
 
 
 @pytest.fixture

@@ -99,7 +99,7 @@ def time_peer(
         with np.load(outputs) as made:
             image, times = made["image"], made["times"]
             row["device"] = str(made["device"])
-    squared = float(((image - truth.numpy().clip(0, 1)) ** 2).mean())
+    squared = float(((image - truth.cpu().numpy().clip(0, 1)) ** 2).mean())
     row["psnr"] = -10 * float(np.log10(max(squared, 1e-12)))
     if row["psnr"] < SAME_PICTURE_DB:
         return {**row, "failed": f"another picture: {row['psnr']:.1f} dB"}
@@ -117,7 +117,7 @@ def _arrays(splats: Splats, view: View) -> Arrays:
         "dc": None if splats.sh is None else splats.sh[:, 0],
         "viewmatrix": view.viewmatrix,
     }
-    plain = {name: tensor.numpy() for name, tensor in given.items() if tensor is not None}
+    plain = {name: tensor.cpu().numpy() for name, tensor in given.items() if tensor is not None}
     size = np.array([view.width, view.height, view.tan_fov_y], dtype=np.float32)
     return {**plain, "size": size}
 

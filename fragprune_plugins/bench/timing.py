@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.measure.clock import synchronize, timed
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 
 Pass = Literal["forward", "forward_backward"]
@@ -24,8 +24,8 @@ class Case:
 
     Attributes:
         scene: its name.
-        view: the camera.
-        splats: activated Gaussians.
+        view: the camera, where the Gaussians are.
+        splats: activated Gaussians; where they are, everything happens.
         kind: forward only, or with every gradient.
         thresholds: (N,) or None.
     """
@@ -35,6 +35,11 @@ class Case:
     splats: Splats
     kind: Pass
     thresholds: Tensor | None = None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        return self.splats.device
 
 
 def measure(
@@ -46,6 +51,8 @@ def measure(
 ) -> list[dict[str, Any]]:
     """Time every case on every engine, all of them once a round.
 
+    On a GPU the clock stops when it is idle again, after the backward pass too.
+
     Args:
         cases: what to draw.
         engines: who draws; the first one's picture is what the others' are compared with.
@@ -53,30 +60,30 @@ def measure(
         say: told each finished round.
 
     Returns:
-        One dict a case and engine: scene, width, height, gaussians, pass, engine, threads,
+        One dict a case and engine: scene, width, height, gaussians, pass, engine, device, threads,
         truncated, fragments_per_pixel, evaluated_per_pixel, ms_median, ms_min, ms_se,
         ns_per_fragment (of the median; None where nothing is drawn), stages (medians in ms),
-        peak_mb (beyond inputs and outputs; None where the system cannot tell), difference (mean
-        absolute, from the first engine's picture).
+        peak_mb (beyond inputs, of a GPU's own memory as torch gives it out, else of main memory;
+        None where the system cannot tell), difference (mean absolute, from the first engine's
+        picture).
     """
     jobs = [(case, engine, _prepare(case, engine)) for case in cases for engine in engines]
     times: list[list[float]] = [[] for _ in jobs]
     stages: list[list[dict[str, float]]] = [[] for _ in jobs]
     last: list[RasterOutputs] = []
     peaks = []
-    for _, _, job in jobs:
-        outputs, peak = _with_peak(job)
+    for case, _, job in jobs:
+        outputs, peak = _with_peak(job, case.device)
         last.append(outputs)
         peaks.append(peak)
     for turn in range(repeats):
         order = range(len(jobs)) if turn % 2 == 0 else reversed(range(len(jobs)))
         for index in order:
-            started = time.perf_counter()
-            outputs = jobs[index][2]()
-            spent = 1e3 * (time.perf_counter() - started)
+            case, _, job = jobs[index]
+            outputs, spent = timed(job, case.device)
             times[index].append(spent)
             parts = dict(outputs.stages or {})
-            if jobs[index][0].kind == "forward_backward" and parts:
+            if case.kind == "forward_backward" and parts:
                 parts["backward"] = spent - sum(parts.values())
             stages[index].append(parts)
         say(f"round {turn + 1} of {repeats}")
@@ -94,6 +101,7 @@ def measure(
                 "gaussians": len(case.splats),
                 "pass": case.kind,
                 "engine": engine.name,
+                "device": str(case.device),
                 "threads": torch.get_num_threads(),
                 "truncated": case.thresholds is not None,
                 "fragments_per_pixel": drawn,
@@ -167,13 +175,13 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
 
     names = ("means", "opacities", "scales", "rotations", "sh")
     leaves = {n: getattr(case.splats, n).detach().clone().requires_grad_(True) for n in names}
-    hook = torch.zeros(len(case.splats), 3, requires_grad=True)
+    hook = torch.zeros(len(case.splats), 3, device=case.device, requires_grad=True)
     thresholds = None
     if case.thresholds is not None:
         thresholds = case.thresholds.clone().requires_grad_(True)
     inputs = RasterInputs(case.view, replace(case.splats, **leaves), hook)
     stream = torch.Generator().manual_seed(0)
-    weight = torch.randn(3, case.view.height, case.view.width, generator=stream)
+    weight = torch.randn(3, case.view.height, case.view.width, generator=stream).to(case.device)
 
     def draw_and_differentiate() -> RasterOutputs:
         for leaf in (*leaves.values(), hook, *([] if thresholds is None else [thresholds])):
@@ -189,8 +197,16 @@ def _standard_error(values: Sequence[float]) -> float:
     return statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
 
 
-def _with_peak(job: Callable[[], RasterOutputs]) -> tuple[RasterOutputs, float | None]:
-    """Run once (this also warms up); the highest resident memory above where it began, in MB."""
+def _with_peak(
+    job: Callable[[], RasterOutputs], device: torch.device
+) -> tuple[RasterOutputs, float | None]:
+    """Run once (this also warms up); the most memory in use above where it began, in MB."""
+    if device.type == "cuda":
+        synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        start = torch.cuda.memory_allocated(device)
+        outputs = job()
+        return outputs, (torch.cuda.max_memory_allocated(device) - start) / 2**20
     try:
         Path("/proc/self/clear_refs").write_text("5")  # Linux: forget the old peak
         before = _status("VmRSS")

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.cli.common import FILE, Command, Report, engine_options, set_threads
+from fragprune_plugins.cli.common import FILE, Command, Report, engine_options, open_engine
 from fragprune_plugins.errors import UsageError
 
 TRUNCATION = 16 / 255
@@ -57,6 +57,7 @@ def command(
     forward_only: bool,
     peers: bool,
     engine: str,
+    device: str,
     threads: int | None,
 ) -> Report:
     """Time rasterization, forward and with every gradient, with and without truncation.
@@ -76,15 +77,16 @@ def command(
     import torch
 
     from fragprune_plugins.bench.timing import Case, measure, scaling, translation
-    from fragprune_plugins.engines import create_engine
+    from fragprune_plugins.plugins.hooks import thresholds_for
+    from fragprune_plugins.types import RasterInputs
 
-    set_threads(threads)
-    rasterizer = create_engine(engine)
+    rasterizer, where = open_engine(engine, device, threads)
     kinds = ("forward",) if forward_only else ("forward", "forward_backward")
     cases: list[Case] = []
-    scenes = _scenes(model, cameras, gaussians, sizes)
-    for name, splats, view, learned in scenes:
-        cut = torch.full((len(splats),), TRUNCATION) if learned is None else learned
+    scenes = _scenes(model, cameras, gaussians, sizes, where)
+    for name, splats, view, store in scenes:
+        cut = thresholds_for(RasterInputs(view, splats), store)
+        cut = torch.full_like(splats.opacities, TRUNCATION) if cut is None else cut.detach()
         for kind in kinds:
             cases += [Case(name, view, splats, kind, thresholds) for thresholds in (None, cut)]  # type: ignore[arg-type]
     before = os.getloadavg()[0]
@@ -102,6 +104,7 @@ def command(
         "platform": platform.platform(),
         "torch": torch.__version__,
         "native": _native(),
+        "gpu": torch.cuda.get_device_name(where) if where.type == "cuda" else None,
     }
     share = translation(results, rasterizer.name)
     one_scene = len({row["scene"] for row in results}) == 1
@@ -119,9 +122,13 @@ def command(
 
 
 def _scenes(
-    model: Path | None, cameras: Path | None, gaussians: tuple[int, ...], sizes: tuple[str, ...]
+    model: Path | None,
+    cameras: Path | None,
+    gaussians: tuple[int, ...],
+    sizes: tuple[str, ...],
+    device: Any,
 ) -> list[tuple[str, Any, Any, Any]]:
-    """(name, activated splats, view, learned thresholds or None), one a count and size."""
+    """(name, activated splats, view, thresholds' store or None), one a count and size."""
     from dataclasses import replace
 
     from fragprune_plugins.bench.scene import make_scene, make_view
@@ -130,14 +137,19 @@ def _scenes(
         from fragprune_plugins.datasets.cameras import load_cameras
         from fragprune_plugins.storage.models import load_model
 
-        splat, learned = load_model(model)
-        _, view = load_cameras(cameras)[0]
+        splat, store = load_model(model, device=device)
+        view = load_cameras(cameras)[0][1].to(device)
         return [
-            (model.stem, splat.splats(), replace(view, width=w, height=h), learned)
+            (model.stem, splat.splats(), replace(view, width=w, height=h), store)
             for w, h in map(_size, sizes)
         ]
     return [
-        (f"bench-{count}", make_scene(count).splats(), make_view(*_size(size)), None)
+        (
+            f"bench-{count}",
+            make_scene(count).to(device).splats(),
+            make_view(*_size(size)).to(device),
+            None,
+        )
         for count in gaussians
         for size in sizes
     ]
@@ -158,7 +170,7 @@ def _peers(
         flat = replace(splats, sh=splats.sh[:, :1].contiguous(), sh_degree=0)
         (ours,) = measure([Case(name, view, flat, "forward")], [rasterizer], repeats=repeats)
         keys = ("width", "height", "gaussians", "ms_median", "ms_min", "ms_se")
-        row = {"name": "fragprune", "device": "cpu", "psnr": None, "failed": None}
+        row = {"name": "fragprune", "device": ours["device"], "psnr": None, "failed": None}
         rows.append({"scene": name, **row, **{key: ours[key] for key in keys}})
         truth = rasterizer.rasterize(RasterInputs(view, flat), None).image
         for peer in installed():
@@ -203,9 +215,11 @@ def _table(data: dict[str, Any]) -> str:
             f"{row['scene']:<16}{row['width']:>6}x{row['height']:<4}  {row['name']} "
             f"({row['device']}): {what}"
         )
+    first = results[0]
     lines.append(
-        f"{results[0]['engine']} engine ({machine['native']}), {results[0]['threads']} threads on "
-        f"{machine['processor']}; load {machine['load_before']:.1f} to {machine['load_after']:.1f}"
+        f"{first['engine']} engine ({machine['native']}) on {machine['gpu'] or first['device']}, "
+        f"{first['threads']} threads on {machine['processor']}; "
+        f"load {machine['load_before']:.1f} to {machine['load_after']:.1f}"
     )
     return "\n".join(lines)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,10 @@ from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
 from fragprune_plugins.storage.records import strict
 
 if TYPE_CHECKING:
+    import torch
+
     from fragprune_plugins.datasets.dataset import Shot
+    from fragprune_plugins.engines import Engine
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -140,17 +144,42 @@ data_options = _together(
     image_options,
 )
 
-engine_options = _together(
-    click.option(
-        "--engine",
-        type=click.Choice(["auto", "reference", "cpu", "cuda"]),
-        default="auto",
+
+def _device(ctx: click.Context, param: click.Parameter, value: str) -> str:
+    """A word that ``engines.device_for`` knows; whether the device is here is for it to say."""
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,2})?", value):
+        raise click.BadParameter(f"{value!r} is not one of auto, cpu, cuda, cuda:N.")
+    return value
+
+
+def engine_option(what: str) -> Callable[[Function], Function]:
+    """``--engine``; what it does here."""
+    names = "auto (the fastest that runs here), reference, cpu, cuda, or the name of a plugin's."
+    return click.option(
+        "--engine", metavar="NAME", default="auto", show_default=True, help=f"{what}: {names}"
+    )
+
+
+def device_option(what: str, default: str = "auto") -> Callable[[Function], Function]:
+    """``--device``; what it does here."""
+    return click.option(
+        "--device",
+        metavar="auto|cpu|cuda[:N]",
+        callback=_device,
+        default=default,
         show_default=True,
-        help="What rasterizes; auto takes the fastest that runs here.",
-    ),
-    click.option(
-        "--threads", type=click.IntRange(min=1), help="CPU threads; all cores when left out."
-    ),
+        help=what,
+    )
+
+
+threads_option = click.option(
+    "--threads", type=click.IntRange(min=1), help="CPU threads; all cores when left out."
+)
+
+engine_options = _together(
+    engine_option("What rasterizes"),
+    device_option("Where; auto takes a GPU on which our cuda engine may be used, else the CPU."),
+    threads_option,
 )
 
 truncation_option = click.option(
@@ -166,25 +195,44 @@ views_option = click.option(
 )
 
 
-def set_threads(threads: int | None) -> None:
-    """Bound the CPU threads of torch and of the engines, which follow torch."""
-    if threads is not None:
-        import torch
+def open_engine(engine: str, device: str, threads: int | None) -> tuple[Engine, torch.device]:
+    """The engine that was asked for, and the device to put models and views on.
 
+    Bounds the CPU threads of torch and of the engines, which follow torch.
+
+    Raises:
+        UsageError: there is no such device.
+        EngineError: there is no such engine.
+    """
+    import torch
+
+    from fragprune_plugins.engines import device_for
+    from fragprune_plugins.plugins.hooks import engine_for
+
+    if threads is not None:
         torch.set_num_threads(threads)
+    where = device_for(device, engine)
+    return engine_for(engine, where), where
 
 
 def load_shots(
-    folder: Path, views: str, *, resolution: int, white_background: bool
+    folder: Path,
+    views: str,
+    *,
+    resolution: int,
+    white_background: bool,
+    device: torch.device | str = "cpu",
 ) -> Sequence[Shot]:
-    """The views of a scene folder that were asked for.
+    """The views of a scene folder that were asked for, on a device.
 
     Raises:
         DatasetError: the folder cannot be read as a scene.
     """
     from fragprune_plugins.datasets.dataset import load_dataset
 
-    dataset = load_dataset(folder, resolution=resolution, white_background=white_background)
+    dataset = load_dataset(folder, resolution=resolution, white_background=white_background).to(
+        device
+    )
     return {
         "test": dataset.test,
         "train": dataset.train,

@@ -15,7 +15,7 @@ from fragprune_plugins.cli.common import (
     engine_options,
     gain,
     load_shots,
-    set_threads,
+    open_engine,
     truncation_option,
     views_option,
 )
@@ -40,6 +40,7 @@ def command(
     views: str,
     no_truncation: bool,
     engine: str,
+    device: str,
     threads: int | None,
 ) -> Report:
     """Measure A and B on the same photographs.
@@ -51,20 +52,20 @@ def command(
       fragprune compare point_cloud.ply small.ply --data scene --out pictures
     """
     from fragprune_plugins.cli.profile import draw_panels
-    from fragprune_plugins.engines import create_engine
     from fragprune_plugins.measure import Candidate, measure
     from fragprune_plugins.storage import records
     from fragprune_plugins.storage.atomic import writable_folder
 
-    set_threads(threads)
+    rasterizer, where = open_engine(engine, device, threads)
     if out is not None:
         writable_folder(out)
     columns = {
-        label: Candidate(*load_model(path, truncation=not no_truncation))
+        label: Candidate(*load_model(path, truncation=not no_truncation, device=where))
         for label, path in (("A", a), ("B", b))
     }
-    shots = load_shots(data, views, resolution=resolution, white_background=white_background)
-    rasterizer = create_engine(engine)
+    shots = load_shots(
+        data, views, resolution=resolution, white_background=white_background, device=where
+    )
     first, second = measure(list(columns.values()), shots, engine=rasterizer)
     report = {
         "a": {"model": str(a)} | first,

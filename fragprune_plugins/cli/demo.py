@@ -12,8 +12,10 @@ from fragprune_plugins.cli.common import (
     Command,
     Report,
     describe,
-    engine_options,
-    set_threads,
+    device_option,
+    engine_option,
+    open_engine,
+    threads_option,
 )
 
 
@@ -33,8 +35,12 @@ from fragprune_plugins.cli.common import (
     help="Iterations of the training; the fine-tuning takes half as many.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of scene and training.")
-@engine_options
-def command(out: Path, iters: int, seed: int, engine: str, threads: int | None) -> Report:
+@engine_option("What rasterizes")
+@device_option("Where; the scene is small enough for any CPU.", default="cpu")
+@threads_option
+def command(
+    out: Path, iters: int, seed: int, engine: str, device: str, threads: int | None
+) -> Report:
     """Make a small scene, train on it, prune its fragments, show before and after.
 
     Takes a few minutes on a laptop; nothing is downloaded.
@@ -47,8 +53,10 @@ def command(out: Path, iters: int, seed: int, engine: str, threads: int | None) 
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from fragprune_plugins.demo.demo import DemoSettings, honest, quotable, run_demo
 
-    set_threads(threads)
-    settings = DemoSettings(iterations=iters, finetune=iters // 2, seed=seed, engine=engine)
+    _, where = open_engine(engine, device, threads)
+    settings = DemoSettings(
+        iterations=iters, finetune=iters // 2, seed=seed, engine=engine, device=str(where)
+    )
     report = run_demo(out, settings, lambda line: click.echo(line, err=True))
     table = describe({"before": report["before"], "after": report["after"]})
     text = (

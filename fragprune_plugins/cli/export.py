@@ -28,15 +28,16 @@ def command(model: Path, out: Path) -> Report:
     from fragprune_plugins.storage import sidecar
     from fragprune_plugins.storage.ply import THRESHOLD_COLUMN, write_ply
 
-    splat, thresholds = load_model(model)
-    if thresholds is None:
+    splat, store = load_model(model)
+    if store is None:
         raise SidecarError(
             str(sidecar.path_beside(model)),
             "no thresholds for this model",
             "a sidecar beside it, written by fragprune",
             "Run fragprune finetune first.",
         )
-    write_ply(out, splat, thresholds)
+    learned = sidecar.path_beside(model).exists() or splat.thresholds is None
+    write_ply(out, splat, store.values if learned else splat.thresholds)
     return Report(
         {
             "model": str(model),

@@ -15,12 +15,12 @@ from fragprune_plugins.cli.common import (
     describe,
     engine_options,
     gain,
-    set_threads,
+    open_engine,
 )
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage.models import load_model, load_store
+from fragprune_plugins.storage.models import load_model
 
 
 @click.command("finetune", cls=Command)
@@ -43,6 +43,7 @@ def command(
     no_truncation: bool,
     curves: Path | None,
     engine: str,
+    device: str,
     threads: int | None,
 ) -> Report:
     """Learn how far each Gaussian of MODEL must reach.
@@ -61,21 +62,22 @@ def command(
     if out.resolve() == model.resolve():
         raise UsageError("--out", f"{out}, the model itself", "another file", "Name a new file.")
 
-    from fragprune_plugins.engines import create_engine
+    from copy import deepcopy
+
     from fragprune_plugins.errors import OutputError
     from fragprune_plugins.finetuning import finetune, load_dataset, save
     from fragprune_plugins.measure import Candidate, measure
     from fragprune_plugins.storage import records, sidecar
     from fragprune_plugins.storage.atomic import writable_folder
 
-    set_threads(threads)
+    rasterizer, where = open_engine(engine, device, threads)
     writable_folder(out.parent)
     if out.is_dir():
         raise OutputError(str(out), "a folder", "a .ply file", "Name a file in it.")
-    splat, thresholds = load_model(model, truncation=settings.truncate and not no_truncation)
+    truncation = settings.truncate and not no_truncation
+    splat, store = load_model(model, truncation=truncation, device=where)
     dataset = load_dataset(data, resolution=resolution, white_background=white_background)
-    rasterizer = create_engine(engine, splat.xyz.device)
-    store = None if thresholds is None else load_store(model, splat)
+    start = Candidate(splat, deepcopy(store))  # the store itself learns
 
     result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
     done = result.progress
@@ -86,7 +88,7 @@ def command(
 
         save_learning(curves, rows, result.thresholds)
     before, after = measure(
-        [Candidate(splat, thresholds), Candidate(result.model, result.thresholds)],
+        [start, Candidate(result.model, result.store)],
         dataset.test,
         engine=rasterizer,
     )

@@ -15,7 +15,7 @@ from fragprune_plugins.cli.common import (
     describe,
     engine_options,
     load_shots,
-    set_threads,
+    open_engine,
     truncation_option,
     views_option,
 )
@@ -47,6 +47,7 @@ def command(
     views: str,
     no_truncation: bool,
     engine: str,
+    device: str,
     threads: int | None,
 ) -> Report:
     """Measure MODEL: quality, fragments per pixel, time per frame.
@@ -59,34 +60,36 @@ def command(
     """
     import torch
 
-    from fragprune_plugins.engines import create_engine
     from fragprune_plugins.measure import Candidate, measure
     from fragprune_plugins.storage import records
     from fragprune_plugins.storage.atomic import writable_folder
 
-    set_threads(threads)
+    rasterizer, where = open_engine(engine, device, threads)
     if out is not None:
         writable_folder(out)
-    splat, thresholds = load_model(model, truncation=not no_truncation)
-    shots = load_shots(data, views, resolution=resolution, white_background=white_background)
-    rasterizer = create_engine(engine, splat.xyz.device)
+    splat, store = load_model(model, truncation=not no_truncation, device=where)
+    shots = load_shots(
+        data, views, resolution=resolution, white_background=white_background, device=where
+    )
     columns = {"untruncated": Candidate(splat)}
-    if thresholds is not None:
-        columns["truncated"] = Candidate(splat, thresholds)
+    if store is not None:
+        columns["truncated"] = Candidate(splat, store)
     measured = dict(
         zip(columns, measure(list(columns.values()), shots, engine=rasterizer), strict=True)
     )
     last = list(measured)[-1]
-    report: dict[str, Any] = {"model": str(model), "truncated": thresholds is not None}
+    report: dict[str, Any] = {"model": str(model), "truncated": store is not None}
     report |= measured[last] | {"columns": measured}
     lines = [describe(measured)]
-    if thresholds is not None:
+    if store is not None:
         points = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
+        thresholds = store.values.detach().cpu()
         step = max(1, len(thresholds) // 100_000)
         quantiles = torch.quantile(thresholds[::step], points).tolist()
         report["threshold_quantiles"] = quantiles
         lines.append(
-            "thresholds (5, 25, 50, 75, 95 %): " + ", ".join(f"{value:.3f}" for value in quantiles)
+            "learned thresholds (5, 25, 50, 75, 95 %): "
+            + ", ".join(f"{value:.3f}" for value in quantiles)
         )
     if out is not None:
         files = draw_panels(out, columns, shots, rasterizer)
@@ -103,16 +106,13 @@ def draw_panels(
     import torch
 
     from fragprune_plugins.measure.pictures import save_panel
-    from fragprune_plugins.types import RasterInputs
 
     files = []
     drawn = {name: candidate.model.splats() for name, candidate in columns.items()}
     for shot in shots[:: -(-len(shots) // PANELS)]:
         with torch.no_grad():
             outputs = {
-                name: engine.rasterize(
-                    RasterInputs(shot.view, drawn[name], counts=True), candidate.thresholds
-                )
+                name: candidate.draw(engine, shot.view, drawn[name], counts=True)
                 for name, candidate in columns.items()
             }
         heat = {
@@ -126,7 +126,7 @@ def draw_panels(
             [
                 ("photograph", shot.image),
                 *((name, output.image) for name, output in outputs.items()),
-                *((f"{name}: {c.float().mean():.1f}/px", c) for name, c in heat.items()),
+                *((f"{name}: {float(c.float().mean()):.1f}/px", c) for name, c in heat.items()),
             ],
             max(float(fragments.max()) for fragments in heat.values()),
         )

@@ -13,7 +13,7 @@ from fragprune_plugins.cli.common import (
     engine_options,
     image_options,
     load_shots,
-    set_threads,
+    open_engine,
     truncation_option,
     views_option,
 )
@@ -42,6 +42,7 @@ def command(
     white_background: bool,
     no_truncation: bool,
     engine: str,
+    device: str,
     threads: int | None,
 ) -> Report:
     """Render MODEL from many cameras, one PNG each.
@@ -60,32 +61,32 @@ def command(
     import torch
 
     from fragprune_plugins.datasets.cameras import load_cameras
-    from fragprune_plugins.engines import create_engine
     from fragprune_plugins.measure.pictures import save_heatmap, save_image
+    from fragprune_plugins.plugins.hooks import thresholds_for
     from fragprune_plugins.storage.atomic import writable_folder
     from fragprune_plugins.types import RasterInputs
 
-    set_threads(threads)
+    rasterizer, where = open_engine(engine, device, threads)
     writable_folder(out)
-    splat, thresholds = load_model(model, truncation=not no_truncation)
+    splat, store = load_model(model, truncation=not no_truncation, device=where)
     if data is not None:
         shots = load_shots(data, views, resolution=resolution, white_background=white_background)
         named = [(shot.name, shot.view) for shot in shots]
     else:
         assert cameras is not None
         named = load_cameras(cameras, white_background=white_background)
-    rasterizer = create_engine(engine, splat.xyz.device)
     splats = splat.splats()
     files, fragments, maps = [], [], []
     with torch.no_grad():
         for name, view in named:
-            outputs = rasterizer.rasterize(RasterInputs(view, splats, counts=heatmap), thresholds)
+            inputs = RasterInputs(view.to(where), splats, counts=heatmap)
+            outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, store))
             file = out / f"{Path(name.replace('/', '_')).stem}.png"
             save_image(file, outputs.image)
             files.append(file)
             fragments.append(float(outputs.fragments_per_pixel))
             if outputs.fragments is not None:
-                maps.append((file.with_name(file.stem + "_fragments.png"), outputs.fragments))
+                maps.append((file.with_name(file.stem + "_fragments.png"), outputs.fragments.cpu()))
     limit = max((float(counts.max()) for _, counts in maps), default=0.0)
     for file, counts in maps:
         save_heatmap(file, counts, limit)
@@ -97,10 +98,10 @@ def command(
             "files": [str(file) for file in files],
             "fragments_per_pixel": mean,
             "gaussians": len(splat),
-            "truncated": thresholds is not None,
+            "truncated": store is not None,
             "engine": rasterizer.name,
             "device": str(splat.xyz.device),
         },
         f"Wrote {len(files)} pictures to {out} ({mean:.1f} fragments per pixel, "
-        f"{'truncated' if thresholds is not None else 'not truncated'}).",
+        f"{'truncated' if store is not None else 'not truncated'}).",
     )

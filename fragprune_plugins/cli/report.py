@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -17,11 +19,14 @@ from fragprune_plugins.cli.common import (
     describe,
     engine_options,
     gain,
-    set_threads,
+    open_engine,
 )
 from fragprune_plugins.storage.models import load_model
 
 if TYPE_CHECKING:
+    import torch
+
+    from fragprune_plugins.engines import Engine
     from fragprune_plugins.storage.records import Record
 
 PAGE = "report.html"
@@ -36,7 +41,12 @@ after; beside it the photograph; below, the fragments that each pixel draws."""
 @click.option("--data", type=FILE, help="Scene folder, where the one that was used has moved.")
 @engine_options
 def command(
-    folder: Path, out: Path | None, data: Path | None, engine: str, threads: int | None
+    folder: Path,
+    out: Path | None,
+    data: Path | None,
+    engine: str,
+    device: str,
+    threads: int | None,
 ) -> Report:
     """Make one page of what was gained in DIR: a sentence, tables, sliders over views, curves.
 
@@ -52,14 +62,15 @@ def command(
     from fragprune_plugins.storage.atomic import replacing
     from fragprune_plugins.storage.records import find
 
-    set_threads(threads)
     records = find(folder)
     main = next((r for r in reversed(records) if r.command in ("run", "finetune")), records[-1])
     others = [record for record in records if record is not main]
     line = _sentence(main)
     with TemporaryDirectory() as name:
         pictures = Path(name)
-        views, learning, missing = _draw(main, pictures, data, engine)
+        views, learning, missing = _draw(
+            main, pictures, data, partial(open_engine, engine, device, threads)
+        )
         more = [*learning, *_files(records, pictures)]
         text = report_page.compose(
             title=f"fragprune report: {folder.resolve().name}",
@@ -152,7 +163,10 @@ def _facts(record: Record) -> str:
 
 
 def _draw(
-    record: Record, folder: Path, data: Path | None, engine: str
+    record: Record,
+    folder: Path,
+    data: Path | None,
+    opened: Callable[[], tuple[Engine, torch.device]],
 ) -> tuple[list[str], list[tuple[str, str]], str]:
     """Held-out views and learning curves, drawn into the folder.
 
@@ -160,20 +174,24 @@ def _draw(
         Names of the views, headed pictures besides, and what is missing and why.
     """
     from fragprune_plugins.datasets.dataset import load_dataset
-    from fragprune_plugins.engines import create_engine
     from fragprune_plugins.errors import DatasetError, ModelFileError, SidecarError
     from fragprune_plugins.measure import Candidate, report_page
 
     drawn, curves = record.data.get("photographs"), record.data.get("curves")
     if drawn is None:
         return [], [], ""
+    engine, device = opened()
     learning: list[tuple[str, str]] = []
     try:
-        models = [load_model(Path(path), filtered=drawn["filtered"]) for path in drawn["models"]]
-        before, after = (Candidate(*model, drawn["drawing"]) for model in models)
-        if curves and after.thresholds is not None:
+        (one, before_store), (other, store) = (
+            load_model(Path(path), filtered=drawn["filtered"], device=device)
+            for path in drawn["models"]
+        )
+        before = Candidate(one, before_store, drawn["drawing"])
+        after = Candidate(other, store, drawn["drawing"])
+        if curves and store is not None:
             rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
-            report_page.save_learning(folder / report_page.LEARNING, rows, after.thresholds)
+            report_page.save_learning(folder / report_page.LEARNING, rows, store.values)
             learning = [("How it learned", report_page.LEARNING)]
         dataset = load_dataset(
             data or Path(drawn["folder"]),
@@ -184,7 +202,7 @@ def _draw(
         if data is not None:  # they were asked for
             raise
         return [], learning, f"No views are shown: {error}"
-    views = report_page.draw_views(folder, before, after, dataset.test, create_engine(engine))
+    views = report_page.draw_views(folder, before, after, dataset.test, engine)
     return list(views), learning, ""
 
 

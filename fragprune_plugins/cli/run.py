@@ -10,7 +10,15 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.cli.common import JSON, Command, Report, describe
+from fragprune_plugins.cli.common import (
+    JSON,
+    Command,
+    Report,
+    describe,
+    device_option,
+    engine_option,
+    open_engine,
+)
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import FragpruneError, UsageError
 from fragprune_plugins.learning.schedule import Settings
@@ -39,20 +47,8 @@ from fragprune_plugins.storage import records
     "--alternate", type=click.IntRange(min=1), help="joint: learn N iterations, hold N, and so on."
 )
 @learning_options
-@click.option(
-    "--engine",
-    type=click.Choice(["auto", "reference", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="What rasterizes where thresholds apply or the host's own rasterizer is missing.",
-)
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="cpu runs a CUDA-only host without a GPU.",
-)
+@engine_option("What rasterizes where thresholds apply or the host's own rasterizer is missing")
+@device_option("Where the host runs; cpu runs a CUDA-only host without a GPU.")
 @click.option(
     "--evaluate/--no-evaluate",
     default=True,
@@ -69,7 +65,7 @@ def command(
     alternate: int | None,
     settings: Settings,
     engine: str,
-    device: Any,
+    device: str,
     evaluate: bool,
 ) -> Report:
     """Train with a host's own command, then learn truncation thresholds.
@@ -88,7 +84,7 @@ def command(
     if alternate is not None and stage != "joint":
         raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Add or drop it.")
 
-    from fragprune_plugins.injection.launch import RunOptions, run
+    from fragprune_plugins.injection.launch import RunOptions, current_gpu, run
 
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     options = RunOptions(
@@ -105,7 +101,8 @@ def command(
     with to_stderr or contextlib.nullcontext():
         summary = run(list(host_command), options)
         photographs = _photographs(list(host_command), summary)
-        measured = _measure(photographs) if evaluate and photographs else None
+        with current_gpu(device):
+            measured = _measure(photographs, engine, device) if evaluate and photographs else None
     data = {
         "adapter": summary.adapter,
         "engine": summary.engine,
@@ -153,24 +150,29 @@ def _photographs(host_command: list[str], summary: Any) -> dict[str, Any] | None
     }
 
 
-def _measure(photographs: dict[str, Any]) -> list[dict[str, Any]] | None:
-    """Before and after on held-out views."""
+def _measure(
+    photographs: dict[str, Any], engine: str = "auto", device: str = "auto"
+) -> list[dict[str, Any]] | None:
+    """Before and after on held-out views, where the host ran if our engine may draw there."""
     from fragprune_plugins.finetuning import load_dataset
     from fragprune_plugins.measure import Candidate, measure
     from fragprune_plugins.storage.models import load_model
 
+    rasterizer, where = open_engine(engine, "cpu" if device == "cpu" else "auto", None)
     try:
         dataset = load_dataset(
             Path(photographs["folder"]),
             resolution=photographs["resolution"],
             white_background=photographs["white_background"],
         )
-        models = [load_model(Path(path), filtered=True) for path in photographs["models"]]
+        models = [
+            load_model(Path(path), filtered=True, device=where) for path in photographs["models"]
+        ]
     except FragpruneError as error:
         logging.getLogger("fragprune").warning("not compared on held-out views: %s", error)
         return None
     candidates = [Candidate(*model, photographs["drawing"]) for model in models]
-    return measure(candidates, dataset.test)
+    return measure(candidates, dataset.test, engine=rasterizer)
 
 
 def _flag(words: list[str], *names: str) -> str | None:

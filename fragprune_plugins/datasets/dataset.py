@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -27,7 +27,8 @@ class Shot:
     Attributes:
         name: unique in its dataset.
         view: the camera, with the background colour that the image was composited over.
-        path: the image file; read when first asked for, kept as 8-bit.
+        path: the image file; read when first asked for, kept as 8-bit in main memory, wherever
+            the view lives: a scene's photographs may be larger than a GPU's memory.
     """
 
     name: str
@@ -36,8 +37,14 @@ class Shot:
 
     @property
     def image(self) -> Tensor:
-        """(3, H, W) RGB in [0, 1], alpha composited over the view's background."""
-        return self._bytes.permute(2, 0, 1).float() / 255
+        """(3, H, W) RGB in [0, 1], alpha composited over the view's background; where that is."""
+        return self._bytes.to(self.view.background.device).permute(2, 0, 1).float() / 255
+
+    def to(self, device: torch.device | str) -> Shot:
+        """The same photograph with its view on a device; itself where it is there."""
+        if self.view.background.device == torch.device(device):
+            return self
+        return replace(self, view=self.view.to(device))
 
     @cached_property
     def _bytes(self) -> Tensor:
@@ -54,7 +61,7 @@ class Shot:
         values = np.asarray(picture)
         if values.shape[2] == 4:
             alpha = values[..., 3:].astype(np.float32) / 255
-            behind = 255 * self.view.background.numpy()
+            behind = 255 * self.view.background.cpu().numpy()
             over = values[..., :3] * alpha + behind * (1 - alpha)
             values = np.round(over).astype(np.uint8)
         return torch.from_numpy(values.copy())
@@ -75,6 +82,10 @@ class Dataset:
         """
         centres = torch.stack([shot.view.campos for shot in self.train])
         return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max()) or 1.0
+
+    def to(self, device: torch.device | str) -> Dataset:
+        """The same photographs with their views on a device."""
+        return Dataset([s.to(device) for s in self.train], [s.to(device) for s in self.test])
 
 
 def load_dataset(folder: Path, *, resolution: int = 1, white_background: bool = False) -> Dataset:

@@ -41,6 +41,7 @@ class DemoSettings:
         pressure: weight of drawn fragments per pixel; None for the default.
         seed: of the scene and of the training.
         engine: what rasterizes.
+        device: where everything runs, "cpu" or a CUDA device.
         scene: the photographs.
     """
 
@@ -49,6 +50,7 @@ class DemoSettings:
     pressure: float | None = None
     seed: int = 0
     engine: str = "auto"
+    device: str = "cpu"
     scene: SceneSettings = field(default_factory=SceneSettings)
 
 
@@ -119,7 +121,7 @@ def run_demo(
         report = _measure(scene, summary, control, settings)
     with clock.part("pictures"):
         say("5/5  Drawing the pictures")
-        report["files"] = write_page(out, report, scene, summary, settings.engine)
+        report["files"] = write_page(out, report, scene, summary, settings)
     report["seconds_by_part"] = clock.seconds
     report["seconds"] = sum(clock.seconds.values())
     with replacing(out / REPORT) as path:
@@ -187,7 +189,7 @@ def _run_options(settings: DemoSettings) -> RunOptions:
     learning = Settings(
         iterations=settings.finetune, pressure=settings.pressure, seed=settings.seed
     )
-    return RunOptions(settings=learning, engine=settings.engine, device="cpu")
+    return RunOptions(settings=learning, engine=settings.engine, device=settings.device)
 
 
 def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> SplatFile:
@@ -197,7 +199,7 @@ def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> SplatF
     from fragprune_plugins.storage.models import load_model
 
     assert summary.model_before is not None  # the host saves at its last iteration
-    model, _ = load_model(summary.model_before)
+    model, _ = load_model(summary.model_before, device=settings.device)
     learning = Settings(iterations=settings.finetune, truncate=False, seed=settings.seed)
     data = load_dataset(scene)
     return finetune(model, data, learning, engine=settings.engine, progress=True).model
@@ -213,7 +215,10 @@ def _measure(
     assert summary.model_before is not None
     assert summary.model_after is not None
     candidates = [
-        *(Candidate(*load_model(path)) for path in (summary.model_before, summary.model_after)),
+        *(
+            Candidate(*load_model(path, device=settings.device))
+            for path in (summary.model_before, summary.model_after)
+        ),
         Candidate(control, None),
     ]
     shots = load_dataset(scene).test

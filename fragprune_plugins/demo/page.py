@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.storage.atomic import replacing
 
 if TYPE_CHECKING:
+    from fragprune_plugins.demo.demo import DemoSettings
     from fragprune_plugins.injection.launch import RunSummary
 
 _INTRODUCTION = """A small training repository learned this room from ray-traced photographs. Then
@@ -20,28 +21,28 @@ fragprune finetune point_cloud.ply --data scene --out small.ply"""
 
 
 def write_page(
-    out: Path, report: dict[str, Any], scene: Path, summary: RunSummary, engine: str
+    out: Path, report: dict[str, Any], scene: Path, summary: RunSummary, settings: DemoSettings
 ) -> list[str]:
     """Write ``pictures/`` and ``index.html``; returns the files, relative to ``out``."""
     from fragprune_plugins.cli.common import describe
     from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.demo.demo import honest, quotable
-    from fragprune_plugins.engines import create_engine
     from fragprune_plugins.measure import Candidate, report_page
+    from fragprune_plugins.plugins.hooks import engine_for
     from fragprune_plugins.storage.models import load_model
 
     assert summary.model_before is not None
     assert summary.model_after is not None
     pictures = out / "pictures"
     models = (summary.model_before, summary.model_after)
-    before, after = (Candidate(*load_model(path)) for path in models)
-    views = report_page.draw_views(
-        pictures, before, after, load_dataset(scene).test, create_engine(engine)
-    )
+    (one, _), (other, store) = (load_model(path, device=settings.device) for path in models)
+    before, after = Candidate(one), Candidate(other, store)
+    engine = engine_for(settings.engine, settings.device)
+    views = report_page.draw_views(pictures, before, after, load_dataset(scene).test, engine)
     files = [file for names in views.values() for file in names]
     learning = []
-    if summary.curves and after.thresholds is not None:
-        report_page.save_learning(pictures / report_page.LEARNING, summary.curves, after.thresholds)
+    if summary.curves and store is not None:
+        report_page.save_learning(pictures / report_page.LEARNING, summary.curves, store.values)
         learning = [("How it learned", report_page.LEARNING)]
         files.append(report_page.LEARNING)
     text = report_page.compose(

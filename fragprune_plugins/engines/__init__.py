@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
-from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.errors import EngineError, UsageError
 
 if TYPE_CHECKING:
     import torch
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
         Sliced,
         SpacetimeSplats,
     )
+
+log = logging.getLogger("fragprune")
 
 ENGINES = ("reference", "cpu", "cuda")
 
@@ -38,8 +41,50 @@ class Slicer(Protocol):
         """Cut Gaussians in space and time at a moment; inputs that require gradients get them."""
 
 
+def device_for(wanted: str = "auto", engine: str = "auto") -> torch.device:
+    """The device that a command works on: the one rule behind ``--device``.
+
+    Args:
+        wanted: "cpu", "cuda", "cuda:N", or "auto": the GPU where torch sees one and our cuda
+            engine may be used on it, else the CPU.
+        engine: by name; ours named "cpu" and "cuda" draw on nothing else.
+
+    Raises:
+        UsageError: no such device here, or one that the engine cannot draw on.
+    """
+    import torch
+
+    seen = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if wanted == "auto":
+        if not seen or engine == "cpu":
+            return torch.device("cpu")
+        if engine == "cuda" or _fastest("cuda") == "cuda":
+            return torch.device("cuda")
+        log.warning(
+            "working on the CPU: the cuda engine cannot be used on this GPU; "
+            "fragprune doctor says why"
+        )
+        return torch.device("cpu")
+    device = torch.device(wanted)
+    if device.type == "cuda" and (device.index or 0) >= seen:
+        raise UsageError(
+            f"--device {wanted}",
+            f"{seen or 'no'} CUDA device{'' if seen == 1 else 's'}",
+            "that one",
+            "Use --device cpu, or auto.",
+        )
+    if engine in ("cpu", "cuda") and device.type != engine:
+        raise UsageError(
+            f"--device {wanted}",
+            f"--engine {engine}",
+            f"--device {engine}, where it draws",
+            "Leave one of the two out.",
+        )
+    return device
+
+
 def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
-    """The engine by name; "auto" takes the fastest that runs on the device.
+    """Our own engine by name; "auto" takes the fastest that runs on the device.
 
     Raises:
         EngineError: an unknown name, or an engine that cannot run here.
@@ -96,33 +141,3 @@ def slice_at(splats: SpacetimeSplats, moment: Moment) -> Sliced:
     """
     slicer: Slicer = _slicer(_fastest(str(splats.device)))  # type: ignore[assignment]
     return slicer.slice(splats, moment)
-
-
-def rasterize(
-    inputs: RasterInputs, thresholds: Tensor | None = None, *, engine: str | Engine = "auto"
-) -> RasterOutputs:
-    """Draw splats, each truncated at its own threshold. Differentiable; any engine.
-
-    A fragment of Gaussian i is drawn iff q <= min(-2 ln tau_i, 2 ln(255 o_i)), q its squared
-    Mahalanobis distance; the gradient of tau comes from a logistic surrogate at the rim.
-
-    Args:
-        inputs: camera and Gaussians.
-        thresholds: (N,) falloff in (0, 1), or None.
-        engine: a name ("auto", "reference", "cpu", "cuda") or an engine object.
-
-    Raises:
-        InputError: thresholds that do not match the Gaussians.
-        EngineError: no such engine here.
-    """
-    n = len(inputs.splats)
-    if thresholds is not None and tuple(thresholds.shape) != (n,):
-        raise InputError(
-            "thresholds",
-            f"shape {tuple(thresholds.shape)}",
-            f"({n},), one per Gaussian",
-            "Pass the thresholds of this very model.",
-        )
-    if isinstance(engine, str):
-        engine = create_engine(engine, inputs.splats.device)
-    return engine.rasterize(inputs, thresholds)

@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Dataset, Shot
-from fragprune_plugins.engines import Engine, create_engine
+from fragprune_plugins.engines import Engine
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Progress, Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.atomic import replacing, writable_folder
 from fragprune_plugins.storage.ply import SplatFile, write_ply
@@ -80,26 +81,29 @@ def finetune(
     random permutations; the global random streams are not touched.
 
     Args:
-        model: the trained splat; not changed.
-        dataset: its photographs; only training views are learned from.
+        model: the trained splat; not changed. Everything happens on its device.
+        dataset: its photographs; only training views are learned from. Pixels stay in main memory
+            and follow the model one view at a time.
         settings: iterations, what moves, pressure or target; defaults when None.
         store: thresholds to go on from, changed in place; neutral ones when None.
-        schedule: when what learns how fast; the default one when None.
+        schedule: when what learns how fast; when None a plugin's, or the default one.
         engine: a name or an engine.
         progress: draw a bar on stderr.
 
     Raises:
         EngineError: no such engine here.
+        PluginError: a plugin raised, or gave an answer that cannot be used.
         AlignmentError: store and model differ in length.
     """
-    settings = settings or Settings()
+    settings, device = settings or Settings(), model.xyz.device
+    dataset = dataset.to(device)
     run = _Run(
         model,
         dataset,
         settings,
-        ThresholdStore(len(model)) if store is None else store,
-        schedule or Schedule(settings),
-        create_engine(engine, model.xyz.device) if isinstance(engine, str) else engine,
+        ThresholdStore(len(model), device) if store is None else store,
+        schedule or schedule_for(settings),
+        engine_for(engine, device) if isinstance(engine, str) else engine,
     )
     started = time.perf_counter()
     interrupted = False
@@ -167,7 +171,14 @@ class _Run:
         self.curves: list[StepStats] = []
         self.done = 0
         again = {shot: partial(self._draw, shot) for shot in dataset.train}
-        self.stage = Stage2(store, settings, schedule, views=again, watch=self.curves.append)
+        self.stage = Stage2(
+            store,
+            settings,
+            schedule,
+            truncate=thresholds_for,
+            views=again,
+            watch=self.curves.append,
+        )
         rates = {"opacity": settings.opacity_lr}
         if settings.train in ("appearance", "all"):
             rates |= _APPEARANCE

@@ -232,8 +232,20 @@ class HostAdapter(ABC):
         """What the source says about being this host; an error finding means it is not."""
 
     def match(self, repo: HostRepo) -> Match:
-        """Fingerprint and seams together."""
-        findings = [*self.fingerprint(repo), *check_seams(repo, self.seams_for(repo))]
+        """Fingerprint and seams together; an adapter that raises does not fit."""
+        try:
+            findings = [*self.fingerprint(repo), *check_seams(repo, self.seams_for(repo))]
+        except Exception as error:  # the adapter's own; others are still tried
+            findings = [
+                Finding(
+                    "error",
+                    "adapter-failed",
+                    f"adapter {self.name}",
+                    f"{type(error).__name__}: {error}",
+                    "an adapter that reads any folder",
+                    "Report it to the adapter's author.",
+                )
+            ]
         fits = not any(finding.level == "error" for finding in findings)
         return Match(self.name, "known" if fits else "none", tuple(findings))
 

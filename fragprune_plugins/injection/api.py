@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,8 @@ from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.injection import session as _session
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.plugins.hooks import select_adapter
+from fragprune_plugins.plugins.loading import installed
 
 
 def activate(
@@ -34,7 +36,7 @@ def activate(
             "off" only applies thresholds that sidecars bring.
         from_iter: iterations of this run to let pass first (0 when it was resumed).
         settings: of the fine-tuning; ``iterations`` is how long it lasts.
-        engine: "auto", "reference", "cpu" or "cuda".
+        engine: "auto", "reference", "cpu", "cuda" or the name of a plugin's.
 
     Raises:
         UnknownHostError: no adapter fits.
@@ -42,10 +44,10 @@ def activate(
         SessionError: a session is active already.
     """
     settings = settings or Settings()
-    plugins = load_plugins()
+    plugins = installed()
     joint = stage == "joint"
     folder = Path(host) if host is not None else Path(sys.argv[0]).resolve().parent
-    tie = plugins.manager.hook.fragprune_select_adapter
+    tie = partial(select_adapter, plugins=plugins)
     repo, chosen = locate(folder, plugins.adapters, adapter, select=tie)
     return Session(
         chosen,

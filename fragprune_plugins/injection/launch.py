@@ -16,6 +16,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 from unittest import mock
@@ -25,7 +26,7 @@ from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.plugins.loading import installed
 
 log = logging.getLogger("fragprune")
 
@@ -51,8 +52,9 @@ class RunOptions:
         from_iter: with "finetune": learn and freeze from this iteration of a run that was not
             resumed; with "joint": learn from it.
         alternate: with "joint", learn for so many iterations, hold for as many, and so on.
-        engine: "auto", "reference", "cpu", "cuda".
-        device: "auto" or "cpu" to run a CUDA-only host on the CPU; "cuda" insists on a GPU.
+        engine: "auto", "reference", "cpu", "cuda", or the name of a plugin's.
+        device: where the host runs: "cpu" lets a CUDA-only host do without a GPU, "cuda" and
+            "cuda:N" insist on one, "auto" takes a GPU where torch sees one.
     """
 
     adapter: str | None = None
@@ -61,7 +63,7 @@ class RunOptions:
     from_iter: int | None = None
     alternate: int | None = None
     engine: str = "auto"
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class RunSummary:
     Attributes:
         adapter: its name.
         engine: that drew stage 2, "" when there was none.
-        device: "cpu" or "cuda".
+        device: "cpu", "cuda" or "cuda:N".
         stage: what was asked for.
         iterations: learned in stage 2.
         gaussians: of the trained model.
@@ -144,27 +146,29 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         options: how.
 
     Raises:
-        UsageError: the command names no script.
+        UsageError: the command names no script, or there is no such device.
+        EngineError: no such engine here.
         UnknownHostError: no adapter fits the script's folder.
         HostFailed: the host ended with an error code.
         Interrupted: Ctrl-C in stage 2; what was learned has been saved.
     """
     import time
 
+    from fragprune_plugins.plugins.hooks import engine_for, select_adapter
+
     options = options or RunOptions()
     script, arguments, module = _split(command)
-    plugins = load_plugins()
-    for finding in plugins.findings:
-        if finding.level != "info":
-            log.warning("%s", finding)
-    tie = plugins.manager.hook.fragprune_select_adapter
+    plugins = installed()
+    tie = partial(select_adapter, plugins=plugins)
     package = HostRepo.installed(module.split(".")[0]) if module else None
     if package is not None:
         repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
     else:
         repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
     host = _parse(script, arguments, adapter.command_line(repo), module)
-    device = _device(options.device)
+    device = _device(options.device, options.engine)
+    if options.engine != "auto":
+        engine_for(options.engine, device, plugins)  # refuse before stage 1
     started = time.perf_counter()
     trains = script in (repo.root / name for name in host.line.scripts)
     with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
@@ -519,18 +523,15 @@ def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) 
         )
 
 
-def _device(wanted: str) -> str:
+def _device(wanted: str, engine: str) -> str:
+    """Where the host runs: it was written for a GPU, so "auto" gives it any that there is."""
     import torch
 
-    if wanted == "cpu":
-        return "cpu"
-    if torch.cuda.is_available():
+    from fragprune_plugins.engines import device_for
+
+    if wanted == "auto" and torch.cuda.is_available():
         return "cuda"
-    if wanted == "cuda":
-        raise UsageError(
-            "--device cuda", "no CUDA device", "one", "Use --device cpu for small scenes."
-        )
-    return "cpu"
+    return str(device_for(wanted, engine))
 
 
 def _with_iterations(settings: Settings, iterations: int) -> Settings:
@@ -579,6 +580,18 @@ def _host_pictures() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def current_gpu(device: str) -> Iterator[None]:
+    """Where a GPU is named by its number, inside it is "cuda", whichever a host would choose."""
+    import torch
+
+    if not device.startswith("cuda:"):
+        yield
+        return
+    with torch.cuda.device(device), mock.patch.object(torch.cuda, "set_device"):
+        yield
+
+
+@contextlib.contextmanager
 def _host_process(
     script: Path, arguments: list[str], device: str, folder: Path | None = None
 ) -> Iterator[None]:
@@ -594,6 +607,8 @@ def _host_process(
             stack.enter_context(_host_pictures())
             if device == "cpu":
                 stack.enter_context(cpu_only())
+            else:
+                stack.enter_context(current_gpu(device))
             yield
     finally:
         sys.argv, sys.path[:], sys.stdout, sys.stderr = saved

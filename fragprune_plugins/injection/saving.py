@@ -16,6 +16,7 @@ from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.injection.state import ModelState, named
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.storage import sidecar
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def adopt(session: Session, model: Any, expected: Tensor, store: ThresholdStore)
     placed.load_state_dict(store.state_dict())
     session.models[model] = ModelState(placed, loaded=weakref.ref(means))
     session.follow(model, session.models[model])
-    session.hook.fragprune_attached(model=model, store=placed)
+    session.plugins.tell(hookspecs.fragprune_attached, model=model, store=placed)
     session.unpacked = None
 
 

@@ -34,6 +34,8 @@ from fragprune_plugins.learning.events import PopulationChange, StepStats, Summa
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.types import RasterInputs
@@ -65,7 +67,7 @@ class Session:
         from_step: steps of the host to let pass before learning and freezing begin.
         freeze: in learning, everything but what ``settings.train`` names stands still.
         start: the host's iteration that this run goes on after.
-        engine: name, see ``fragprune_create_engine``.
+        engine: name, see ``hooks.engine_for``.
         drop_in: put our stand-ins in place of the host's compiled packages: True, False, or None
             for those that cannot be imported.
         output: the host's output folder, when known.
@@ -89,10 +91,9 @@ class Session:
     ) -> None:
         self.adapter, self.repo, self.plugins = adapter, repo, plugins
         self.settings = settings or Settings()
-        self.hook = plugins.manager.hook
         self.learn, self.from_step, self.freeze = learn, from_step, freeze
         self.start = start
-        self.schedule = schedule or self.hook.fragprune_create_schedule(settings=self.settings)
+        self.schedule = schedule or schedule_for(self.settings, plugins)
         self.output = output
         self.curves: list[dict[str, float]] = []
         self._engine_name = engine
@@ -180,17 +181,16 @@ class Session:
         return state.store if state else None
 
     def engine(self, device: torch.device) -> Engine:
-        """The engine, created at its first use."""
-        if self._engine is None:
-            self._engine = self.hook.fragprune_create_engine(name=self._engine_name, device=device)
-            assert self._engine is not None  # the built-in plugin always answers
-            if self._engine.name == "reference":
-                log.warning(
-                    "drawing on %s with the reference engine: exact, and slow; "
-                    "fragprune doctor says why no faster one is used",
-                    device,
-                )
-        return self._engine
+        """The engine for tensors on a device, created at its first use."""
+        engine = engine_for(self._engine_name, device, self.plugins)
+        if engine is not self._engine and engine.name == "reference":
+            log.warning(
+                "drawing on %s with the reference engine: exact, and slow; "
+                "fragprune doctor says why no faster one is used",
+                device,
+            )
+        self._engine = engine
+        return engine
 
     def finish(self) -> Summary:
         """What was gained; observers are told."""
@@ -209,7 +209,7 @@ class Session:
             target_reached=done.target_reached if done else None,
             settings=self.settings.as_dict(),
         )
-        self.hook.fragprune_finished(summary=summary)
+        self.plugins.tell(hookspecs.fragprune_finished, summary=summary)
         return summary
 
     def expect_drawn(self) -> None:
@@ -337,18 +337,17 @@ class Session:
 
     def truncate(self, inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
         """The thresholds that plugins apply to one rasterization."""
-        thresholds: Tensor | None = self.hook.fragprune_truncate(inputs=inputs, store=store)
-        return thresholds
+        return thresholds_for(inputs, store, self.plugins)
 
     def report(self, stats: StepStats) -> None:
         """Tell observers of a step that is over."""
         self.curves.append(asdict(stats))
-        self.hook.fragprune_step(stats=stats)
+        self.plugins.tell(hookspecs.fragprune_step, stats=stats)
 
     def changed(self, store: ThresholdStore, operation: str, before: int) -> None:
         """Tell observers that rows changed."""
         change = PopulationChange(operation, before, len(store))
-        self.hook.fragprune_population_changed(store=store, change=change)
+        self.plugins.tell(hookspecs.fragprune_population_changed, store=store, change=change)
 
     def save(self, model: Any, path: Path) -> None:
         """Write a model's thresholds beside the file ``path`` that holds it; none if neutral.
@@ -376,7 +375,7 @@ class Session:
             host_commit=self.repo.commit,
             settings=self.settings.as_dict(),
         )
-        self.hook.fragprune_saved(path=written)
+        self.plugins.tell(hookspecs.fragprune_saved, path=written)
 
     def load(self, model: Any, path: Path) -> None:
         """Take a model's thresholds from beside the file ``path`` that it was just loaded from.
@@ -390,7 +389,7 @@ class Session:
         state = self.models[model] = ModelState(store, loaded=means)
         self.expect_rows(model, state, str(path))
         self.follow(model, state)
-        self.hook.fragprune_attached(model=model, store=store)
+        self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)
 
     def expect_rows(self, model: Any, state: ModelState, where: str) -> None:
         """Raise AlignmentError unless a model has one threshold per Gaussian."""

@@ -13,6 +13,7 @@ import torch
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.injection.state import ModelState, named
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins import hookspecs
 
 if TYPE_CHECKING:
     from fragprune_plugins.injection.session import Session
@@ -54,7 +55,7 @@ def on_attach(
     session.follow(model, state)
     state.base_rates = {name: group["lr"] for name, group in session.groups(model) if name}
     hook_optimizers(session, model, state)
-    session.hook.fragprune_attached(model=model, store=state.store)
+    session.plugins.tell(hookspecs.fragprune_attached, model=model, store=state.store)
     return result
 
 

@@ -3,42 +3,56 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Shot
-from fragprune_plugins.engines import Engine, create_engine
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.measure.clock import timed
 from fragprune_plugins.measure.metrics import psnr, ssim
+from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.storage.ply import SplatFile
-from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 
 REPEATS = 9
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A splat and the thresholds (N,) to draw it with, None for no truncation.
+    """A splat and how to draw it.
 
-    ``drawing`` holds fields of ``RasterInputs`` where other rules than vanilla's apply.
+    Attributes:
+        model: the Gaussians.
+        thresholds: their store, whose plugins are asked at every view; or (N,) to use as they are;
+            None for no truncation.
+        drawing: fields of ``RasterInputs`` where other rules than vanilla's apply.
     """
 
     model: SplatFile
-    thresholds: Tensor | None = None
+    thresholds: Tensor | ThresholdStore | None = None
     drawing: Mapping[str, Any] = field(default_factory=dict)
 
     def inputs(self, view: View, splats: Splats) -> RasterInputs:
         """One view of the activated model."""
         return RasterInputs(view, splats, **self.drawing)
 
+    def draw(
+        self, engine: Engine, view: View, splats: Splats, *, counts: bool = False
+    ) -> RasterOutputs:
+        """One view of the activated model; also with fragments counted."""
+        inputs = replace(self.inputs(view, splats), counts=counts)
+        return engine.rasterize(inputs, thresholds_for(inputs, self.thresholds))
+
 
 def evaluate(
     model: SplatFile,
-    thresholds: Tensor | None,
+    thresholds: Tensor | ThresholdStore | None,
     shots: Sequence[Shot],
     *,
     engine: str | Engine = "auto",
@@ -59,11 +73,11 @@ def measure(
     """Measure splats against the same photographs, timing them in turns.
 
     Frames of all candidates are timed interleaved, so that a busy machine slows them alike. A
-    frame is one rasterization of activated Gaussians, forward only, without reading or writing
-    images.
+    frame is one rasterization of activated Gaussians with thresholds at hand, forward only, without
+    reading or writing images; on a GPU it lasts until the GPU is idle again.
 
     Args:
-        candidates: what to measure.
+        candidates: what to measure; on one device, where the views are taken.
         shots: the views; figures are means over them.
         engine: a name or an engine.
         repeats: timed frames a view and candidate.
@@ -73,14 +87,16 @@ def measure(
         evaluated_per_pixel, gaussians, frame_ms (median over views and repeats), frame_ms_se
         (standard error over repeats of the median over views), engine, device, views.
     """
+    device = candidates[0].model.xyz.device
     if isinstance(engine, str):
-        engine = create_engine(engine, candidates[0].model.xyz.device)
+        engine = engine_for(engine, device)
+    shots = [shot.to(device) for shot in shots]
     drawn = [candidate.model.splats() for candidate in candidates]
     reports: list[dict[str, Any]] = []
     for candidate, splats in zip(candidates, drawn, strict=True):
         rows = []
         for shot in shots:
-            outputs = engine.rasterize(candidate.inputs(shot.view, splats), candidate.thresholds)
+            outputs = candidate.draw(engine, shot.view, splats)
             rows.append(
                 (
                     psnr(outputs.image, shot.image),
@@ -110,9 +126,10 @@ def measure(
             turns.reverse()  # neither is always the one that finds a cold cache
             for candidate, splats, rounds in turns:
                 inputs = candidate.inputs(shot.view, splats)
-                started = time.perf_counter()
-                engine.rasterize(inputs, candidate.thresholds)
-                rounds[-1].append(1e3 * (time.perf_counter() - started))
+                frame = partial(
+                    engine.rasterize, inputs, thresholds_for(inputs, candidate.thresholds)
+                )
+                rounds[-1].append(timed(frame, device)[1])
     for report, rounds in zip(reports, times, strict=True):
         medians = [statistics.median(frames) for frames in rounds]
         spread = statistics.stdev(medians) if len(medians) > 1 else 0.0
@@ -120,7 +137,7 @@ def measure(
             "frame_ms": statistics.median(ms for frames in rounds for ms in frames),
             "frame_ms_se": spread / len(medians) ** 0.5,
             "engine": engine.name,
-            "device": str(candidates[0].model.xyz.device),
+            "device": str(device),
             "views": len(shots),
         }
     return reports

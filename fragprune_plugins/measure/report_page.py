@@ -30,7 +30,7 @@ def draw_views(
         folder: for the PNGs.
         before: the model as it was.
         after: the model to compare with it.
-        shots: the views.
+        shots: the views; they go where the models are.
         engine: that draws.
 
     Returns:
@@ -42,13 +42,12 @@ def draw_views(
 
     views = {}
     models = [("before", before, before.model.splats()), ("after", after, after.model.splats())]
-    for shot in shots[:: max(1, len(shots) // _SHOWN)][:_SHOWN]:
+    chosen = shots[:: max(1, len(shots) // _SHOWN)][:_SHOWN]
+    for shot in (shot.to(before.model.xyz.device) for shot in chosen):
         stem = Path(shot.name.replace("/", "_")).stem
         with torch.no_grad():
             drawn = {
-                name: engine.rasterize(
-                    each.inputs(shot.view, splats).with_counts(), each.thresholds
-                )
+                name: each.draw(engine, shot.view, splats, counts=True)
                 for name, each, splats in models
             }
         images = {"photograph": shot.image} | {name: out.image for name, out in drawn.items()}

@@ -47,15 +47,20 @@ def fragprune_select_adapter(repo: HostRepo, matches: Sequence[Match]) -> str | 
 def fragprune_truncate(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
     """Give the thresholds (N,) in falloff to apply to one rasterization: learned, fixed, your own.
 
+    Asked wherever a model that has thresholds is drawn. Where no plugin answers, it is the learned
+    ones.
+
     :param inputs: camera and the Gaussians about to be drawn: the model's N, or those of them that
         the host picked; their thresholds are picked alike.
-    :param store: the learned thresholds of the model being drawn.
+    :param store: the learned thresholds of the model being drawn; the answer has one for each.
     """
 
 
 @hookspec(firstresult=True)
 def fragprune_create_engine(name: str, device: torch.device) -> Engine | None:
     """Supply a rasterizer that honours thresholds.
+
+    Asked once for a name and a device. Where no plugin answers, it is one of ours.
 
     :param name: what the user asked for, "auto" included.
     :param device: where the tensors live.
@@ -65,6 +70,8 @@ def fragprune_create_engine(name: str, device: torch.device) -> Engine | None:
 @hookspec(firstresult=True)
 def fragprune_create_schedule(settings: Settings) -> Schedule | None:
     """Decide when thresholds start, move and stop in stage 2.
+
+    Where no plugin answers, it is the paper's schedule.
 
     :param settings: what the user asked for.
     """

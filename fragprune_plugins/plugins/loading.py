@@ -1,33 +1,165 @@
-"""The plugin manager: entry points found, blocked, loaded one by one, and checked.
+"""The plugins of this process: found, blocked, loaded one by one, and asked one by one.
 
-One plugin that fails to import never stops the others; it is reported. Environment:
-``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take comma-separated entry-point names.
+One plugin that fails never stops the others: at import it becomes a finding, in a hook it is named.
+Environment: ``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take comma-separated entry-point names.
 """
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Iterable
+import traceback
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.errors import PluginError
+from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.plugins import builtin, hookspecs
+from fragprune_plugins.plugins import hookspecs
+
+if TYPE_CHECKING:
+    import torch
+
+    from fragprune_plugins.engines import Engine
+
+log = logging.getLogger("fragprune")
 
 GROUP = "fragprune"
+
+Hook = Callable[..., Any]
+"""A function of ``hookspecs``; its name is the hook's."""
+
+Wrong = tuple[str, str]
+"""What was found in an answer, and what was expected."""
+
+_FAULTS = (Exception, SystemExit)
+"""What a plugin may raise without ending the process; Ctrl-C is the user's."""
+
+
+def _manager() -> pluggy.PluginManager:
+    manager = pluggy.PluginManager(hookspecs.PROJECT)
+    manager.add_hookspecs(hookspecs)
+    return manager
 
 
 @dataclass
 class Plugins:
-    """Loaded plugins, the adapters they offer, and what went wrong on the way."""
+    """Registered plugins, the adapters they offer, and what went wrong on the way.
 
-    manager: pluggy.PluginManager
+    Attributes:
+        adapters: by name.
+        findings: what was blocked, shadowed or failed.
+        loaded: the value of each entry point by its name.
+        engines: that were created, by the name that was asked for and the device: an engine keeps
+            memory and kernels that its next frame uses again.
+        _off: (plugin, hook) of observers that raised.
+    """
+
     adapters: list[HostAdapter] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
-    loaded: dict[str, str] = field(default_factory=dict)  # entry point -> its value
+    loaded: dict[str, str] = field(default_factory=dict)
+    engines: dict[tuple[str, torch.device], Engine] = field(default_factory=dict)
+    _manager: pluggy.PluginManager = field(default_factory=_manager, init=False, repr=False)
+    _off: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
+
+    def register(self, plugin: object, name: str) -> None:
+        """Take a plugin and its adapters, or none of it.
+
+        Args:
+            plugin: a module or an object with hooks.
+            name: unique among the plugins.
+
+        Raises:
+            PluginError: it has an unknown hook or argument, or it raised.
+        """
+        offered: list[HostAdapter] = []
+
+        def offer(adapter: HostAdapter) -> None:
+            if not isinstance(adapter, HostAdapter):
+                raise TypeError(f"register() takes a HostAdapter, not {adapter!r}")
+            for attribute, kind in (("name", str), ("info", HostInfo), ("seams", tuple)):
+                if not isinstance(getattr(adapter, attribute, None), kind):
+                    raise TypeError(f"{adapter!r} has no {attribute} ({kind.__name__})")
+            offered.append(adapter)
+
+        if self._manager.has_plugin(name):
+            raise _broken(name, "", "two plugins of this name", "one")
+        try:
+            self._manager.register(plugin, name)
+            self._manager.check_pending()
+            for hook in self._manager.get_hookcallers(plugin) or ():
+                for each in hook.get_hookimpls():
+                    if each.plugin is plugin and (each.wrapper or each.hookwrapper):
+                        raise ValueError(f"{hook.name} is a wrapper")
+            for each in self._implementations(hookspecs.fragprune_register_adapters):
+                if each.plugin is plugin:
+                    _call(each, hookspecs.fragprune_register_adapters, {"register": offer})
+        except BaseException as error:
+            self._manager.unregister(name=name)
+            if not isinstance(error, pluggy.PluginValidationError | ValueError):
+                raise
+            expected = "plain functions for hooks of fragprune, with their arguments"
+            raise _broken(name, "", str(error), expected) from error
+        for adapter in offered:
+            _take(self, adapter)
+        self.adapters.sort(key=lambda adapter: adapter.name)
+
+    def ask(self, hook: Hook, wrong: Callable[[Any], Wrong | None], **given: Any) -> Any:
+        """The first answer that is not None; None where no plugin answers.
+
+        Args:
+            hook: which.
+            wrong: says what is wrong with an answer, None where nothing is.
+            given: the hook's arguments.
+
+        Raises:
+            PluginError: a plugin raised, or its answer is wrong.
+        """
+        for each in self._implementations(hook):
+            answer = _call(each, hook, given)
+            if answer is None:
+                continue
+            if complaint := wrong(answer):
+                raise _broken(each.plugin_name, hook.__name__, *complaint)
+            return answer
+        return None
+
+    def tell(self, hook: Hook, **given: Any) -> None:
+        """Tell every observer; one that raises is reported, and not told again."""
+        for each in self._implementations(hook):
+            key = each.plugin_name, hook.__name__
+            if key in self._off:
+                continue
+            try:
+                _call(each, hook, given)
+            except PluginError as error:
+                self._off.add(key)
+                log.warning("%s Until then it is not told again.", error)
+
+    def answering(self, hook: Hook) -> list[str]:
+        """Names of the plugins that are asked, in order."""
+        return [each.plugin_name for each in self._implementations(hook)]
+
+    def _implementations(self, hook: Hook) -> Iterator[pluggy.HookImpl]:
+        """In the order they are called: the last one registered first."""
+        caller: pluggy.HookCaller = getattr(self._manager.hook, hook.__name__)
+        return reversed(caller.get_hookimpls())
+
+
+@cache
+def installed() -> Plugins:
+    """The plugins of this process, found once; what went wrong is logged."""
+    plugins = load_plugins()
+    for finding in plugins.findings:
+        if finding.level != "info":
+            log.warning("%s", finding)
+    return plugins
 
 
 def load_plugins(found: Iterable[EntryPoint] | None = None) -> Plugins:
@@ -36,10 +168,7 @@ def load_plugins(found: Iterable[EntryPoint] | None = None) -> Plugins:
     Args:
         found: entry points to use in place of the installed ones.
     """
-    manager = pluggy.PluginManager(hookspecs.PROJECT)
-    manager.add_hookspecs(hookspecs)
-    manager.register(builtin, "builtin")
-    plugins = Plugins(manager)
+    plugins = Plugins()
     only = _names("FRAGPRUNE_ONLY")
     blocked = _names("FRAGPRUNE_BLOCK")
     for entry in entry_points(group=GROUP) if found is None else found:
@@ -60,40 +189,27 @@ def load_plugins(found: Iterable[EntryPoint] | None = None) -> Plugins:
                 )
         else:
             _load(plugins, entry, where)
-    plugins.adapters.sort(key=lambda adapter: adapter.name)
     return plugins
 
 
 def _load(plugins: Plugins, entry: EntryPoint, where: str) -> None:
-    """Load one plugin and take its adapters, or none of it."""
-    manager = plugins.manager
-    offered: list[HostAdapter] = []
+    """Load one plugin, or note why not."""
     try:
-        plugin = entry.load()
-        manager.register(plugin, entry.name)
-        try:
-            manager.check_pending()
-            others = [other for other in manager.get_plugins() if other is not plugin]
-            hook = manager.subset_hook_caller("fragprune_register_adapters", others)
-            hook(register=offered.append)
-        except Exception:
-            manager.unregister(plugin)
-            raise
-    except Exception as error:  # whatever a plugin raises is its own; the others go on
+        plugins.register(entry.load(), entry.name)
+    except _FAULTS as error:  # whatever a plugin raises is its own; the others go on
+        found = error.found if isinstance(error, PluginError) else _said(error)
         plugins.findings.append(
             Finding(
                 "error",
                 "plugin-failed",
                 where,
-                f"{type(error).__name__}: {error}",
+                found,
                 "a module that imports and implements known hooks",
                 "Fix or uninstall it, or set FRAGPRUNE_BLOCK.",
             )
         )
     else:
         plugins.loaded[entry.name] = entry.value
-        for adapter in offered:
-            _take(plugins, adapter)
 
 
 def _take(plugins: Plugins, adapter: HostAdapter) -> None:
@@ -110,6 +226,32 @@ def _take(plugins: Plugins, adapter: HostAdapter) -> None:
         )
     else:
         plugins.adapters.append(adapter)
+
+
+def _call(implementation: pluggy.HookImpl, hook: Hook, given: dict[str, Any]) -> Any:
+    """What one plugin answers.
+
+    Raises:
+        PluginError: it raised.
+    """
+    arguments = [given[name] for name in implementation.argnames]
+    try:
+        return implementation.function(*arguments)
+    except _FAULTS as error:
+        frames = traceback.extract_tb(error.__traceback__)[1:2]  # the hook's own; the first is ours
+        line = "".join(f" ({Path(each.filename).name}:{each.lineno})" for each in frames)
+        plugin, found = implementation.plugin_name, _said(error) + line
+        raise _broken(plugin, hook.__name__, found, "an answer") from error
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _broken(plugin: str, hook: str, found: str, expected: str) -> PluginError:
+    where = f"plugin {plugin}, {hook}" if hook else f"plugin {plugin}"
+    remedy = f"Fix or uninstall the plugin, or set FRAGPRUNE_BLOCK={plugin}."
+    return PluginError(where, found, expected, remedy)
 
 
 def _names(variable: str) -> set[str]:

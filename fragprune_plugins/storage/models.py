@@ -6,46 +6,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    import torch
 
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.storage.ply import SplatFile
 
 
 def load_model(
-    path: Path, *, truncation: bool = True, filtered: bool = False
-) -> tuple[SplatFile, Tensor | None]:
-    """A model and its thresholds (N,): the sidecar's, else the file's own column, else None.
+    path: Path,
+    *,
+    truncation: bool = True,
+    filtered: bool = False,
+    device: torch.device | str = "cpu",
+) -> tuple[SplatFile, ThresholdStore | None]:
+    """A model and its thresholds: the sidecar's, else the file's own column, else None.
 
-    ``filtered`` as in ``read_ply``.
+    Args:
+        path: of the model.
+        truncation: False leaves the thresholds out.
+        filtered: as in ``read_ply``.
+        device: where both are to live.
 
     Raises:
         ModelFileError: the model cannot be read.
         SidecarError: the sidecar beside it is broken or belongs to another model.
     """
-    from fragprune_plugins.storage import sidecar
-    from fragprune_plugins.storage.ply import read_ply
-
-    model = read_ply(path, filtered=filtered)
-    if not truncation:
-        return model, None
-    if sidecar.path_beside(path).exists():
-        store = load_store(path, model)
-        return model, None if store.neutral else store.values.detach()
-    return model, model.thresholds
-
-
-def load_store(path: Path, model: SplatFile) -> ThresholdStore:
-    """The thresholds of a model to go on learning from: as ``load_model``, neutral when none."""
     import torch
 
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.storage import sidecar
+    from fragprune_plugins.storage.ply import read_ply
 
-    store = ThresholdStore(len(model))
-    if sidecar.path_beside(path).exists():
+    model = read_ply(path, filtered=filtered).to(device)
+    store = ThresholdStore(len(model), device)
+    if truncation and sidecar.path_beside(path).exists():
         sidecar.load(path, store)
-    elif model.thresholds is not None:
+    elif truncation and model.thresholds is not None:
         with torch.no_grad():
             store.logits.copy_(torch.logit(model.thresholds))
-    return store
+    return model, None if store.neutral else store

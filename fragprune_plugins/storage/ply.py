@@ -10,7 +10,7 @@ these may read them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +87,11 @@ class SplatFile:
     def sh_degree(self) -> int:
         """0 to 3, from the number of coefficients."""
         return _REST_COUNTS[3 * self.f_rest.shape[1]]
+
+    def to(self, device: torch.device | str) -> SplatFile:
+        """The same Gaussians on a device; the very tensors where they are there."""
+        moved = {name: each.to(device) for name, each in vars(self).items() if each is not None}
+        return replace(self, **moved)
 
     def splats(self) -> Splats:
         """The Gaussians activated, as engines take them; differentiable."""

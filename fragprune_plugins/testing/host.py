@@ -372,7 +372,7 @@ def running(
     """
     loaded = load_plugins()
     for index, plugin in enumerate(plugins or ()):
-        loaded.manager.register(plugin, f"test-{index}")
+        loaded.register(plugin, f"test-{index}")
     settings, driver = settings or Settings(iterations=20), driver or Host()
     session = Session(adapter, HostRepo(path), loaded, settings, **({"drop_in": True} | options))
     with imported(path), cpu_only():

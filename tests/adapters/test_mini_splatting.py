@@ -190,15 +190,10 @@ def test_thresholds_learn_through_new_points_and_simplification(
             neutral = bool((store.logits <= -13).all())
             self.changes.append((change.operation, change.before, change.after, neutral))
 
-    rows = Rows()
-
-    def load():
-        plugins = load_plugins()
-        plugins.manager.register(rows, "test")
-        return plugins
-
+    rows, plugins = Rows(), load_plugins()
+    plugins.register(rows, "test")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(launch, "load_plugins", load)
+        patch.setattr(launch, "installed", lambda: plugins)
         options = replace(OPTIONS, stage="joint", from_iter=2)
         summary = run(command(mini, variant, photographs, tmp_path, 16), options)
     store, _ = sidecar.load(summary.model_after)
@@ -254,12 +249,9 @@ class InterruptAt:
 def test_an_interrupted_run_saves_at_its_iteration_whatever_the_hosts_clock_says(
     mini, photographs, tmp_path, monkeypatch
 ):
-    def load():
-        plugins = load_plugins()
-        plugins.manager.register(InterruptAt(), "test")
-        return plugins
-
-    monkeypatch.setattr(launch, "load_plugins", load)
+    plugins = load_plugins()
+    plugins.register(InterruptAt(), "test")
+    monkeypatch.setattr(launch, "installed", lambda: plugins)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(Interrupted):

@@ -14,8 +14,8 @@ from mip_splatting_host import MipHost
 from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
+from fragprune_plugins import rasterize
 from fragprune_plugins.cli.run import _measure, _photographs
-from fragprune_plugins.engines import rasterize
 from fragprune_plugins.errors import ModelFileError, UnknownHostError
 from fragprune_plugins.finetuning import load_dataset
 from fragprune_plugins.hosts.choosing import choose

@@ -14,8 +14,8 @@ import torch
 from miniature import HOST, TINY, expect_ancestors, identity, joint, label, running
 from rain_gs_host import RainHost
 
+from fragprune_plugins import rasterize
 from fragprune_plugins.cli.run import _measure, _photographs
-from fragprune_plugins.engines import rasterize
 from fragprune_plugins.errors import AlignmentError, UnknownHostError
 from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.source import HostRepo

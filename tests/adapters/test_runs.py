@@ -106,12 +106,9 @@ class InterruptAt:
 
 
 def with_plugin(monkeypatch, plugin):
-    def load():
-        plugins = load_plugins()
-        plugins.manager.register(plugin, "test")
-        return plugins
-
-    monkeypatch.setattr(launch, "load_plugins", load)
+    plugins = load_plugins()
+    plugins.register(plugin, "test")
+    monkeypatch.setattr(launch, "installed", lambda: plugins)
 
 
 OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))

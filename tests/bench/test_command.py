@@ -37,6 +37,7 @@ def test_json_shape() -> None:
         "platform",
         "torch",
         "native",
+        "gpu",
     }
 
 

@@ -21,6 +21,7 @@ ROW = {
     "gaussians",
     "pass",
     "engine",
+    "device",
     "threads",
     "truncated",
     "fragments_per_pixel",

@@ -19,6 +19,7 @@ from fragprune_plugins.datasets.dataset import Dataset
 from fragprune_plugins.finetuning import finetune
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
+from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_plugins.types import View
 
@@ -32,6 +33,18 @@ class Photograph:
     name: str
     view: View
     image: torch.Tensor
+
+    def to(self, device):
+        """It is there."""
+        return self
+
+
+class Nearer:
+    """A plugin that cuts nearer than what was learned, and lets that learn on."""
+
+    @hookimpl
+    def fragprune_truncate(self, inputs, store):
+        return 0.1 + 0.8 * store.values
 
 
 class Halting(Schedule):
@@ -50,6 +63,7 @@ CASES = {
     "appearance": Settings(iterations=STEPS, train="appearance"),
     "control": Settings(iterations=STEPS, truncate=False),
     "a schedule of one's own": Settings(iterations=STEPS, pressure=1e-3, train="appearance"),
+    "a plugin's thresholds": Settings(iterations=STEPS, pressure=1e-3),
 }
 
 
@@ -78,10 +92,11 @@ def order(count, settings):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_both_drivers_learn_the_same_to_the_bit(case, tmp_path):
+def test_both_drivers_learn_the_same_to_the_bit(case, tmp_path, plug):
     settings = CASES[case]
     schedule = Halting(settings) if "schedule" in case else None
-    with running(settings, engine="cpu", schedule=schedule) as host:
+    plugins = [Nearer()] if "plugin" in case else []
+    with running(settings, engine="cpu", schedule=schedule, plugins=plugins) as host:
         model = host.model(60)
         model.active_sh_degree = model.max_sh_degree  # as a training has it in the end
         cameras = [host.camera(32, 24, side=side) for side in (-0.4, -0.1, 0.2, 0.5)]
@@ -96,6 +111,8 @@ def test_both_drivers_learn_the_same_to_the_bit(case, tmp_path):
         summary, store, curves = host.finish(), host.store(model), host.curves
         opacity = model._opacity.detach().clone()
         colour = model._features_dc.detach().clone()
+    for plugin in plugins:
+        plug(plugin)
     shots = [photograph(camera, f"{i}") for i, camera in enumerate(cameras)]
     result = finetune(start, Dataset(shots, shots), settings, schedule=schedule, engine="cpu")
 

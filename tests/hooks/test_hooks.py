@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 import re
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -14,9 +16,12 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.hooks import select_adapter, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.plugins.loading import Plugins, load_plugins
+from fragprune_plugins.testing import scenes
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("fragprune_")]
@@ -70,6 +75,16 @@ def test_the_page_documents_no_hook_that_is_not_there():
     assert re.findall(r"^## `(\w+)\(", PAGE.read_text(), re.MULTILINE) == HOOKS
 
 
+def test_the_plugin_on_the_page_works(plug):
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    plugin = ModuleType("plugin")
+    exec(code, vars(plugin))
+    plug(plugin)
+    store = ThresholdStore(60)
+    store.open(torch.full((60,), 0.5))
+    assert torch.equal(thresholds_for(scenes.random_scene(0), store), torch.full((60,), 0.05))
+
+
 def test_hook_fragprune_register_adapters():
     class Fork(Vanilla3DGS):
         name = "a-fork"
@@ -98,9 +113,9 @@ def test_hook_fragprune_select_adapter():
             assert repo.root == HOST
             return matches[-1].adapter
 
-    plugins = load_plugins()
-    plugins.manager.register(Plugin())
-    select = plugins.manager.hook.fragprune_select_adapter
+    plugins = Plugins()
+    plugins.register(Plugin(), "mine")
+    select = partial(select_adapter, plugins=plugins)
     chosen = choose(HostRepo(HOST), [Vanilla3DGS(), Fork()], select=select)
     assert chosen.name == "a-fork"
 

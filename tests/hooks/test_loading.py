@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+import logging
 
 import pytest
 
+from fragprune_plugins.errors import PluginError
 from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.plugins import hookspecs, loading
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.plugins.loading import Plugins, installed, load_plugins
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+HOOKS = [getattr(hookspecs, name) for name in vars(hookspecs) if name.startswith("fragprune_")]
 
 
 class Entry:
@@ -23,16 +28,25 @@ class Entry:
         return self.plugin
 
 
-def offering(*names):
-    """A plugin that offers adapters of these names."""
+def adapter(name):
+    return type("Fork", (Vanilla3DGS,), {"name": name})()
+
+
+def registering(*adapters):
+    """A plugin that offers these."""
 
     class Plugin:
         @hookimpl
         def fragprune_register_adapters(self, register):
-            for name in names:
-                register(SimpleNamespace(name=name))
+            for each in adapters:
+                register(each)
 
     return Plugin()
+
+
+def offering(*names):
+    """A plugin that offers adapters of these names."""
+    return registering(*map(adapter, names))
 
 
 GOOD = Entry("good", offering("good-host"))
@@ -64,6 +78,16 @@ class Broken:
         raise RuntimeError("my table is missing")
 
 
+class Wrapper:
+    @hookimpl(wrapper=True)
+    def fragprune_truncate(self, inputs, store):
+        return (yield)
+
+
+class Nameless(Vanilla3DGS):
+    name = None
+
+
 @pytest.mark.parametrize("order", ["before", "after"])
 @pytest.mark.parametrize(
     ("plugin", "words"),
@@ -72,9 +96,25 @@ class Broken:
         (ZeroDivisionError("at import"), "ZeroDivisionError"),
         (Misspelt(), "fragprune_trunkate"),
         (WrongArgument(), "tau"),
-        (Broken(), "RuntimeError: my table is missing"),
+        (Broken(), "RuntimeError: my table is missing (test_loading.py:"),
+        (SystemExit(7), "SystemExit: 7"),
+        (Wrapper(), "fragprune_truncate is a wrapper"),
+        (registering("not an adapter"), "takes a HostAdapter, not 'not an adapter'"),
+        (registering(adapter("one"), Vanilla3DGS), "takes a HostAdapter, not <class"),
+        (registering(Nameless()), "has no name (str)"),
     ],
-    ids=["import fails", "import raises", "misspelt hook", "unknown argument", "hook raises"],
+    ids=[
+        "import fails",
+        "import raises",
+        "misspelt hook",
+        "unknown argument",
+        "hook raises",
+        "import exits",
+        "wrapper",
+        "no adapter",
+        "a class",
+        "no name",
+    ],
 )
 def test_one_bad_plugin_is_reported_and_stops_no_other(plugin, words, order):
     bad = Entry("bad", plugin)
@@ -84,7 +124,7 @@ def test_one_bad_plugin_is_reported_and_stops_no_other(plugin, words, order):
     assert words in plugins.findings[0].found
     assert "bad = bad_module" in plugins.findings[0].where
     assert list(plugins.loaded) == ["good"]
-    assert plugins.manager.get_plugin("bad") is None
+    assert not any("bad" in plugins.answering(hook) for hook in HOOKS)
 
 
 @pytest.mark.parametrize(
@@ -128,6 +168,40 @@ def test_an_adapter_offered_twice_is_reported():
     plugins = load_plugins([GOOD, Entry("more", offering("good-host", "a-host"))])
     assert names(plugins) == ["a-host", "good-host"]
     assert codes(plugins) == [("warning", "adapter-shadowed")]
+
+
+def test_a_plugin_that_is_refused_leaves_its_name_free():
+    loaded = Plugins()
+    with pytest.raises(PluginError, match="fragprune_trunkate"):
+        loaded.register(Misspelt(), "mine")
+    first = offering("a-host")
+    loaded.register(first, "mine")
+    assert names(loaded) == ["a-host"]
+    for second in (offering("b-host"), first):
+        with pytest.raises(PluginError, match="plugin mine: two plugins of this name"):
+            loaded.register(second, "mine")
+    with pytest.raises(PluginError, match="already registered under a different name"):
+        loaded.register(first, "yours")
+    assert names(loaded) == ["a-host"]
+    assert loaded.answering(hookspecs.fragprune_register_adapters) == ["mine"]
+
+
+def test_plugins_are_found_once_in_a_process_and_faults_are_said(monkeypatch, caplog):
+    looked = []
+
+    def entries(group):
+        looked.append(group)
+        return [GOOD, Entry("bad", ImportError("libfancy.so is missing"))]
+
+    monkeypatch.setattr(loading, "entry_points", entries)
+    installed.cache_clear()
+    try:
+        with caplog.at_level(logging.WARNING, logger="fragprune"):
+            assert names(installed()) == names(installed()) == ["good-host"]
+    finally:
+        installed.cache_clear()
+    assert looked == [loading.GROUP]
+    assert caplog.text.count("libfancy.so is missing") == 1
 
 
 def test_what_is_installed_loads_without_findings():

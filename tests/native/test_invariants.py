@@ -230,7 +230,7 @@ def test_changes_in_place_are_noticed(engine: CpuEngine) -> None:
 
 
 def test_wrong_thresholds_never_reach_the_library(engine: CpuEngine) -> None:
-    from fragprune_plugins.engines import rasterize
+    from fragprune_plugins import rasterize
 
     with pytest.raises(InputError, match="thresholds"):
         rasterize(scenes.random_scene(0), torch.zeros(3), engine=engine)

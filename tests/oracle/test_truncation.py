@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import naive
 
-from fragprune_plugins.engines import rasterize
+from fragprune_plugins import rasterize
 from fragprune_plugins.engines.reference import camera_of, gaussians_of
 from fragprune_plugins.testing import scenes
 from reference_renderer import Options, project, render

@@ -1,0 +1,177 @@
+"""What the core asks its plugins, and its own answers where no plugin has one.
+
+Every command, the session of a host and the functions of the package ask here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import ENGINES, Engine, create_engine
+from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.loading import Plugins, Wrong, installed
+from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+if TYPE_CHECKING:
+    from fragprune_plugins.hosts.findings import Match
+    from fragprune_plugins.hosts.source import HostRepo
+
+
+def engine_for(
+    name: str, device: torch.device | str = "cpu", plugins: Plugins | None = None
+) -> Engine:
+    """The engine of a name for tensors on a device, a plugin's or our own; created once.
+
+    Args:
+        name: "auto", "reference", "cpu", "cuda", or what a plugin answers to.
+        device: where the tensors live.
+        plugins: to ask; those of the process when None.
+
+    Raises:
+        EngineError: an unknown name, or an engine that cannot run here.
+        PluginError: a plugin raised, or gave what is no engine.
+    """
+    device, plugins = torch.device(device), plugins or installed()
+    engine = plugins.engines.get((name, device))
+    if engine is None:
+        hook = hookspecs.fragprune_create_engine
+        engine = plugins.ask(hook, _no_engine, name=name, device=device)
+        if engine is None and name not in ("auto", *ENGINES):
+            raise _unknown_engine(name, plugins.answering(hook))
+        if engine is None:
+            engine = create_engine(name, device)
+        plugins.engines[name, device] = engine
+    return engine
+
+
+def schedule_for(settings: Settings, plugins: Plugins | None = None) -> Schedule:
+    """When thresholds start, move and stop in stage 2: a plugin's schedule, or the paper's.
+
+    Raises:
+        PluginError: a plugin raised, or gave what is no schedule.
+    """
+    hook = hookspecs.fragprune_create_schedule
+    answer = (plugins or installed()).ask(hook, _no_schedule, settings=settings)
+    return Schedule(settings) if answer is None else answer
+
+
+def thresholds_for(
+    inputs: RasterInputs, given: Tensor | ThresholdStore | None, plugins: Plugins | None = None
+) -> Tensor | None:
+    """The thresholds (N,) to draw with, in falloff; None where there are none.
+
+    Args:
+        inputs: of the rasterization.
+        given: a store, whose plugins are asked unless it is neutral; or thresholds to use as they
+            are.
+        plugins: to ask; those of the process when None.
+
+    Raises:
+        PluginError: a plugin raised, or gave other than N thresholds in (0, 1).
+    """
+    if not isinstance(given, ThresholdStore):
+        return given
+    if given.neutral:
+        return None
+
+    def wrong(answer: Any) -> Wrong | None:
+        return _no_thresholds(answer, len(given), inputs.splats.device)
+
+    hook = hookspecs.fragprune_truncate
+    answer = (plugins or installed()).ask(hook, wrong, inputs=inputs, store=given)
+    return given.values if answer is None else answer
+
+
+def select_adapter(
+    repo: HostRepo, matches: Sequence[Match], plugins: Plugins | None = None
+) -> str | None:
+    """The name of the adapter that a plugin prefers where several fit; None where none has a say.
+
+    Raises:
+        PluginError: a plugin raised, or named none of them.
+    """
+    names = [match.adapter for match in matches]
+
+    def wrong(answer: Any) -> Wrong | None:
+        return None if answer in names else (repr(answer), f"one of {', '.join(names)}")
+
+    hook = hookspecs.fragprune_select_adapter
+    name: str | None = (plugins or installed()).ask(hook, wrong, repo=repo, matches=matches)
+    return name
+
+
+def rasterize(
+    inputs: RasterInputs,
+    thresholds: Tensor | ThresholdStore | None = None,
+    *,
+    engine: str | Engine = "auto",
+) -> RasterOutputs:
+    """Draw splats, each truncated at its own threshold. Differentiable; any engine.
+
+    A fragment of Gaussian i is drawn iff q <= min(-2 ln tau_i, 2 ln(255 o_i)), q its squared
+    Mahalanobis distance; the gradient of tau comes from a logistic surrogate at the rim.
+
+    Args:
+        inputs: camera and Gaussians.
+        thresholds: (N,) falloff in (0, 1), used as they are; a store, whose plugins are asked; or
+            None.
+        engine: a name ("auto", "reference", "cpu", "cuda", a plugin's) or an engine object.
+
+    Raises:
+        InputError: thresholds that do not match the Gaussians.
+        EngineError: no such engine here.
+        PluginError: a plugin raised, or gave an answer that cannot be used.
+    """
+    n = len(inputs.splats)
+    thresholds = thresholds_for(inputs, thresholds)
+    if thresholds is not None and tuple(thresholds.shape) != (n,):
+        raise InputError(
+            "thresholds",
+            f"shape {tuple(thresholds.shape)}",
+            f"({n},), one per Gaussian",
+            "Pass the thresholds of this very model.",
+        )
+    if isinstance(engine, str):
+        engine = engine_for(engine, inputs.splats.device)
+    return engine.rasterize(inputs, thresholds)
+
+
+def _unknown_engine(name: str, asked: Sequence[str]) -> EngineError:
+    return EngineError(
+        "engine",
+        repr(name),
+        f"one of auto, {', '.join(ENGINES)}, or the name of a plugin's engine "
+        f"(plugins asked: {', '.join(asked) or 'none'})",
+        "Choose one; fragprune doctor lists plugins that failed to load.",
+    )
+
+
+def _no_engine(answer: Any) -> Wrong | None:
+    fits = callable(getattr(answer, "rasterize", None)) and isinstance(
+        getattr(answer, "name", None), str
+    )
+    return None if fits else (repr(answer), "an engine: a name, and rasterize(inputs, thresholds)")
+
+
+def _no_schedule(answer: Any) -> Wrong | None:
+    fits = callable(getattr(answer, "at", None))
+    return None if fits else (repr(answer), "a schedule: at(step) gives a StepPlan")
+
+
+def _no_thresholds(answer: Any, count: int, device: torch.device) -> Wrong | None:
+    """What is wrong with thresholds; on a GPU it waits for them, which our own need not."""
+    expected = f"({count},) floating-point thresholds in (0, 1) on {device}"
+    if not isinstance(answer, Tensor):
+        return repr(answer), expected
+    found = f"{answer.dtype} {tuple(answer.shape)} on {answer.device}"
+    if answer.shape != (count,) or answer.device != device or not answer.is_floating_point():
+        return found, expected
+    outside = int((~((answer > 0) & (answer < 1))).sum())
+    return (f"{outside} thresholds outside (0, 1)", expected) if outside else None

@@ -1,0 +1,31 @@
+"""Fine-tuning and measuring with the cuda engine, emulated: the same course as on the CPU."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from finetune import tiny
+
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.finetuning import finetune
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.measure import Candidate, measure
+
+
+def test_learned_and_measured_as_on_the_cpu(engine: CudaEngine, tmp_path) -> None:
+    truth = tiny.random_model()
+    dataset = tiny.dataset_in_memory(tmp_path, truth)
+    settings = Settings(iterations=3, pressure=1e-3)
+    courses = []
+    for each in (engine, create_engine("cpu")):
+        result = finetune(tiny.perturbed(truth), dataset, settings, engine=each)
+        candidate = Candidate(result.model, result.store)
+        (report,) = measure([candidate], dataset.test[:1], engine=each, repeats=1)
+        courses.append((result, report))
+    (ours, seen), (cpu, expected) = courses
+    torch.testing.assert_close(ours.store.logits, cpu.store.logits, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(ours.model.opacity, cpu.model.opacity, atol=1e-3, rtol=1e-3)
+    assert (seen["engine"], expected["engine"]) == ("cuda", "cpu")
+    for figure in ("psnr", "fragments_per_pixel"):
+        assert seen[figure] == pytest.approx(expected[figure], rel=1e-3)

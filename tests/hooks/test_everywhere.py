@@ -1,0 +1,241 @@
+"""Thresholds, an engine, a schedule of a plugin: alike in every command and function that draws."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+import fragprune_plugins
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.finetuning import finetune
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.measure import Candidate, evaluate
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.types import RasterInputs
+
+CUT_ALL = 0.999999
+HOST = fragprune_plugins.__path__[0] + "/demo/host/train.py"
+
+
+class Fixed:
+    """One threshold for all, whatever was learned."""
+
+    @hookimpl
+    def fragprune_truncate(self, inputs, store):
+        return torch.full((len(store),), CUT_ALL)
+
+
+class Mine:
+    """An engine with a name of its own, and how often it drew."""
+
+    name = "mine"
+
+    def __init__(self):
+        self.frames = 0
+
+    @hookimpl
+    def fragprune_create_engine(self, name, device):
+        return self if name == "mine" else None
+
+    def rasterize(self, inputs, thresholds):
+        self.frames += 1
+        return create_engine("auto").rasterize(inputs, thresholds)
+
+
+class Never:
+    """Thresholds stay where they open."""
+
+    @hookimpl
+    def fragprune_create_schedule(self, settings):
+        class Held(Schedule):
+            def at(self, step):
+                return replace(super().at(step), learn=False)
+
+        return Held(settings)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Photographs, a model whose thresholds lie beside it, a cameras file, a folder to write to."""
+    data, path, model = tiny.scene(tmp_path)
+    store = ThresholdStore(len(model))
+    with torch.no_grad():
+        store.logits.copy_(torch.logit(torch.full((len(model),), 0.3)))
+    sidecar.save(path, store)
+    cameras = tmp_path / "path.json"
+    content = tiny.transforms(["a"], tiny.cameras()[:1]) | {"w": 32, "h": 32}
+    cameras.write_text(json.dumps(content))
+    return data, path, cameras, tmp_path / "out"
+
+
+COMMANDS = {
+    "finetune": lambda data, path, cameras, out: (
+        *(path, "--data", data, "--out", out / "small.ply", "--iters", 2),
+    ),
+    "render": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
+    "profile": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
+    "compare": lambda data, path, cameras, out: (path, path, "--data", data, "--out", out),
+    "bench": lambda data, path, cameras, out: (
+        *("--model", path, "--cameras", cameras, "--size", "32x32", "--repeats", 2),
+    ),
+}
+
+
+def drawn(report):
+    """Fragments per pixel of what a command drew with the model's thresholds."""
+    if "results" in report:
+        return [row["fragments_per_pixel"] for row in report["results"] if row["truncated"]]
+    parts = [report[key] for key in ("before", "after", "a", "b") if key in report] or [report]
+    return [part["fragments_per_pixel"] for part in parts]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_fixed_thresholds_of_a_plugin_are_drawn_by_every_command(command, scene, plug):
+    assert min(drawn(run_json(command, *COMMANDS[command](*scene)))) > 0
+    plug(Fixed())
+    assert max(drawn(run_json(command, *COMMANDS[command](*scene)))) == 0
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_plugins_engine_is_named_like_our_own(command, scene, plug):
+    mine = Mine()
+    plug(mine)
+    report = run_json(command, *COMMANDS[command](*scene), "--engine", "mine")
+    row = report["results"][0] if "results" in report else report
+    row = row["columns"]["truncated"] if "columns" in row else row
+    assert row["engine"] == "mine"
+    assert mine.frames > 0
+
+
+def test_report_draws_with_a_plugins_engine_and_thresholds(scene, plug):
+    _, _, _, out = scene
+    run_json("finetune", *COMMANDS["finetune"](*scene))
+    mine = Mine()
+    plug(mine)
+    run_json("report", out, "--engine", "mine")
+    assert mine.frames > 0
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "run", "demo"])
+def test_an_unknown_engine_is_refused_with_those_that_are_known(command, scene, plug, tmp_path):
+    plug(Mine(), "my_plugin")
+    others = {
+        "run": ("--", "python", HOST, "-s", "x", "-m", tmp_path / "m"),
+        "demo": ("--out", tmp_path / "demo"),
+    }
+    words = others[command] if command in others else COMMANDS[command](*scene)
+    result = run(command, "--engine", "mime", *words)
+    assert result.exit_code == 1
+    assert result.stderr.count("[engine] engine: 'mime'; expected one of auto, reference, cpu") == 1
+    assert "plugins asked: my_plugin" in result.stderr
+    assert not (tmp_path / "m").exists()
+    assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "run", "report", "demo"])
+def test_help_names_our_engines_and_devices(command):
+    said = " ".join(run(command, "--help").stdout.split())
+    assert "--engine NAME" in said
+    assert "reference, cpu, cuda, or the name of a plugin's" in said
+    assert "--device auto|cpu|cuda[:N]" in said
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny.perturbed(tiny.random_model())
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), tiny.random_model())
+
+
+def test_finetune_learns_by_a_plugins_schedule(model, dataset, plug):
+    settings = Settings(iterations=5)
+    opened = finetune(
+        model, dataset, settings, schedule=Never().fragprune_create_schedule(settings)
+    )
+    learned = finetune(model, dataset, settings)
+    plug(Never())
+    result = finetune(model, dataset, settings)
+    assert torch.equal(result.store.logits, opened.store.logits)
+    assert not torch.equal(result.store.logits, learned.store.logits)
+    assert result.store.steps == 0
+    given = finetune(model, dataset, settings, schedule=Schedule(settings))
+    assert torch.equal(given.store.logits, learned.store.logits)  # what is passed wins
+
+
+def test_finetune_learns_opacities_under_a_plugins_thresholds(model, dataset, plug):
+    class Half:
+        @hookimpl
+        def fragprune_truncate(self, inputs, store):
+            return torch.full((len(store),), 0.5)
+
+    plug(Half())
+    result = finetune(model, dataset, Settings(iterations=5, pressure=1e-3))
+    start = ThresholdStore(len(model))
+    start.open(torch.sigmoid(model.opacity))
+    assert torch.equal(result.store.logits, start.logits)  # they decided nothing
+    assert not torch.equal(result.model.opacity, model.opacity)
+    assert result.progress.fragments_after < 0.8 * result.progress.fragments_before
+
+
+def test_thresholds_that_are_passed_win_over_a_plugins(model, plug):
+    plug(Fixed())
+    inputs = RasterInputs(tiny.cameras()[0].view(), model.splats())
+    store = ThresholdStore(len(model))
+    neutral = fragprune_plugins.rasterize(inputs, store)
+    assert torch.equal(neutral.image, fragprune_plugins.rasterize(inputs).image)
+    store.open(torch.sigmoid(model.opacity))
+    assert float(fragprune_plugins.rasterize(inputs, store).fragments_per_pixel.detach()) == 0
+    passed = fragprune_plugins.rasterize(inputs, store.values)
+    assert float(passed.fragments_per_pixel.detach()) > 0
+
+
+def test_rasterize_draws_with_a_plugins_engine(model, plug):
+    mine = Mine()
+    plug(mine)
+    inputs = RasterInputs(tiny.cameras()[0].view(), model.splats())
+    for _ in range(2):
+        fragprune_plugins.rasterize(inputs, engine="mine")
+    assert mine.frames == 2
+
+
+def test_an_engine_is_created_once_for_a_name_and_a_device(model, plug):
+    made = []
+
+    class Counting:
+        @hookimpl
+        def fragprune_create_engine(self, name, device):
+            made.append((name, str(device)))
+
+    plug(Counting())
+    inputs = RasterInputs(tiny.cameras()[0].view(), model.splats())
+    for _ in range(3):
+        fragprune_plugins.rasterize(inputs)
+    assert made == [("auto", "cpu")]
+
+
+def test_a_store_is_measured_as_its_thresholds_are(model, dataset):
+    store = ThresholdStore(len(model))
+    store.open(torch.full((len(model),), 0.5))
+    one = evaluate(model, store, dataset.test, repeats=1)
+    other = evaluate(model, store.values.detach(), dataset.test, repeats=1)
+    for key in ("psnr", "ssim", "fragments_per_pixel", "evaluated_per_pixel"):
+        assert one[key] == other[key]
+    assert Candidate(model, store).thresholds is store
+
+
+def test_an_exported_column_is_exported_again_to_the_bit(model, tmp_path):
+    values = torch.rand(len(model), generator=torch.Generator().manual_seed(0)).clamp(0.01, 0.9)
+    write_ply(tmp_path / "a.ply", model, values)
+    assert run("export", tmp_path / "a.ply", "--out", tmp_path / "b.ply").exit_code == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()

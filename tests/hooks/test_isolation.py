@@ -1,0 +1,198 @@
+"""A plugin that fails in a hook is named; what it answers is looked at before it is used."""
+
+from __future__ import annotations
+
+import logging
+from types import SimpleNamespace
+
+import pytest
+import torch
+from miniature import HOST, joint, running
+
+from fragprune_plugins.errors import InputError, PluginError, UnknownHostError
+from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.hosts.findings import Match
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.hooks import engine_for, schedule_for, select_adapter, thresholds_for
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import Plugins
+from fragprune_plugins.testing import scenes
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+pytestmark = pytest.mark.usefixtures("single_thread")
+
+COUNT = 60
+MATCHES = [Match(name, "known", ()) for name in ("a-host", "b-host")]
+
+
+def learned() -> ThresholdStore:
+    store = ThresholdStore(COUNT)
+    store.open(torch.full((COUNT,), 0.5))
+    return store
+
+
+ASK = {
+    "fragprune_truncate": lambda p: thresholds_for(scenes.random_scene(0), learned(), p),
+    "fragprune_create_engine": lambda p: engine_for("auto", "cpu", p),
+    "fragprune_create_schedule": lambda p: schedule_for(Settings(), p),
+    "fragprune_select_adapter": lambda p: select_adapter(HostRepo(HOST), MATCHES, p),
+}
+"""What makes the core ask."""
+
+OBSERVERS = [
+    "fragprune_attached",
+    "fragprune_population_changed",
+    "fragprune_step",
+    "fragprune_saved",
+    "fragprune_finished",
+]
+
+
+def plugin(hook, act):
+    """A plugin that does something in one hook; every argument of the hook is taken."""
+    names = {
+        "fragprune_truncate": lambda inputs, store: act(),
+        "fragprune_create_engine": lambda name, device: act(),
+        "fragprune_create_schedule": lambda settings: act(),
+        "fragprune_select_adapter": lambda repo, matches: act(),
+        "fragprune_attached": lambda model, store: act(),
+        "fragprune_population_changed": lambda store, change: act(),
+        "fragprune_step": lambda stats: act(),
+        "fragprune_saved": lambda path: act(),
+        "fragprune_finished": lambda summary: act(),
+    }
+    return SimpleNamespace(**{hook: hookimpl(names[hook])})
+
+
+def raising(error):
+    def act():
+        raise error
+
+    return act
+
+
+def with_one(hook, act):
+    plugins = Plugins()
+    plugins.register(plugin(hook, act), "mine")
+    return plugins
+
+
+def test_asked_and_told_are_all_hooks():
+    hooks = {name for name in vars(hookspecs) if name.startswith("fragprune_")}
+    assert hooks == {*ASK, *OBSERVERS, "fragprune_register_adapters"}
+
+
+@pytest.mark.parametrize(
+    "error",
+    [RuntimeError("no table"), SystemExit(7), InputError("here", "x", "y", "Do z.")],
+    ids=lambda error: type(error).__name__,
+)
+@pytest.mark.parametrize("hook", ASK)
+def test_a_raise_names_plugin_hook_cause_and_line(hook, error):
+    with pytest.raises(PluginError) as raised:
+        ASK[hook](with_one(hook, raising(error)))
+    assert raised.value.where == f"plugin mine, {hook}"
+    assert raised.value.found.startswith(f"{type(error).__name__}: {error} (test_isolation.py:")
+    assert "FRAGPRUNE_BLOCK=mine" in raised.value.remedy
+    assert raised.value.__cause__ is error
+
+
+@pytest.mark.parametrize("hook", ASK)
+def test_ctrl_c_in_a_hook_stays_the_users(hook):
+    with pytest.raises(KeyboardInterrupt):
+        ASK[hook](with_one(hook, raising(KeyboardInterrupt())))
+
+
+@pytest.mark.parametrize("hook", ASK)
+def test_a_plugin_without_an_answer_leaves_it_to_us(hook):
+    own = ASK[hook](Plugins())
+    left = ASK[hook](with_one(hook, lambda: None))
+    if isinstance(own, torch.Tensor):
+        assert torch.equal(own, left)
+    else:
+        assert type(left) is type(own)
+
+
+@pytest.mark.parametrize(
+    ("hook", "answer", "words"),
+    [
+        ("fragprune_create_engine", 3, "3; expected an engine"),
+        ("fragprune_create_engine", SimpleNamespace(name="mine"), "expected an engine"),
+        ("fragprune_create_engine", SimpleNamespace(rasterize=print), "expected an engine"),
+        ("fragprune_create_schedule", "soon", "'soon'; expected a schedule"),
+        ("fragprune_create_schedule", SimpleNamespace(at=3), "expected a schedule"),
+        ("fragprune_select_adapter", "c-host", "'c-host'; expected one of a-host, b-host"),
+        ("fragprune_select_adapter", 1, "expected one of a-host, b-host"),
+        ("fragprune_truncate", 0.1, r"0\.1; expected \(60,\) floating-point thresholds"),
+        ("fragprune_truncate", torch.full((59,), 0.1), r"\(59,\) on cpu"),
+        ("fragprune_truncate", torch.full((60, 1), 0.1), r"\(60, 1\)"),
+        ("fragprune_truncate", torch.ones(60, dtype=torch.int64), r"torch\.int64"),
+        ("fragprune_truncate", torch.full((60,), 0.1, device="meta"), "on meta"),
+        ("fragprune_truncate", torch.tensor([0.1] * 58 + [0.0, 1.0]), "2 thresholds outside"),
+        ("fragprune_truncate", torch.full((60,), torch.nan), "60 thresholds outside"),
+    ],
+)
+def test_an_answer_that_cannot_be_used_is_refused(hook, answer, words):
+    with pytest.raises(PluginError, match=f"plugin mine, {hook}: .*{words}"):
+        ASK[hook](with_one(hook, lambda: answer))
+
+
+def test_an_adapter_that_raises_while_it_reads_a_host_does_not_fit_and_stops_no_other():
+    class Broken(Vanilla3DGS):
+        name = "broken"
+
+        def fingerprint(self, repo):
+            raise KeyError("revision")
+
+    repo = HostRepo(HOST)
+    assert choose(repo, [Broken(), Vanilla3DGS()]).name == "vanilla-3dgs"
+    with pytest.raises(UnknownHostError, match="adapter broken: KeyError: 'revision'"):
+        choose(repo, [Broken()])
+
+
+def learn(plugins, tmp_path):
+    """Three steps, a change of rows, a saved model, the end: every observer is told; the logits."""
+    with joint(Settings(iterations=20), plugins=plugins) as host:
+        model, camera = host.model(20), host.camera()
+        for iteration in (1, 2, 3):
+            host.step(model, camera, iteration)
+        model.prune_points(torch.arange(20) < 5)
+        model.save_ply(str(tmp_path / "a.ply"))
+        host.finish()
+        return host.store(model).logits.detach().clone()
+
+
+@pytest.mark.parametrize("error", [RuntimeError("disk full"), SystemExit(7)], ids=["raise", "exit"])
+@pytest.mark.parametrize("hook", OBSERVERS)
+def test_an_observer_that_raises_is_switched_off_and_the_run_goes_on(hook, error, tmp_path, caplog):
+    told, calls = [], []
+
+    def act():
+        calls.append(hook)
+        raise error
+
+    others = SimpleNamespace()
+    for name in OBSERVERS:
+        setattr(others, name, getattr(plugin(name, lambda name=name: told.append(name)), name))
+    alone = learn([others], tmp_path)
+    expected, told[:] = told.copy(), []
+    with caplog.at_level(logging.WARNING, logger="fragprune"):
+        assert torch.equal(learn([others, plugin(hook, act)], tmp_path), alone)
+    assert told == expected
+    assert set(told) == set(OBSERVERS)
+    assert calls == [hook]
+    said = [record.getMessage() for record in caplog.records]
+    (line,) = [text for text in said if "plugin test-1" in text]
+    assert f"plugin test-1, {hook}: {type(error).__name__}: {error} (test_isolation.py:" in line
+
+
+def test_thresholds_that_cannot_be_used_stop_a_run_before_anything_is_drawn():
+    short = plugin("fragprune_truncate", lambda: torch.full((3,), 0.1))
+    with running(plugins=[short], freeze=False) as host:
+        model, camera = host.model(), host.camera()
+        model.update_learning_rate(1)
+        with pytest.raises(PluginError, match=r"plugin test-0, fragprune_truncate: .*\(3,\)"):
+            host.render(camera, model)
