@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from fragprune_plugins.cli.common import FILE, Command, Report
+from fragprune_plugins.cli.common import FILE, Command, OutFile, Report, require_place
 from fragprune_plugins.errors import SidecarError
 from fragprune_plugins.storage.models import load_model
 
 
 @click.command("export", cls=Command)
 @click.argument("model", type=FILE)
-@click.option("--out", type=FILE, required=True, help="The PLY to write.")
+@click.option("--out", type=OutFile(".ply"), required=True, help="The PLY to write.")
 def command(model: Path, out: Path) -> Report:
     """Write MODEL with its thresholds as one more column.
 
@@ -28,6 +28,7 @@ def command(model: Path, out: Path) -> Report:
     from fragprune_plugins.storage import sidecar
     from fragprune_plugins.storage.ply import THRESHOLD_COLUMN, write_ply
 
+    require_place(out, model)
     splat, thresholds = load_model(model)
     if thresholds is None:
         raise SidecarError(
@@ -37,6 +38,7 @@ def command(model: Path, out: Path) -> Report:
             "Run fragprune finetune first.",
         )
     write_ply(out, splat, thresholds)
+    sidecar.path_beside(out).unlink(missing_ok=True)  # of an earlier model under this name
     return Report(
         {
             "model": str(model),

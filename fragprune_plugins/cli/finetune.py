@@ -10,27 +10,32 @@ import click
 from fragprune_plugins.cli.common import (
     FILE,
     Command,
+    OutFile,
     Report,
     data_options,
     describe,
     engine_options,
     gain,
+    require_place,
     set_threads,
 )
 from fragprune_plugins.cli.learning import learning_options
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage.models import load_model, load_store
 
 
 @click.command("finetune", cls=Command)
 @click.argument("model", type=FILE)
-@click.option("--out", type=FILE, required=True, help="The new .ply; its sidecar goes beside it.")
+@click.option(
+    "--out", type=OutFile(".ply"), required=True, help="The new .ply; its sidecar goes beside it."
+)
 @data_options
 @learning_options
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the order of views.")
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
-@click.option("--curves", type=FILE, help="Write a picture of the learning curves here (.png).")
+@click.option(
+    "--curves", type=OutFile(".png"), help="Write a picture of the learning curves here (.png)."
+)
 @engine_options
 def command(
     model: Path,
@@ -58,20 +63,14 @@ def command(
       fragprune finetune point_cloud.ply --data scene --out half.ply --target-speedup 2
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
     """
-    if out.resolve() == model.resolve():
-        raise UsageError("--out", f"{out}, the model itself", "another file", "Name a new file.")
+    require_place(out, model)
 
     from fragprune_plugins.engines import create_engine
-    from fragprune_plugins.errors import OutputError
     from fragprune_plugins.finetuning import finetune, load_dataset, save
     from fragprune_plugins.measure import Candidate, measure
     from fragprune_plugins.storage import records, sidecar
-    from fragprune_plugins.storage.atomic import writable_folder
 
     set_threads(threads)
-    writable_folder(out.parent)
-    if out.is_dir():
-        raise OutputError(str(out), "a folder", "a .ply file", "Name a file in it.")
     splat, thresholds = load_model(model, truncation=settings.truncate and not no_truncation)
     dataset = load_dataset(data, resolution=resolution, white_background=white_background)
     rasterizer = create_engine(engine, splat.xyz.device)

@@ -6,8 +6,10 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
+from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage.ply import read_ply, write_ply
 
 
 def test_one_file_with_the_thresholds(tmp_path):
@@ -22,6 +24,19 @@ def test_one_file_with_the_thresholds(tmp_path):
     both = run_json("compare", tuned, out, "--data", data)
     assert both["speedup"] == 1
     assert both["psnr_change"] == 0
+
+
+def test_over_a_pair_leaves_no_stale_sidecar(tmp_path):
+    _, path, model = tiny.scene(tmp_path)
+    out = tmp_path / "out.ply"
+    for pair in (path, out):
+        write_ply(pair, model)
+        sidecar.save(pair, ThresholdStore(len(model)))
+    store = ThresholdStore(len(model))
+    store.open(model.splats().opacities)
+    sidecar.save(path, store)
+    assert run("export", path, "--out", out).exit_code == 0
+    assert torch.equal(load_model(out)[1], store.values)
 
 
 def test_nothing_to_export(tmp_path):
