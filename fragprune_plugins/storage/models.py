@@ -21,7 +21,7 @@ def load_model(
 
     Raises:
         ModelFileError: the model cannot be read.
-        SidecarError: the sidecar beside it is broken or belongs to another model.
+        SidecarError: the sidecar beside it is lost, broken or another model's.
     """
     from fragprune_plugins.storage import sidecar
     from fragprune_plugins.storage.ply import read_ply
@@ -29,7 +29,7 @@ def load_model(
     model = read_ply(path, filtered=filtered)
     if not truncation:
         return model, None
-    if sidecar.path_beside(path).exists():
+    if sidecar.lies_beside(path):
         store = load_store(path, model)
         return model, None if store.neutral else store.values.detach()
     return model, model.thresholds
@@ -43,7 +43,7 @@ def load_store(path: Path, model: SplatFile) -> ThresholdStore:
     from fragprune_plugins.storage import sidecar
 
     store = ThresholdStore(len(model))
-    if sidecar.path_beside(path).exists():
+    if sidecar.lies_beside(path):
         sidecar.load(path, store)
     elif model.thresholds is not None:
         with torch.no_grad():
