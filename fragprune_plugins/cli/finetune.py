@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -55,7 +56,8 @@ def command(
     Thresholds and opacities adapt to each other on the photographs in --data; positions, shapes
     and colours stay bit for bit (but see --train). OUT has the columns of MODEL; the thresholds go
     beside it, into OUT.fragprune.safetensors. The table compares both on views that were not
-    learned from. Ctrl-C saves what was learned so far.
+    learned from, and a line below it says what OUT is without its thresholds, as other viewers draw
+    it. Ctrl-C saves what was learned so far.
 
     \b
     Examples:
@@ -84,11 +86,10 @@ def command(
         from fragprune_plugins.measure.report_page import save_learning
 
         save_learning(curves, rows, result.thresholds)
-    before, after = measure(
-        [Candidate(splat, thresholds), Candidate(result.model, result.thresholds)],
-        dataset.test,
-        engine=rasterizer,
-    )
+    candidates = [Candidate(splat, thresholds), Candidate(result.model, result.thresholds)]
+    if result.thresholds is not None:
+        candidates.append(Candidate(result.model))
+    before, after, *without = measure(candidates, dataset.test, engine=rasterizer)
     pressure = f" at pressure {done.pressure:.2g}" if settings.truncate else ""
     quote = (
         f"{gain(before, after)} that were held out ({after['engine']} engine, "
@@ -103,12 +104,14 @@ def command(
         )
     if result.interrupted:
         lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations.")
-    lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.")
+    lines += [_describe_untruncated(before, plain) for plain in without]
+    lines.append(f"Wrote {out}. Keep {sidecar.path_beside(out).name} beside {out.name}.")
     report = {
         "model": str(model),
         "out": str(out),
         "before": before,
         "after": after,
+        "untruncated": without[0] if without else None,
         "speedup": done.speedup,
         "target_reached": done.target_reached,
         "interrupted": result.interrupted,
@@ -134,3 +137,12 @@ def command(
     }
     records.leave(out, "finetune", report | more)
     return Report(report, "\n".join(lines), exit_code=130 if result.interrupted else 0)
+
+
+def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
+    """What is left of a model for who does not know its thresholds."""
+    return (
+        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
+        f"({plain['psnr'] - before['psnr']:+.2f}), {plain['fragments_per_pixel']:.1f} fragments "
+        f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
+    )

@@ -56,6 +56,28 @@ def test_json_is_one_object_with_the_house_names(scene, tmp_path):
     assert report["pressure"] >= LEAST_PRESSURE
 
 
+def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
+    data, path, _ = scene
+    out = tmp_path / "out.ply"
+    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 30)
+    report = run_json(*arguments, "--pressure", 1e-3)
+    profile = run_json("profile", out, "--data", data)
+    for key in ("psnr", "fragments_per_pixel"):
+        assert report["untruncated"][key] == profile["columns"]["untruncated"][key]
+        assert report["after"][key] == profile["columns"]["truncated"][key]
+    text = run(*arguments, "--pressure", 1e-3).stdout
+    plain = report["untruncated"]
+    change = plain["psnr"] - report["before"]["psnr"]
+    assert (
+        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
+        f"({change:+.2f}), {plain['fragments_per_pixel']:.1f} fragments per pixel"
+    ) in text
+    assert f"Keep {sidecar.path_beside(out).name} beside {out.name}" in text
+    control = run_json(*arguments, "--control")
+    assert control["untruncated"] is None
+    assert "Without its thresholds" not in run(*arguments, "--control").stdout
+
+
 def test_target_control_and_curves(scene, tmp_path):
     data, path, _ = scene
     out, curves = tmp_path / "out.ply", tmp_path / "curves.png"
