@@ -255,6 +255,24 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def dropping(out: Path, bytes_before: int, before: int, after: int) -> dict[str, int]:
+    """What leaving Gaussians out of a file did: to its bytes, and to their count."""
+    return {
+        "gaussians": before - after,
+        "of": before,
+        "bytes_before": bytes_before,
+        "bytes_after": out.stat().st_size,
+    }
+
+
+def describe_dropped(dropped: dict[str, int], why: str) -> str:
+    """The same in a line."""
+    return (
+        f"Dropped {dropped['gaussians']:,} of {dropped['of']:,} Gaussians, {why}: "
+        f"{dropped['bytes_before']:,} -> {dropped['bytes_after']:,} bytes."
+    )
+
+
 def gain(first: dict[str, Any], second: dict[str, Any]) -> str:
     """What the second measurement gains over the first, in a line one can quote.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from fragprune_plugins.cli.common import (
     Report,
     data_options,
     describe,
+    describe_dropped,
+    dropping,
     engine_options,
     gain,
     require_place,
@@ -37,6 +39,12 @@ from fragprune_plugins.storage.models import load_model, load_store
 @click.option(
     "--curves", type=OutFile(".png"), help="Write a picture of the learning curves here (.png)."
 )
+@click.option(
+    "--drop-invisible",
+    "drop",
+    is_flag=True,
+    help="Leave out Gaussians that reach no pixel of any view in --data, training or held out.",
+)
 @engine_options
 def command(
     model: Path,
@@ -48,6 +56,7 @@ def command(
     seed: int,
     no_truncation: bool,
     curves: Path | None,
+    drop: bool,
     engine: str,
     threads: int | None,
 ) -> Report:
@@ -69,7 +78,7 @@ def command(
 
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.finetuning import finetune, load_dataset, save
-    from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.measure import Candidate, drop_invisible, measure
     from fragprune_plugins.storage import records, sidecar
 
     set_threads(threads)
@@ -81,6 +90,14 @@ def command(
     result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
     done = result.progress
     save(out, result)
+    dropped = None
+    if drop:
+        whole = out.stat().st_size
+        views = [shot.view for shot in (*dataset.train, *dataset.test)]
+        smaller, kept = drop_invisible(result.model, result.store, views, engine=rasterizer)
+        result = replace(result, model=smaller, store=kept)
+        save(out, result)
+        dropped = dropping(out, whole, len(splat), len(smaller))
     rows = [asdict(point) for point in result.curves]
     if curves is not None and result.thresholds is not None:
         from fragprune_plugins.measure.report_page import save_learning
@@ -104,6 +121,8 @@ def command(
         )
     if result.interrupted:
         lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations.")
+    if dropped:
+        lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(views)} views"))
     lines += [_describe_untruncated(before, plain) for plain in without]
     lines.append(f"Wrote {out}. Keep {sidecar.path_beside(out).name} beside {out.name}.")
     report = {
@@ -112,6 +131,7 @@ def command(
         "before": before,
         "after": after,
         "untruncated": without[0] if without else None,
+        "dropped": dropped,
         "speedup": done.speedup,
         "target_reached": done.target_reached,
         "interrupted": result.interrupted,

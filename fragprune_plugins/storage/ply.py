@@ -10,7 +10,7 @@ these may read them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -91,6 +91,11 @@ class SplatFile:
     def sh_degree(self) -> int:
         """0 to 3, from the number of coefficients."""
         return _REST_COUNTS[3 * self.f_rest.shape[1]]
+
+    def keep(self, mask: Tensor) -> SplatFile:
+        """The rows where mask (N,) bool is True, in their order."""
+        held = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{k: rows[mask] for k, rows in held.items() if rows is not None})
 
     def splats(self) -> Splats:
         """The Gaussians activated, as engines take them; differentiable."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from cli.commands import run, run_json
 from finetune import tiny
@@ -24,6 +26,28 @@ def test_one_file_with_the_thresholds(tmp_path):
     both = run_json("compare", tuned, out, "--data", data)
     assert both["speedup"] == 1
     assert both["psnr_change"] == 0
+
+
+def test_drops_what_no_view_can_draw(tmp_path):
+    _, path, model = tiny.scene(tmp_path)
+    opacity = model.opacity.clone()
+    opacity[5:9] = -6  # under 1/255
+    thresholds = torch.linspace(0.1, 0.9, len(model))
+    write_ply(path, replace(model, opacity=opacity), thresholds)
+    out = tmp_path / "out.ply"
+    assert run_json("export", path, "--out", out)["dropped"] is None
+    report = run_json("export", path, "--out", out, "--drop-invisible")
+    assert report["gaussians"] == len(model) - 4
+    assert report["dropped"]["gaussians"] == 4
+    assert report["dropped"]["bytes_before"] == path.stat().st_size
+    assert report["dropped"]["bytes_after"] == out.stat().st_size < path.stat().st_size
+    kept = torch.ones(len(model), dtype=torch.bool)
+    kept[5:9] = False
+    exported = read_ply(out)
+    assert torch.equal(exported.thresholds, thresholds[kept])
+    assert torch.equal(exported.xyz, model.xyz[kept])
+    text = run("export", path, "--out", out, "--drop-invisible").stdout
+    assert "Dropped 4 of 60 Gaussians, too faint for any view: " in text
 
 
 def test_over_a_pair_leaves_no_stale_sidecar(tmp_path):

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,34 @@ def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
     control = run_json(*arguments, "--control")
     assert control["untruncated"] is None
     assert "Without its thresholds" not in run(*arguments, "--control").stdout
+
+
+def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
+    data, path, model = scene
+    xyz = model.xyz.clone()
+    xyz[:7, 1] += 50  # out of every picture
+    write_ply(path, replace(model, xyz=xyz))
+    whole, less = tmp_path / "whole.ply", tmp_path / "less.ply"
+    arguments = ("finetune", path, "--data", data, "--iters", 10)
+    first = run_json(*arguments, "--out", whole)
+    report = run_json(*arguments, "--out", less, "--drop-invisible")
+    assert first["dropped"] is None
+    count = report["dropped"]["gaussians"]
+    assert count >= 7
+    assert report["after"]["gaussians"] == len(model) - count == len(read_ply(less))
+    assert report["before"]["gaussians"] == len(model)
+    assert report["dropped"]["bytes_before"] == whole.stat().st_size
+    assert report["dropped"]["bytes_after"] == less.stat().st_size
+    both = run_json("compare", whole, less, "--data", data, "--views", "all")
+    assert both["a"]["fragments_per_pixel"] == both["b"]["fragments_per_pixel"]
+    assert both["psnr_change"] == pytest.approx(0, abs=1e-4)
+    store, old = sidecar.load(less)[0].state_dict(), sidecar.load(whole)[0].state_dict()
+    kept = torch.isin(old["logits"], store["logits"])
+    for name in ("logits", "exp_avg", "exp_avg_sq"):
+        assert torch.equal(store[name], old[name][kept])
+    assert (store["adam_step"], store["steps"]) == (old["adam_step"], old["steps"])
+    text = run(*arguments, "--out", less, "--drop-invisible").stdout
+    assert f"Dropped {count} of 60 Gaussians, which reach no pixel of the 9 views: " in text
 
 
 def test_target_control_and_curves(scene, tmp_path):
