@@ -37,7 +37,7 @@ def command(model: Path, out: Path, drop: bool) -> Report:
 
     \b
     Example:
-      fragprune export small.ply --out small_with_thresholds.ply
+      fragprune export pruned.ply --out for_viewer.ply
     """
     from fragprune_plugins.measure.visibility import visible
     from fragprune_plugins.storage import sidecar

@@ -70,7 +70,7 @@ def command(
 
     \b
     Examples:
-      fragprune finetune point_cloud.ply --data scene --out small.ply --quick
+      fragprune finetune point_cloud.ply --data scene --out pruned.ply --quick
       fragprune finetune point_cloud.ply --data scene --out half.ply --target-speedup 2
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
     """
