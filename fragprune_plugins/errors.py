@@ -43,7 +43,7 @@ class DatasetError(FragpruneError):
 
 
 class SidecarError(FragpruneError):
-    """A sidecar that is broken or belongs to another model."""
+    """A sidecar that is lost, broken or belongs to another model."""
 
     code = "sidecar"
 

@@ -59,10 +59,10 @@ def cli() -> None:
     Every Gaussian learns how far it reaches; fragments beyond are neither sorted nor blended.
 
     \b
-    I have a training repository     fragprune run -- python train.py -s scene -m out
-    I have a trained .ply            fragprune finetune point_cloud.ply --data scene --out small.ply
-    What did I gain?                 fragprune compare point_cloud.ply small.ply --data scene
-    Show me, no GPU needed           fragprune demo
+    I have a training repository   fragprune run -- python train.py -s scene -m out
+    I have a trained .ply          fragprune finetune point_cloud.ply --data scene --out pruned.ply
+    What did I gain?               fragprune compare point_cloud.ply pruned.ply --data scene
+    Show me, no GPU needed         fragprune demo
 
     Every command takes --json (one object on stdout, progress on stderr) and --help.
     """

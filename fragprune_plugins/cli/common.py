@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
+from fragprune_plugins.errors import FragpruneError, Interrupted, OutputError, UsageError
 from fragprune_plugins.storage.records import strict
 
 if TYPE_CHECKING:
@@ -25,6 +25,42 @@ if TYPE_CHECKING:
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 FILE = click.Path(path_type=Path)
+
+
+class OutFile(click.Path):
+    """A file to write, refused before any work unless its name says what will be in it.
+
+    Args:
+        suffix: that its name must have, in lower or upper case.
+    """
+
+    def __init__(self, suffix: str) -> None:
+        super().__init__(path_type=Path)
+        self.suffix = suffix
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path, if its name fits."""
+        path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
+        if path.suffix.lower() != self.suffix:
+            self.fail(f"'{path}' is no name for it: a {self.suffix} file is written.", param, ctx)
+        return path
+
+
+def require_place(out: Path, model: Path) -> None:
+    """Prove, before any work, that a model can be written at ``out``, and is not ``model`` again.
+
+    Raises:
+        UsageError: both have one name, and so one sidecar.
+        OutputError: it cannot be written.
+    """
+    from fragprune_plugins.storage.atomic import writable_folder
+
+    if out.resolve().with_suffix("") == model.resolve().with_suffix(""):
+        raise UsageError("--out", f"{out}, named as the model is", "another name", "Choose one.")
+    writable_folder(out.parent)
+    if out.is_dir():
+        raise OutputError(str(out), "a folder", "a .ply file", "Name a file in it.")
+
 
 JSON = "fragprune.json"
 """Key in the context's meta: whether stdout is kept for one JSON object."""
@@ -265,6 +301,24 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
     report = reports[-1]
     lines.append(f"{report['views']} views, {report['engine']} engine on {report['device']}")
     return "\n".join(lines)
+
+
+def dropping(out: Path, bytes_before: int, before: int, after: int) -> dict[str, int]:
+    """What leaving Gaussians out of a file did: to its bytes, and to their count."""
+    return {
+        "gaussians": before - after,
+        "of": before,
+        "bytes_before": bytes_before,
+        "bytes_after": out.stat().st_size,
+    }
+
+
+def describe_dropped(dropped: dict[str, int], why: str) -> str:
+    """The same in a line."""
+    return (
+        f"Dropped {dropped['gaussians']:,} of {dropped['of']:,} Gaussians, {why}: "
+        f"{dropped['bytes_before']:,} -> {dropped['bytes_after']:,} bytes."
+    )
 
 
 def gain(first: dict[str, Any], second: dict[str, Any]) -> str:

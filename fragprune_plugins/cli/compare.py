@@ -49,7 +49,7 @@ def command(
 
     \b
     Example:
-      fragprune compare point_cloud.ply small.ply --data scene --out pictures
+      fragprune compare point_cloud.ply pruned.ply --data scene --out pictures
     """
     from fragprune_plugins.cli.profile import draw_panels
     from fragprune_plugins.measure import Candidate, measure

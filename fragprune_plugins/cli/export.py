@@ -6,28 +6,44 @@ from pathlib import Path
 
 import click
 
-from fragprune_plugins.cli.common import FILE, Command, Report
+from fragprune_plugins.cli.common import (
+    FILE,
+    Command,
+    OutFile,
+    Report,
+    describe_dropped,
+    dropping,
+    require_place,
+)
 from fragprune_plugins.errors import SidecarError
 from fragprune_plugins.storage.models import load_model
 
 
 @click.command("export", cls=Command)
 @click.argument("model", type=FILE)
-@click.option("--out", type=FILE, required=True, help="The PLY to write.")
-def command(model: Path, out: Path) -> Report:
+@click.option("--out", type=OutFile(".ply"), required=True, help="The PLY to write.")
+@click.option(
+    "--drop-invisible",
+    "drop",
+    is_flag=True,
+    help="Leave out Gaussians that no view can draw: opacity under 1/255.",
+)
+def command(model: Path, out: Path, drop: bool) -> Report:
     """Write MODEL with its thresholds as one more column.
 
     The column, trunc_threshold, holds the threshold itself, a falloff in (0, 1): a renderer that
     draws a fragment only where exp(-q/2) >= trunc_threshold (q the squared Mahalanobis distance)
-    draws what we draw. Tools that do not know the column ignore it.
+    draws what we draw. Tools that do not know the column ignore it, if they read columns by name.
 
     \b
     Example:
-      fragprune export small.ply --out small_with_thresholds.ply
+      fragprune export pruned.ply --out for_viewer.ply
     """
+    from fragprune_plugins.measure.visibility import visible
     from fragprune_plugins.storage import sidecar
     from fragprune_plugins.storage.ply import THRESHOLD_COLUMN, write_ply
 
+    require_place(out, model)
     splat, store = load_model(model)
     if store is None:
         raise SidecarError(
@@ -36,14 +52,27 @@ def command(model: Path, out: Path) -> Report:
             "a sidecar beside it, written by fragprune",
             "Run fragprune finetune first.",
         )
-    learned = sidecar.path_beside(model).exists() or splat.thresholds is None
-    write_ply(out, splat, store.values if learned else splat.thresholds)
+    thresholds = splat.thresholds  # a column's own bits
+    if thresholds is None or sidecar.path_beside(model).exists():
+        thresholds = store.values.detach()
+    write_ply(out, splat, thresholds)
+    sidecar.path_beside(out).unlink(missing_ok=True)  # of an earlier model under this name
+    dropped, lines = None, []
+    if drop:
+        whole, count = out.stat().st_size, len(splat)
+        kept = visible(splat, thresholds)
+        splat = splat.keep(kept)
+        write_ply(out, splat, thresholds[kept])
+        dropped = dropping(out, whole, count, len(splat))
+        lines.append(describe_dropped(dropped, "too faint for any view"))
+    lines.append(f"Wrote {out}: {len(splat)} Gaussians with {THRESHOLD_COLUMN}.")
     return Report(
         {
             "model": str(model),
             "out": str(out),
             "gaussians": len(splat),
             "column": THRESHOLD_COLUMN,
+            "dropped": dropped,
         },
-        f"Wrote {out}: {len(splat)} Gaussians with {THRESHOLD_COLUMN}.",
+        "\n".join(lines),
     )

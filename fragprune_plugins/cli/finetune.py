@@ -2,35 +2,49 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import click
 
 from fragprune_plugins.cli.common import (
     FILE,
     Command,
+    OutFile,
     Report,
     data_options,
     describe,
+    describe_dropped,
+    dropping,
     engine_options,
     gain,
     open_engine,
+    require_place,
 )
 from fragprune_plugins.cli.learning import learning_options
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage.models import load_model
 
 
 @click.command("finetune", cls=Command)
 @click.argument("model", type=FILE)
-@click.option("--out", type=FILE, required=True, help="The new .ply; its sidecar goes beside it.")
+@click.option(
+    "--out", type=OutFile(".ply"), required=True, help="The new .ply; its sidecar goes beside it."
+)
 @data_options
 @learning_options
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the order of views.")
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
-@click.option("--curves", type=FILE, help="Write a picture of the learning curves here (.png).")
+@click.option(
+    "--curves", type=OutFile(".png"), help="Write a picture of the learning curves here (.png)."
+)
+@click.option(
+    "--drop-invisible",
+    "drop",
+    is_flag=True,
+    help="Leave out Gaussians that reach no pixel of any view in --data, training or held out.",
+)
 @engine_options
 def command(
     model: Path,
@@ -42,6 +56,7 @@ def command(
     seed: int,
     no_truncation: bool,
     curves: Path | None,
+    drop: bool,
     engine: str,
     device: str,
     threads: int | None,
@@ -51,29 +66,24 @@ def command(
     Thresholds and opacities adapt to each other on the photographs in --data; positions, shapes
     and colours stay bit for bit (but see --train). OUT has the columns of MODEL; the thresholds go
     beside it, into OUT.fragprune.safetensors. The table compares both on views that were not
-    learned from. Ctrl-C saves what was learned so far.
+    learned from, and a line below it says what OUT is without its thresholds, as other viewers draw
+    it. Ctrl-C saves what was learned so far.
 
     \b
     Examples:
-      fragprune finetune point_cloud.ply --data scene --out small.ply --quick
+      fragprune finetune point_cloud.ply --data scene --out pruned.ply --quick
       fragprune finetune point_cloud.ply --data scene --out half.ply --target-speedup 2
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
     """
-    if out.resolve() == model.resolve():
-        raise UsageError("--out", f"{out}, the model itself", "another file", "Name a new file.")
+    require_place(out, model)
 
     from copy import deepcopy
 
-    from fragprune_plugins.errors import OutputError
     from fragprune_plugins.finetuning import finetune, load_dataset, save
-    from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.measure import Candidate, drop_invisible, measure
     from fragprune_plugins.storage import records, sidecar
-    from fragprune_plugins.storage.atomic import writable_folder
 
     rasterizer, where = open_engine(engine, device, threads)
-    writable_folder(out.parent)
-    if out.is_dir():
-        raise OutputError(str(out), "a folder", "a .ply file", "Name a file in it.")
     truncation = settings.truncate and not no_truncation
     splat, store = load_model(model, truncation=truncation, device=where)
     dataset = load_dataset(data, resolution=resolution, white_background=white_background)
@@ -82,16 +92,23 @@ def command(
     result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
     done = result.progress
     save(out, result)
+    dropped = None
+    if drop:
+        whole = out.stat().st_size
+        views = [shot.view for shot in (*dataset.train, *dataset.test)]
+        smaller, kept = drop_invisible(result.model, result.store, views, engine=rasterizer)
+        result = replace(result, model=smaller, store=kept)
+        save(out, result)
+        dropped = dropping(out, whole, len(splat), len(smaller))
     rows = [asdict(point) for point in result.curves]
     if curves is not None and result.thresholds is not None:
         from fragprune_plugins.measure.report_page import save_learning
 
         save_learning(curves, rows, result.thresholds)
-    before, after = measure(
-        [start, Candidate(result.model, result.store)],
-        dataset.test,
-        engine=rasterizer,
-    )
+    candidates = [start, Candidate(result.model, result.store)]
+    if result.thresholds is not None:
+        candidates.append(Candidate(result.model))
+    before, after, *without = measure(candidates, dataset.test, engine=rasterizer)
     pressure = f" at pressure {done.pressure:.2g}" if settings.truncate else ""
     quote = (
         f"{gain(before, after)} that were held out ({after['engine']} engine, "
@@ -106,12 +123,17 @@ def command(
         )
     if result.interrupted:
         lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations.")
-    lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.")
+    if dropped:
+        lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(views)} views"))
+    lines += [_describe_untruncated(before, plain) for plain in without]
+    lines.append(f"Wrote {out}. Keep {sidecar.path_beside(out).name} beside {out.name}.")
     report = {
         "model": str(model),
         "out": str(out),
         "before": before,
         "after": after,
+        "untruncated": without[0] if without else None,
+        "dropped": dropped,
         "speedup": done.speedup,
         "target_reached": done.target_reached,
         "interrupted": result.interrupted,
@@ -137,3 +159,12 @@ def command(
     }
     records.leave(out, "finetune", report | more)
     return Report(report, "\n".join(lines), exit_code=130 if result.interrupted else 0)
+
+
+def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
+    """What is left of a model for who does not know its thresholds."""
+    return (
+        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
+        f"({plain['psnr'] - before['psnr']:+.2f}), {plain['fragments_per_pixel']:.1f} fragments "
+        f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
+    )

@@ -56,7 +56,7 @@ def command(
 
     \b
     Example:
-      fragprune profile small.ply --data scene --out pictures
+      fragprune profile pruned.ply --data scene --out pictures
     """
     import torch
 

@@ -51,8 +51,8 @@ def command(
 
     \b
     Examples:
-      fragprune render small.ply --data scene --out renders --heatmap
-      fragprune render small.ply --cameras out/cameras.json --out renders
+      fragprune render pruned.ply --data scene --out renders --heatmap
+      fragprune render pruned.ply --cameras out/cameras.json --out renders
     """
     if (cameras is None) == (data is None):
         found = "neither" if data is None else "both"

@@ -15,6 +15,7 @@ import click
 from fragprune_plugins.cli.common import (
     FILE,
     Command,
+    OutFile,
     Report,
     describe,
     engine_options,
@@ -37,7 +38,7 @@ after; beside it the photograph; below, the fragments that each pixel draws."""
 
 @click.command("report", cls=Command)
 @click.argument("folder", metavar="DIR", type=FILE)
-@click.option("--out", type=FILE, help=f"The page; DIR/{PAGE} when left out.")
+@click.option("--out", type=OutFile(".html"), help=f"The page; DIR/{PAGE} when left out.")
 @click.option("--data", type=FILE, help="Scene folder, where the one that was used has moved.")
 @engine_options
 def command(

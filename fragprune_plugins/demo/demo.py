@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -13,9 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fragprune_plugins.demo.folder import claiming, clear
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
-from fragprune_plugins.errors import OutputError
-from fragprune_plugins.storage.atomic import replacing, writable_folder
+from fragprune_plugins.storage.atomic import replacing
 
 if TYPE_CHECKING:
     from fragprune_plugins.injection.launch import RunOptions, RunSummary
@@ -25,7 +24,7 @@ HOST = Path(__file__).with_name("host") / "train.py"
 """The training script that the demo runs, as a user runs their own."""
 
 REPORT = "report.json"
-"""Written last; a folder that holds it, or nothing, is ours to write into."""
+"""Written last."""
 
 
 _REPEATS = 20  # timed frames a view: small frames are quick, and laptops are noisy
@@ -93,20 +92,24 @@ def run_demo(
         held-out views, seconds by part.
 
     Raises:
-        OutputError: the folder cannot be written, or holds something else.
+        OutputError: the folder cannot be written, or holds what no demo wrote.
     """
     from fragprune_plugins.demo.page import write_page
     from fragprune_plugins.injection.launch import run
 
     settings = settings or DemoSettings()
-    _prepare(out)
+    clear(out)
     clock = _Clock()
     scene, model = out / "scene", out / "model"
     views = settings.scene.views
-    with clock.part("scene"):
+    with clock.part("scene"), claiming(out, "scene"):
         say(f"1/5  Photographing a room from {views} sides (ray-traced, nothing is downloaded)")
         _photograph(scene, settings)
-    with clock.part("train"), contextlib.redirect_stdout(sys.stderr):
+    with (
+        clock.part("train"),
+        claiming(out, "model"),
+        contextlib.redirect_stdout(sys.stderr),
+    ):
         command = host_command(scene.resolve(), model.resolve(), settings)
         say(
             f"2/5  Training for {settings.iterations} iterations, then opacities and thresholds "
@@ -119,12 +122,12 @@ def run_demo(
     with clock.part("measure"):
         say("4/5  Measuring on the held-out views")
         report = _measure(scene, summary, control, settings)
-    with clock.part("pictures"):
+    with clock.part("pictures"), claiming(out, "pictures", "index.html"):
         say("5/5  Drawing the pictures")
         report["files"] = write_page(out, report, scene, summary, settings)
     report["seconds_by_part"] = clock.seconds
     report["seconds"] = sum(clock.seconds.values())
-    with replacing(out / REPORT) as path:
+    with claiming(out, REPORT), replacing(out / REPORT) as path:
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
 
@@ -150,23 +153,6 @@ def honest(report: dict[str, Any]) -> str:
         f"{report['control_psnr_change']:+.2f} dB PSNR "
         f"at {report['control']['fragments_per_pixel']:.1f} fragments per pixel."
     )
-
-
-def _prepare(out: Path) -> None:
-    """Make the folder, or empty our own earlier demo: its checkpoints would be taken up again."""
-    writable_folder(out)
-    ours = {"scene", "model", "pictures", "index.html", REPORT}
-    strange = sorted(path.name for path in out.iterdir() if path.name not in ours)
-    if strange:
-        raise OutputError(
-            str(out),
-            f"holds {strange[0]!r}, which no demo wrote",
-            "a new or empty folder, or an earlier demo's",
-            "Choose another --out.",
-        )
-    (out / REPORT).unlink(missing_ok=True)
-    for name in ("scene", "model", "pictures"):
-        shutil.rmtree(out / name, ignore_errors=True)
 
 
 def _photograph(folder: Path, settings: DemoSettings) -> None:

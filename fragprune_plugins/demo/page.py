@@ -17,7 +17,7 @@ of the repository was changed. Drag the sliders: left of the handle before, righ
 beside it the photograph, which neither has seen."""
 
 _YOUR_OWN = """fragprune run -- python train.py -s scene -m out
-fragprune finetune point_cloud.ply --data scene --out small.ply"""
+fragprune finetune point_cloud.ply --data scene --out pruned.ply"""
 
 
 def write_page(

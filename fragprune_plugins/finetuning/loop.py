@@ -147,7 +147,7 @@ def save(path: Path, result: FinetuneResult) -> Path:
     target = sidecar.path_beside(path)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".fragprune-") as scratch:
         model = Path(scratch) / path.name
-        write_ply(model, result.model)
+        write_ply(model, result.model, marked=not result.store.neutral)
         beside = sidecar.save(model, result.store, settings=result.settings.as_dict())
         with replacing(target) as new_sidecar, replacing(path) as new_model:
             os.replace(beside, new_sidecar)

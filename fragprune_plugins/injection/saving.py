@@ -41,7 +41,7 @@ def on_load(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, k
     """Thresholds from beside the file that the host read."""
     result = wrapped(*args, **kwargs)
     path = file_at(session, seam, named(wrapped, args, kwargs)[seam.needs[0]])
-    if sidecar.path_beside(path).exists():
+    if sidecar.lies_beside(path):
         session.load(model, path)
     else:
         session.models.pop(model, None)  # another population: what we knew is not about it

@@ -2,5 +2,15 @@
 
 from fragprune_plugins.measure.evaluate import Candidate, evaluate, measure
 from fragprune_plugins.measure.metrics import lpips, psnr, ssim
+from fragprune_plugins.measure.visibility import drop_invisible, visible
 
-__all__ = ["Candidate", "evaluate", "lpips", "measure", "psnr", "ssim"]
+__all__ = [
+    "Candidate",
+    "drop_invisible",
+    "evaluate",
+    "lpips",
+    "measure",
+    "psnr",
+    "ssim",
+    "visible",
+]

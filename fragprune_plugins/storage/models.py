@@ -29,7 +29,7 @@ def load_model(
 
     Raises:
         ModelFileError: the model cannot be read.
-        SidecarError: the sidecar beside it is broken or belongs to another model.
+        SidecarError: the sidecar beside it is lost, broken or another model's.
     """
     import torch
 
@@ -39,7 +39,7 @@ def load_model(
 
     model = read_ply(path, filtered=filtered).to(device)
     store = ThresholdStore(len(model), device)
-    if truncation and sidecar.path_beside(path).exists():
+    if truncation and sidecar.lies_beside(path):
         sidecar.load(path, store)
     elif truncation and model.thresholds is not None:
         with torch.no_grad():

@@ -10,7 +10,8 @@ these may read them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ from fragprune_plugins.storage.atomic import replacing
 from fragprune_plugins.types import Splats
 
 THRESHOLD_COLUMN = "trunc_threshold"
+
+MARK = "fragprune thresholds lie beside this file (.fragprune.safetensors)"
+"""A comment in the header of each PLY of ours that is half of a pair."""
 
 _XYZ = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -92,6 +96,11 @@ class SplatFile:
         """The same Gaussians on a device; the very tensors where they are there."""
         moved = {name: each.to(device) for name, each in vars(self).items() if each is not None}
         return replace(self, **moved)
+
+    def keep(self, mask: Tensor) -> SplatFile:
+        """The rows where mask (N,) bool is True, in their order."""
+        held = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{k: rows[mask] for k, rows in held.items() if rows is not None})
 
     def splats(self) -> Splats:
         """The Gaussians activated, as engines take them; differentiable."""
@@ -185,13 +194,16 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
     )
 
 
-def write_ply(path: Path, model: SplatFile, thresholds: Tensor | None = None) -> None:
+def write_ply(
+    path: Path, model: SplatFile, thresholds: Tensor | None = None, *, marked: bool = False
+) -> None:
     """Write a splat as hosts do, bit for bit what ``read_ply`` gave; atomically.
 
     Args:
         path: the file; an existing one is replaced only when the new one is complete.
         model: the Gaussians.
         thresholds: (N,) written as the last column ``trunc_threshold`` when given.
+        marked: say in the header that a sidecar with thresholds belongs to it.
 
     Raises:
         OutputError: the place cannot be written.
@@ -216,8 +228,26 @@ def write_ply(path: Path, model: SplatFile, thresholds: Tensor | None = None) ->
     names = [name for group, _ in columns for name in group]
     table = torch.cat([values.detach().cpu().float() for _, values in columns], dim=1)
     rows = np.ascontiguousarray(table.numpy()).view([(name, "<f4") for name in names])[:, 0]
+    # An element's comments come after its line: some viewers read the number of Gaussians off the
+    # header's third line, whatever it says.
+    vertices = PlyElement.describe(rows, "vertex", comments=[MARK] if marked else [])
     with replacing(path) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+        PlyData([vertices], byte_order="<").write(str(temporary))
+
+
+def is_marked(path: Path) -> bool:
+    """Whether a file is a PLY whose header says that a sidecar holds its thresholds.
+
+    One that has a column of thresholds needs no sidecar, whatever its header says.
+    """
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        if file.readline().strip() != b"ply":
+            return False
+        header = list(takewhile(lambda line: line != b"end_header", map(bytes.strip, file)))
+    column = any(line.endswith(f" {THRESHOLD_COLUMN}".encode()) for line in header)
+    return f"comment {MARK}".encode() in header and not column
 
 
 def _read_vertices(path: Path) -> np.ndarray[Any, Any]:

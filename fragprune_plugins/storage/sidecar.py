@@ -1,7 +1,8 @@
 """The sidecar: a safetensors file beside the host's own that carries a threshold store.
 
 ``point_cloud.ply`` gets ``point_cloud.fragprune.safetensors``. Its metadata names the model file's
-digest and row count, so a stale pair is refused; the host's file stays as the host wrote it.
+digest and row count, so a stale pair is refused; the host's file stays as the host wrote it. A PLY
+that we write ourselves says in its header that it has a sidecar, so that one without is noticed.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import torch
 from fragprune_plugins.errors import SidecarError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage.atomic import digest, replacing
+from fragprune_plugins.storage.ply import is_marked
 
 SUFFIX = ".fragprune.safetensors"
 FORMAT = "fragprune-thresholds-1"
@@ -43,6 +45,24 @@ class SidecarInfo:
 def path_beside(model: Path) -> Path:
     """Where a model file's sidecar lies."""
     return Path(model).with_suffix(SUFFIX)
+
+
+def lies_beside(model: Path) -> bool:
+    """Whether a model file has a sidecar.
+
+    Raises:
+        SidecarError: it has none, and was saved with one.
+    """
+    path = path_beside(model)
+    if not path.exists() and is_marked(model):
+        raise SidecarError(
+            str(path),
+            f"no such file, though {Path(model).name} was saved with thresholds beside it",
+            "its sidecar, under this name",
+            "Bring it along; whoever renames a model renames both. "
+            "Or go without thresholds, where a command takes --no-truncation.",
+        )
+    return path.exists()
 
 
 def save(

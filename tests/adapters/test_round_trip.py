@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 from miniature import joint
 
+from fragprune_plugins.errors import SidecarError
 from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply, write_ply
 
 
 def trained(host, count=20):
@@ -46,3 +49,13 @@ def test_a_model_loaded_without_a_sidecar_forgets_the_thresholds_it_had(tmp_path
         model.load_ply(str(tmp_path / "plain.ply"))
         assert host.store(model) is None
         assert host.render(host.camera(), model)["render"].isfinite().all()
+
+
+def test_a_model_that_lost_its_sidecar_is_not_loaded_without_it(tmp_path):
+    path = tmp_path / "pruned.ply"
+    with joint() as host:
+        trained(host).save_ply(str(path))
+        write_ply(path, read_ply(path), marked=True)  # as finetune writes it
+        sidecar.path_beside(path).unlink()
+        with pytest.raises(SidecarError, match="saved with thresholds beside it"):
+            host.model(5).load_ply(str(path))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 
 import pytest
+import torch
 from cli.commands import run
 from finetune import tiny
 
 from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply, write_ply
 
 
 @pytest.fixture
@@ -100,12 +102,40 @@ def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypat
     assert untouched(out)
 
 
-def test_the_model_itself_is_no_output(scene):
+@pytest.mark.parametrize("command", ["finetune", "export"])
+def test_the_model_itself_is_no_output(scene, command):
     data, path, _ = scene
+    write_ply(path, tiny.random_model(8), torch.full((8,), 0.3))
     before = path.read_bytes()
-    result = run("finetune", path, "--data", data, "--out", path)
-    assert result.exit_code == 2
+    more = ("--data", data) if command == "finetune" else ()
+    for out in (path, path.with_suffix(".PLY")):  # one sidecar for both
+        result = run(command, path, *more, "--out", out)
+        assert result.exit_code == 2
+        assert "named as the model is" in result.stderr
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong", "kind"),
+    [
+        (("finetune", "m.ply", "--data", "d", "--out"), "pruned.txt", ".ply"),
+        (("finetune", "m.ply", "--data", "d", "--out"), "pruned", ".ply"),
+        (("finetune", "m.ply", "--data", "d", "--out", "o.ply", "--curves"), "c.jpg", ".png"),
+        (("export", "m.ply", "--out"), "pruned.splat", ".ply"),
+        (("report", "d", "--out"), "page.pdf", ".html"),
+    ],
+)
+def test_a_file_is_not_written_under_the_name_of_another_kind(words, wrong, kind):
+    result = run(*words, wrong)
+    assert result.exit_code == 2
+    assert f"'{wrong}' is no name for it: a {kind} file is written" in result.stderr
+
+
+def test_upper_case_is_the_same_kind(scene, tmp_path):
+    _, path, _ = scene
+    write_ply(path, tiny.random_model(8), torch.full((8,), 0.3))
+    assert run("export", path, "--out", tmp_path / "OUT.PLY").exit_code == 0
+    assert read_ply(tmp_path / "OUT.PLY").thresholds is not None
 
 
 def test_a_failed_write_touches_nothing(scene, monkeypatch):

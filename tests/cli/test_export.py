@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
+from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage.ply import read_ply, write_ply
 
 
 def test_one_file_with_the_thresholds(tmp_path):
@@ -22,6 +26,41 @@ def test_one_file_with_the_thresholds(tmp_path):
     both = run_json("compare", tuned, out, "--data", data)
     assert both["speedup"] == 1
     assert both["psnr_change"] == 0
+
+
+def test_drops_what_no_view_can_draw(tmp_path):
+    _, path, model = tiny.scene(tmp_path)
+    opacity = model.opacity.clone()
+    opacity[5:9] = -6  # under 1/255
+    thresholds = torch.linspace(0.1, 0.9, len(model))
+    write_ply(path, replace(model, opacity=opacity), thresholds)
+    out = tmp_path / "out.ply"
+    assert run_json("export", path, "--out", out)["dropped"] is None
+    report = run_json("export", path, "--out", out, "--drop-invisible")
+    assert report["gaussians"] == len(model) - 4
+    assert report["dropped"]["gaussians"] == 4
+    assert report["dropped"]["bytes_before"] == path.stat().st_size
+    assert report["dropped"]["bytes_after"] == out.stat().st_size < path.stat().st_size
+    kept = torch.ones(len(model), dtype=torch.bool)
+    kept[5:9] = False
+    exported = read_ply(out)
+    assert torch.equal(exported.thresholds, thresholds[kept])
+    assert torch.equal(exported.xyz, model.xyz[kept])
+    text = run("export", path, "--out", out, "--drop-invisible").stdout
+    assert "Dropped 4 of 60 Gaussians, too faint for any view: " in text
+
+
+def test_over_a_pair_leaves_no_stale_sidecar(tmp_path):
+    _, path, model = tiny.scene(tmp_path)
+    out = tmp_path / "out.ply"
+    for pair in (path, out):
+        write_ply(pair, model)
+        sidecar.save(pair, ThresholdStore(len(model)))
+    store = ThresholdStore(len(model))
+    store.open(model.splats().opacities)
+    sidecar.save(path, store)
+    assert run("export", path, "--out", out).exit_code == 0
+    assert torch.equal(load_model(out)[1], store.values)
 
 
 def test_nothing_to_export(tmp_path):

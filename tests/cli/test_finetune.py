@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,56 @@ def test_json_is_one_object_with_the_house_names(scene, tmp_path):
         assert report[part]["psnr"] > 10
     assert {"train_seconds", "engine", "device", "target_reached"} <= report.keys()
     assert report["pressure"] >= LEAST_PRESSURE
+
+
+def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
+    data, path, _ = scene
+    out = tmp_path / "out.ply"
+    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 30)
+    report = run_json(*arguments, "--pressure", 1e-3)
+    profile = run_json("profile", out, "--data", data)
+    for key in ("psnr", "fragments_per_pixel"):
+        assert report["untruncated"][key] == profile["columns"]["untruncated"][key]
+        assert report["after"][key] == profile["columns"]["truncated"][key]
+    text = run(*arguments, "--pressure", 1e-3).stdout
+    plain = report["untruncated"]
+    change = plain["psnr"] - report["before"]["psnr"]
+    assert (
+        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
+        f"({change:+.2f}), {plain['fragments_per_pixel']:.1f} fragments per pixel"
+    ) in text
+    assert f"Keep {sidecar.path_beside(out).name} beside {out.name}" in text
+    control = run_json(*arguments, "--control")
+    assert control["untruncated"] is None
+    assert "Without its thresholds" not in run(*arguments, "--control").stdout
+
+
+def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
+    data, path, model = scene
+    xyz = model.xyz.clone()
+    xyz[:7, 1] += 50  # out of every picture
+    write_ply(path, replace(model, xyz=xyz))
+    whole, less = tmp_path / "whole.ply", tmp_path / "less.ply"
+    arguments = ("finetune", path, "--data", data, "--iters", 10)
+    first = run_json(*arguments, "--out", whole)
+    report = run_json(*arguments, "--out", less, "--drop-invisible")
+    assert first["dropped"] is None
+    count = report["dropped"]["gaussians"]
+    assert count >= 7
+    assert report["after"]["gaussians"] == len(model) - count == len(read_ply(less))
+    assert report["before"]["gaussians"] == len(model)
+    assert report["dropped"]["bytes_before"] == whole.stat().st_size
+    assert report["dropped"]["bytes_after"] == less.stat().st_size
+    both = run_json("compare", whole, less, "--data", data, "--views", "all")
+    assert both["a"]["fragments_per_pixel"] == both["b"]["fragments_per_pixel"]
+    assert both["psnr_change"] == pytest.approx(0, abs=1e-4)
+    store, old = sidecar.load(less)[0].state_dict(), sidecar.load(whole)[0].state_dict()
+    kept = torch.isin(old["logits"], store["logits"])
+    for name in ("logits", "exp_avg", "exp_avg_sq"):
+        assert torch.equal(store[name], old[name][kept])
+    assert (store["adam_step"], store["steps"]) == (old["adam_step"], old["steps"])
+    text = run(*arguments, "--out", less, "--drop-invisible").stdout
+    assert f"Dropped {count} of 60 Gaussians, which reach no pixel of the 9 views: " in text
 
 
 def test_target_control_and_curves(scene, tmp_path):

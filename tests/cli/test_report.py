@@ -18,7 +18,7 @@ def finetuned(tmp_path_factory):
     data, model, _ = tiny.scene(folder)
     out = folder / "out"
     words = ("--data", data, "--iters", 4)
-    figures = run_json("finetune", model, "--out", out / "small.ply", *words)
+    figures = run_json("finetune", model, "--out", out / "pruned.ply", *words)
     return out, data, figures
 
 
@@ -58,9 +58,9 @@ def test_as_text_the_result_comes_first(folder):
 
 def test_comparisons_come_along_with_their_pictures(folder):
     out, data, _ = folder
-    small = out / "small.ply"
-    run_json("compare", small, small, "--data", data, "--out", out / "pictures")
-    run_json("profile", small, "--data", data, "--out", out / "more")
+    pruned = out / "pruned.ply"
+    run_json("compare", pruned, pruned, "--data", data, "--out", out / "pictures")
+    run_json("profile", pruned, "--data", data, "--out", out / "more")
     report = run_json("report", out)
     assert report["command"] == "finetune"
     page = (out / "report.html").read_text()
@@ -76,7 +76,7 @@ def test_without_the_photographs_there_are_curves_and_the_reason(folder, tmp_pat
     out, data, _ = folder
     (record,) = records.find(out)
     record.data["photographs"]["folder"] = str(tmp_path / "moved")
-    records.leave(out / "small", "finetune", record.data)
+    records.leave(out / "pruned", "finetune", record.data)
     result = run("report", out)
     assert result.exit_code == 0
     assert "No views are shown: [dataset]" in result.stdout

@@ -9,6 +9,7 @@ from safetensors.torch import save_file
 from fragprune_plugins.errors import OutputError, SidecarError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import MARK
 
 
 @pytest.fixture
@@ -43,6 +44,19 @@ def test_what_is_saved_is_loaded_bit_for_bit(model, trained):
             assert torch.equal(value, again) if torch.is_tensor(value) else value == again
         assert (info.rows, info.adapter, info.host_commit) == (6, "a-host", "c0ffee")
         assert info.settings == {"iterations": 3}
+
+
+def test_only_a_marked_model_must_have_a_sidecar(tmp_path, model, trained):
+    assert not sidecar.lies_beside(model)  # a host's own file
+    assert not sidecar.lies_beside(tmp_path)
+    assert not sidecar.lies_beside(tmp_path / "nothing.ply")
+    header = f"ply\nelement vertex 6\ncomment {MARK}\nend_header\n".encode()
+    for ours in (header, header.replace(b"\n", b"\r\n")):  # as other tools may rewrite it
+        model.write_bytes(ours)
+        with pytest.raises(SidecarError, match=r"point_cloud\.ply was saved with thresholds"):
+            sidecar.lies_beside(model)
+    sidecar.save(model, trained)
+    assert sidecar.lies_beside(model)
 
 
 def test_a_sidecar_of_an_earlier_model_file_is_refused(model, trained):

@@ -2,12 +2,14 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from fragprune_plugins.demo import folder
 from fragprune_plugins.demo.demo import DemoSettings, honest, host_command, quotable, run_demo
 from fragprune_plugins.errors import OutputError
 
@@ -15,6 +17,7 @@ TINY = """
 import json, sys
 from pathlib import Path
 from fragprune_plugins.demo.scene import SceneSettings
+from fragprune_plugins.demo import folder
 from fragprune_plugins.demo.demo import DemoSettings, run_demo
 scene = SceneSettings(views=9, width=48, height=36, supersample=1, points=400)
 settings = DemoSettings(iterations=60, finetune=30, scene=scene)
@@ -80,6 +83,12 @@ def test_pictures_and_page_are_there(demo):
     for file in report["files"]:
         assert file in page or file == "index.html"
     assert Path(report["model_after"]).exists()
+
+
+def test_all_of_it_is_the_next_demos_to_delete(demo, tmp_path):
+    out = shutil.copytree(demo[0], tmp_path / "out")
+    folder.clear(out)
+    assert [path.name for path in out.iterdir()] == [folder.MARKER]
 
 
 def test_progress_is_on_stderr_throughout(demo):

@@ -302,7 +302,7 @@ class GraphdecoAdapter(HostAdapter):
             eps=1e-15,
         )
         state: dict[str, Any] = optimizer.state_dict()
-        if sidecar.path_beside(ply).exists():
+        if sidecar.lies_beside(ply):
             state["fragprune"] = sidecar.load(ply)[0].state_dict()
         capture = (
             m.sh_degree,
