@@ -95,7 +95,8 @@ def command_line() -> str:
 
     intro = """What `fragprune COMMAND --help` prints. Every command takes `--json`: one object on
 stdout, progress on stderr. Exit codes are listed in [errors](errors.md)."""
-    context = click.Context(cli, info_name="fragprune", terminal_width=96, max_content_width=96)
+    context = cli.make_context("fragprune", [], resilient_parsing=True)
+    context.terminal_width = context.max_content_width = 96
     parts = []
     for name in cli.list_commands(context):
         command = cli.get_command(context, name)

@@ -25,7 +25,8 @@ from fragprune_plugins.testing import scenes
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("fragprune_")]
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "hooks.md"
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = DOCS / "reference" / "hooks.md"
 
 pytestmark = pytest.mark.usefixtures("single_thread")
 
@@ -76,7 +77,8 @@ def test_the_page_documents_no_hook_that_is_not_there():
 
 
 def test_the_plugin_on_the_page_works(plug):
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    page = (DOCS / "explanation" / "plugins.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     plugin = ModuleType("plugin")
     exec(code, vars(plugin))
     plug(plugin)

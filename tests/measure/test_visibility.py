@@ -10,8 +10,9 @@ from finetune import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fragprune_plugins import rasterize
 from fragprune_plugins.constants import ALPHA_MIN
-from fragprune_plugins.engines import create_engine, rasterize
+from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.measure.visibility import drop_invisible, visible
