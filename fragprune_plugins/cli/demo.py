@@ -25,7 +25,8 @@ from fragprune_plugins.cli.common import (
     type=FILE,
     default="fragprune-demo",
     show_default=True,
-    help="Folder for the scene, the models, the pictures and index.html.",
+    help="Folder for the scene, the models, the pictures and index.html: a new one, or an earlier "
+    "demo's, which is emptied.",
 )
 @click.option(
     "--iters",

@@ -126,7 +126,8 @@ def command(
     if dropped:
         lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(views)} views"))
     lines += [_describe_untruncated(before, plain) for plain in without]
-    lines.append(f"Wrote {out}. Keep {sidecar.path_beside(out).name} beside {out.name}.")
+    together = " Keep the two together." if without else ""
+    lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
     report = {
         "model": str(model),
         "out": str(out),

@@ -73,10 +73,12 @@ def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
         f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
         f"({change:+.2f}), {plain['fragments_per_pixel']:.1f} fragments per pixel"
     ) in text
-    assert f"Keep {sidecar.path_beside(out).name} beside {out.name}" in text
+    assert f"{sidecar.path_beside(out).name}. Keep the two together." in text
     control = run_json(*arguments, "--control")
     assert control["untruncated"] is None
-    assert "Without its thresholds" not in run(*arguments, "--control").stdout
+    text = run(*arguments, "--control").stdout
+    assert "Without its thresholds" not in text
+    assert "together" not in text
 
 
 def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
