@@ -16,6 +16,7 @@ from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine, create_engine
+from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -93,11 +94,19 @@ def finetune(
         AlignmentError: store and model differ in length.
     """
     settings = settings or Settings()
+    store = ThresholdStore(len(model)) if store is None else store  # an empty store is false
+    if len(store) != len(model):
+        raise AlignmentError(
+            "finetune",
+            f"a store of {len(store)} thresholds",
+            f"{len(model)}, one per Gaussian",
+            "Pass the store of this very model.",
+        )
     run = _Run(
         model,
         dataset,
         settings,
-        ThresholdStore(len(model)) if store is None else store,
+        store,
         schedule or Schedule(settings),
         create_engine(engine, model.xyz.device) if isinstance(engine, str) else engine,
     )

@@ -388,7 +388,6 @@ class Session:
         sidecar.load(path, store)
         means = weakref.ref(self.adapter.means(model))
         state = self.models[model] = ModelState(store, loaded=means)
-        self.expect_rows(model, state, str(path))
         self.follow(model, state)
         self.hook.fragprune_attached(model=model, store=store)
 

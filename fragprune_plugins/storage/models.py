@@ -21,7 +21,7 @@ def load_model(
 
     Raises:
         ModelFileError: the model cannot be read.
-        SidecarError: the sidecar beside it is broken or belongs to another model.
+        SidecarError: the sidecar beside it is broken, belongs to another model or has other rows.
     """
     from fragprune_plugins.storage import sidecar
     from fragprune_plugins.storage.ply import read_ply
