@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
-from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.errors import EngineError
 
 if TYPE_CHECKING:
     import torch
@@ -28,7 +28,11 @@ class Engine(Protocol):
     name: str
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
-        """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+        """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
+
+        Raises:
+            InputError: by ``inputs.check_thresholds``, thresholds that are not one per Gaussian.
+        """
 
 
 class Slicer(Protocol):
@@ -115,14 +119,7 @@ def rasterize(
         InputError: thresholds that do not match the Gaussians.
         EngineError: no such engine here.
     """
-    n = len(inputs.splats)
-    if thresholds is not None and tuple(thresholds.shape) != (n,):
-        raise InputError(
-            "thresholds",
-            f"shape {tuple(thresholds.shape)}",
-            f"({n},), one per Gaussian",
-            "Pass the thresholds of this very model.",
-        )
+    inputs.check_thresholds(thresholds)  # also for engines that are not ours
     if isinstance(engine, str):
         engine = create_engine(engine, inputs.splats.device)
     return engine.rasterize(inputs, thresholds)

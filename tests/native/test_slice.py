@@ -231,10 +231,14 @@ def test_the_library_refuses_what_does_not_fit(engine):
     """Below the Python checks: the C interface stands on its own."""
     calls, error = binding.library().calls, binding.Error()
     three = torch.zeros(3).data_ptr()
-    good = {"count": 0, "campos": three, "duration": 1.0}
+    lengths = binding.Lengths(campos=3)
+    good = {"count": 0, "campos": three, "duration": 1.0, "threads": 1, "lengths": lengths}
     to = binding.Sliced()
     assert calls.fragprune_slice(binding.Spacetime(**good), to, error) == binding.OK
-    for change in ({"threads": 1025}, {"count": -1}, {"campos": None}, {"count": 1}):
+    for change in (
+        *({"threads": 1025}, {"threads": 0}, {"count": -1}, {"count": 1}),
+        *({"campos": None}, {"lengths": binding.Lengths(campos=2)}),
+    ):
         status = calls.fragprune_slice(binding.Spacetime(**{**good, **change}), to, error)
         assert status != binding.OK
         assert error.message
