@@ -179,9 +179,9 @@ def test_thresholds_leave_radii_alone(mini):
         store = host.store(model)
         found = []
         for tau in (None, 0.7):
-            if tau:
-                store.logits.data.fill_(float(torch.logit(torch.tensor(tau))))
             with torch.no_grad():
+                if tau:
+                    store.logits.fill_(float(torch.logit(torch.tensor(tau))))
                 found.append(host.render(camera, model)["radii"])
         assert torch.equal(*found)
 
