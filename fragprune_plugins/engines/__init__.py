@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from fragprune_plugins.errors import EngineError
 
@@ -35,6 +35,7 @@ class Engine(Protocol):
         """
 
 
+@runtime_checkable
 class Slicer(Protocol):
     """What our own engines do beside."""
 
@@ -86,19 +87,30 @@ _slicer = cache(create_engine)
 """Engines keep memory and kernels that the next frame uses again."""
 
 
-def slice_at(splats: SpacetimeSplats, moment: Moment) -> Sliced:
+def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = "auto") -> Sliced:
     """The 3D Gaussians that Gaussians in space and time are at a moment. Differentiable.
 
-    By the fastest of our engines on the device of the splats. Gradients are those of RT-4DGS,
-    whose kernels differentiate by hand: without ``rotations_r`` the marginal has none; colours are
-    differentiated as seen where the moment has moved the means, though shown as seen where they are
-    stored; where time has a say in them, the second coefficient gets the first one's gradient, and
-    the times that of the highest cosine alone, with the opposite sign.
+    Gradients are those of RT-4DGS, whose kernels differentiate by hand: without ``rotations_r`` the
+    marginal has none; colours are differentiated as seen where the moment has moved the means,
+    though shown as seen where they are stored; where time has a say in them, the second coefficient
+    gets the first one's gradient, and the times that of the highest cosine alone, with the opposite
+    sign.
+
+    Args:
+        splats: the Gaussians.
+        moment: when and from where.
+        engine: a name as ``create_engine`` takes it, or an engine; one that is not ours and cuts
+            nothing leaves it to the fastest of ours on the device.
 
     Raises:
         InputError: harmonics with fewer coefficients than the moment's cosines take.
+        EngineError: no such engine here.
     """
-    slicer: Slicer = _slicer(_fastest(str(splats.device)))  # type: ignore[assignment]
+    if isinstance(engine, Slicer):
+        return engine.slice(splats, moment)
+    if not isinstance(engine, str) or engine == "auto":
+        engine = _fastest(str(splats.device))
+    slicer: Slicer = _slicer(engine)  # type: ignore[assignment]
     return slicer.slice(splats, moment)
 
 

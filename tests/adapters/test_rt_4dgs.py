@@ -9,6 +9,7 @@ import pytest
 import torch
 from rt_4dgs_host import PythonHost, RigidHost, RT4DGSHost
 
+from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
@@ -124,6 +125,28 @@ def test_flow_is_blended_as_colour_is(mini, driver, monkeypatch):
             package = host.render(camera, model)
         assert torch.equal(seen["inputs"].splats.features[:, 1:], seen["flow"])
         assert package["flow"].any()
+
+
+@pytest.mark.parametrize("opened", [True, False])
+def test_moments_are_cut_by_the_engine_that_draws(mini, opened):
+    cut = []
+
+    class Noting(ReferenceEngine):
+        def slice(self, splats, moment):
+            cut.append(len(splats))
+            return super().slice(splats, moment)
+
+    class Plugin:
+        @hookimpl
+        def fragprune_create_engine(self, name, device):
+            return Noting()
+
+    with joint(plugins=[Plugin()], **of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera()
+        if opened:
+            host.store(model).open(host.adapter.opacities(model))
+        host.render(camera, model)
+    assert cut == [COUNT]
 
 
 @pytest.mark.parametrize("driver", [RT4DGSHost, RigidHost], ids=["4D rotation", "without"])

@@ -212,6 +212,28 @@ def test_slice_at_takes_the_fastest_engine(monkeypatch):
     assert torch.equal(fragprune_plugins.slice_at(given, when).means, expected.means)
 
 
+@pytest.mark.skipif(not binding.usable_builds(), reason="no compiled rasterizer here")
+def test_slice_at_takes_the_engine_that_was_asked_for():
+    given, when = splats("joint", 50), moment()
+    expected = ReferenceEngine().slice(given, when)
+
+    class Drawing:
+        """Another's engine, which cuts nothing."""
+
+        name = "mine"
+
+        def rasterize(self, inputs, thresholds):
+            raise AssertionError
+
+    for engine in ("reference", ReferenceEngine()):
+        assert torch.equal(
+            fragprune_plugins.slice_at(given, when, engine=engine).means, expected.means
+        )
+    for engine in ("cpu", "auto", Drawing()):
+        cut = fragprune_plugins.slice_at(given, when, engine=engine)
+        assert cut.means.dtype == torch.float32
+
+
 def test_what_does_not_fit_is_refused(engine):
     good = splats("joint", 5)
     for changes in ({"times": None}, {"scales": None}, {"cov3d": torch.ones(5, 6)}):
