@@ -55,6 +55,11 @@ class ThresholdStore:
             self._look()
         return self._neutral
 
+    @property
+    def opened(self) -> bool:
+        """True when ``open`` would change nothing: no row has been neutral since it was called."""
+        return self._is_known() and self._opened
+
     def _is_known(self) -> bool:
         """Whether nobody has written to the logits, or replaced them, since the last look."""
         return self._seen is not None and (
@@ -80,7 +85,7 @@ class ThresholdStore:
         """
         opacities = opacities.detach().reshape(-1).to(self.logits)
         self._expect(len(opacities), "open")
-        if self._is_known() and self._opened:
+        if self.opened:
             return
         limit = (ALPHA_MIN / opacities.clamp_min(1e-12)).clamp_max(_START_MAX)
         start = torch.logit(limit * (1 - _START_MARGIN))
