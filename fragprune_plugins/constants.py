@@ -35,6 +35,12 @@ MIP_FLOOR: Final = 1e-6
 FEATURES_MAX: Final = 8
 """Most channels that one rasterization blends beside colour."""
 
+COEFFICIENTS_MAX: Final = 1024
+"""Most spherical-harmonic coefficients of one Gaussian; more is an array read the wrong way."""
+
+THREADS_MAX: Final = 1024
+"""Most threads of one call of the cpu engine; results do not depend on their number."""
+
 MARGINAL_MIN: Final = 0.05
 """A Gaussian is not there when the moment is this unlikely for it, 1 at its mean in time."""
 

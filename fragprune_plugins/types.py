@@ -5,7 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
-from fragprune_plugins.constants import ALPHA_MAX, ALPHA_MIN, DILATION, FEATURES_MAX, NEAR
+from fragprune_plugins.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    COEFFICIENTS_MAX,
+    DILATION,
+    FEATURES_MAX,
+    NEAR,
+)
 from fragprune_plugins.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,18 +23,42 @@ Compensation = Literal["none", "antialiasing", "mip"]
 """What keeps a dilated Gaussian's weight, by name; ``RasterInputs`` has the formulas."""
 
 
-def _check(name: str, tensor: Tensor | None, *shape: int | None) -> None:
-    """Raise InputError unless tensor is None or has the shape (None: any length)."""
+def _check(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = False) -> None:
+    """Raise InputError unless tensor is None or holds real numbers in the shape.
+
+    Args:
+        name: of the tensor.
+        tensor: anything; a dense tensor with its numbers in memory passes.
+        shape: lengths; None stands for any.
+        whole: of an integer type instead of a floating one.
+    """
     if tensor is None:
         return
-    fits = tensor.ndim == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, tensor.shape, strict=True)
-    )
-    if not fits:
-        want = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
-        raise InputError(
-            name, f"shape {tuple(tensor.shape)}", f"shape {want}", "Check the call's arguments."
-        )
+    import torch
+
+    found = expected = ""
+    if not isinstance(tensor, torch.Tensor):
+        found, expected = f"a {type(tensor).__name__}", "a torch.Tensor"
+    elif tensor.is_meta or tensor.layout is not torch.strided:
+        found, expected = f"{tensor.layout} on {tensor.device}", "a dense tensor with its numbers"
+    elif not (_is_whole(tensor.dtype) if whole else tensor.dtype.is_floating_point):
+        found = str(tensor.dtype)
+        expected = "integers" if whole else "floating-point numbers"
+    elif tensor.ndim != len(shape) or any(
+        want not in (None, have) for want, have in zip(shape, tensor.shape, strict=True)
+    ):
+        lengths = ["any" if want is None else str(want) for want in shape]
+        found = f"shape {tuple(tensor.shape)}"
+        expected = f"shape ({', '.join(lengths)}{',' * (len(lengths) == 1)})"
+    if found:
+        raise InputError(name, found, expected, "Check the call's arguments.")
+
+
+def _is_whole(dtype: torch.dtype) -> bool:
+    """Whether it is an integer type; torch has no name for them all."""
+    import torch
+
+    return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
 
 
 def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
@@ -52,6 +83,13 @@ def _check_degree(name: str, sh: Tensor | None, degree: int) -> None:
             f"{sh.shape[1]} coefficients",
             f"at least {(degree + 1) ** 2} for degree {degree}",
             "Lower the SH degree or pass all coefficients.",
+        )
+    if sh is not None and sh.shape[1] > COEFFICIENTS_MAX:
+        raise InputError(
+            f"{name}.sh",
+            f"{sh.shape[1]} coefficients",
+            f"at most {COEFFICIENTS_MAX}",
+            "Pass (N, coefficients, 3).",
         )
 
 
@@ -363,7 +401,7 @@ class Footprints:
         depths: (N,) they are blended in this order, ties by row; 1 / depth feeds ``invdepth``.
         opacities: (N,) in (0, 1), used as given.
         colors: (N, 3) RGB, used as given.
-        tiles: (N, 4) int32 x0, y0, x1, y1, half open: the 16x16 tiles it may draw in.
+        tiles: (N, 4) integers x0, y0, x1, y1, half open: the 16x16 tiles it may draw in.
         features: as in ``Splats``.
     """
 
@@ -382,7 +420,7 @@ class Footprints:
         _check("Footprints.depths", self.depths, n)
         _check("Footprints.opacities", self.opacities, n)
         _check("Footprints.colors", self.colors, n, 3)
-        _check("Footprints.tiles", self.tiles, n, 4)
+        _check("Footprints.tiles", self.tiles, n, 4, whole=True)
         _check_features("Footprints.features", self.features, n)
 
     def __len__(self) -> int:
@@ -461,6 +499,14 @@ class RasterInputs:
                 "3 or more with absolute_gradient",
                 "Pass a wider hook.",
             )
+
+    def check_thresholds(self, thresholds: Tensor | None) -> None:
+        """What every engine does first: raise InputError unless there is one per Gaussian, or None.
+
+        Args:
+            thresholds: (N,) falloff in (0, 1), of any floating type; None for no truncation.
+        """
+        _check("thresholds", thresholds, len(self.splats))
 
     def with_counts(self) -> RasterInputs:
         """The same, counting fragments per pixel and per Gaussian."""

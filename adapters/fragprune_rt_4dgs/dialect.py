@@ -112,4 +112,5 @@ def at_moment(call: HostCall) -> Sliced:
             prefilter_var=float(call.arguments.get("prefilter_var", -1.0)),
             scale_modifier=float(s.scale_modifier),
         ),
+        engine=call.engine,
     )

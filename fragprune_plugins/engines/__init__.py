@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from functools import cache
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from fragprune_plugins.errors import EngineError, UsageError
 
@@ -31,9 +31,14 @@ class Engine(Protocol):
     name: str
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
-        """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+        """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
+
+        Raises:
+            InputError: by ``inputs.check_thresholds``, thresholds that are not one per Gaussian.
+        """
 
 
+@runtime_checkable
 class Slicer(Protocol):
     """What our own engines do beside."""
 
@@ -127,17 +132,28 @@ _slicer = cache(create_engine)
 """Engines keep memory and kernels that the next frame uses again."""
 
 
-def slice_at(splats: SpacetimeSplats, moment: Moment) -> Sliced:
+def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = "auto") -> Sliced:
     """The 3D Gaussians that Gaussians in space and time are at a moment. Differentiable.
 
-    By the fastest of our engines on the device of the splats. Gradients are those of RT-4DGS,
-    whose kernels differentiate by hand: without ``rotations_r`` the marginal has none; colours are
-    differentiated as seen where the moment has moved the means, though shown as seen where they are
-    stored; where time has a say in them, the second coefficient gets the first one's gradient, and
-    the times that of the highest cosine alone, with the opposite sign.
+    Gradients are those of RT-4DGS, whose kernels differentiate by hand: without ``rotations_r`` the
+    marginal has none; colours are differentiated as seen where the moment has moved the means,
+    though shown as seen where they are stored; where time has a say in them, the second coefficient
+    gets the first one's gradient, and the times that of the highest cosine alone, with the opposite
+    sign.
+
+    Args:
+        splats: the Gaussians.
+        moment: when and from where.
+        engine: a name as ``create_engine`` takes it, or an engine; one that is not ours and cuts
+            nothing leaves it to the fastest of ours on the device.
 
     Raises:
         InputError: harmonics with fewer coefficients than the moment's cosines take.
+        EngineError: no such engine here.
     """
-    slicer: Slicer = _slicer(_fastest(str(splats.device)))  # type: ignore[assignment]
+    if isinstance(engine, Slicer):
+        return engine.slice(splats, moment)
+    if not isinstance(engine, str) or engine == "auto":
+        engine = _fastest(str(splats.device))
+    slicer: Slicer = _slicer(engine)  # type: ignore[assignment]
     return slicer.slice(splats, moment)

@@ -37,6 +37,7 @@ class ReferenceEngine:
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+        inputs.check_thresholds(thresholds)
         drawn = _draw(inputs, thresholds)
         return RasterOutputs(
             image=drawn.image,
@@ -63,6 +64,8 @@ class ReferenceEngine:
 def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:
     camera, hook, options = camera_of(inputs), inputs.means2d_hook, options_of(inputs)
     splats = inputs.splats
+    if thresholds is not None:
+        thresholds = thresholds.to(splats.opacities)  # type and device, as compiled engines do
     if isinstance(splats, Splats):
         gaussians = gaussians_of(splats)
         return render(camera, gaussians, thresholds, means2d_hook=hook, options=options)

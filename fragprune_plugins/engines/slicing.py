@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.inputs import native_lengths, native_threads
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.types import Moment, Sliced, SpacetimeSplats
 
@@ -85,7 +86,7 @@ class _Cut:
         """The C struct; it points into ``arrays``."""
         moment, sh = self.moment, self.splats.sh
         return binding.Spacetime(
-            threads=min(torch.get_num_threads(), 1024),
+            threads=native_threads(),
             timestamp=moment.timestamp,
             duration=moment.duration,
             prefilter_var=moment.prefilter_var,
@@ -94,6 +95,7 @@ class _Cut:
             sh_degree_t=-1 if moment.sh_degree_t is None else moment.sh_degree_t,
             sh_coefficients=0 if sh is None else sh.shape[1],
             count=len(self.splats),
+            lengths=native_lengths(self.arrays),
             **{name: address(array) for name, array in self.arrays.items()},
         )
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -97,11 +98,19 @@ def finetune(
     """
     settings, device = settings or Settings(), model.xyz.device
     dataset = dataset.to(device)
+    store = ThresholdStore(len(model), device) if store is None else store  # empty ones are false
+    if len(store) != len(model):
+        raise AlignmentError(
+            "finetune",
+            f"a store of {len(store)} thresholds",
+            f"{len(model)}, one per Gaussian",
+            "Pass the store of this very model.",
+        )
     run = _Run(
         model,
         dataset,
         settings,
-        ThresholdStore(len(model), device) if store is None else store,
+        store,
         schedule or schedule_for(settings),
         engine_for(engine, device) if isinstance(engine, str) else engine,
     )

@@ -20,6 +20,7 @@ from fragprune_plugins.hosts.source import HostRepo, check_seams
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from fragprune_plugins.engines import Engine
     from fragprune_plugins.storage.ply import SplatFile
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
@@ -49,11 +50,13 @@ class HostCall:
         settings: what the host configured its rasterizer with.
         arguments: of the call, by name.
         entry: the function called, "module:attribute" as seams spell it.
+        engine: what draws it, for dialects that compute with it beforehand (``slice_at``).
     """
 
     settings: Any
     arguments: Mapping[str, Any]
     entry: str = ""
+    engine: str | Engine = "auto"
 
     @classmethod
     def bind(

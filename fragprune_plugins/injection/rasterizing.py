@@ -21,6 +21,7 @@ from fragprune_plugins.injection.stepping import begin_step
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 if TYPE_CHECKING:
+    from fragprune_plugins.engines import Engine
     from fragprune_plugins.injection.session import Session
 
 log = logging.getLogger("fragprune")
@@ -107,7 +108,7 @@ def on_rasterize(
         )
     if state.store.neutral:
         return wrapped(*args, **kwargs)
-    inputs = session.dialect.unpack(call)
+    inputs, engine = session.unpack(call)
     stage = state.stage
     thresholds = (
         session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
@@ -115,12 +116,12 @@ def on_rasterize(
     if thresholds is None:
         return wrapped(*args, **kwargs)
     thresholds = thresholds if rows is None else thresholds[rows]
-    draw = partial(rasterize, session, state, rendering[1], thresholds)
+    draw = partial(rasterize, engine, state, rendering[1], thresholds)
     return session.dialect.answer(call, inputs, draw)
 
 
 def rasterize(
-    session: Session,
+    engine: Engine,
     state: ModelState,
     view: int,
     thresholds: Tensor,
@@ -128,7 +129,6 @@ def rasterize(
     part: int = 0,
 ) -> RasterOutputs:
     """With thresholds; learning, with the fragment pressure in the loss."""
-    engine = session.engine(inputs.splats.device)
     outputs = engine.rasterize(inputs, thresholds)
     if state.stage is None:
         return outputs

@@ -74,7 +74,8 @@ def on_unpack(
     result = wrapped(*args, **kwargs)
     packed = session.adapter.packed(named(wrapped, args, kwargs), result)
     if packed is not None and sidecar.path_beside(packed[0]).exists():
-        session.unpacked = packed[1], sidecar.load(packed[0])[0]
+        file, means = packed
+        session.unpacked = means, sidecar.load(file, ThresholdStore(len(means)))[0]
     return result
 
 

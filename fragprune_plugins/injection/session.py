@@ -12,7 +12,7 @@ import sys
 import weakref
 from collections.abc import Iterator
 from contextvars import ContextVar
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -97,7 +97,7 @@ class Session:
         self.output = output
         self.curves: list[dict[str, float]] = []
         self._engine_name = engine
-        self._engine: Engine | None = None
+        self._engines: dict[torch.device, Engine] = {}
         self._drop_in = drop_in
         self.dialect = adapter.dialect(repo)
         self._ledger: PatchLedger | None = None
@@ -181,16 +181,17 @@ class Session:
         return state.store if state else None
 
     def engine(self, device: torch.device) -> Engine:
-        """The engine for tensors on a device, created at its first use."""
-        engine = engine_for(self._engine_name, device, self.plugins)
-        if engine is not self._engine and engine.name == "reference":
-            log.warning(
-                "drawing on %s with the reference engine: exact, and slow; "
-                "fragprune doctor says why no faster one is used",
-                device,
-            )
-        self._engine = engine
-        return engine
+        """The engine for tensors on a device, created at its first use there."""
+        if device not in self._engines:
+            engine = engine_for(self._engine_name, device, self.plugins)
+            if engine.name == "reference":
+                log.warning(
+                    "drawing on %s with the reference engine: exact, and slow; "
+                    "fragprune doctor says why no faster one is used",
+                    device,
+                )
+            self._engines[device] = engine
+        return self._engines[device]
 
     def finish(self) -> Summary:
         """What was gained; observers are told."""
@@ -201,7 +202,7 @@ class Session:
         done = stage.progress() if stage else None
         summary = Summary(
             adapter=self.adapter.name,
-            engine=self._engine.name if self._engine else "",
+            engine=", ".join(dict.fromkeys(engine.name for engine in self._engines.values())),
             steps=done.steps if done else 0,
             gaussians=len(state.store) if state else 0,
             fragments_before=done.fragments_before if done else None,
@@ -283,9 +284,13 @@ class Session:
 
     def draw(self, call: HostCall) -> Any:
         """The host's picture without thresholds, from our engine."""
-        inputs = self.dialect.unpack(call)
-        engine = self.engine(inputs.splats.device)
+        inputs, engine = self.unpack(call)
         return self.dialect.answer(call, inputs, lambda each, _=0: engine.rasterize(each, None))
+
+    def unpack(self, call: HostCall) -> tuple[RasterInputs, Engine]:
+        """The host's call as core values, and the engine that draws them."""
+        engine = self.engine(call[self.dialect.means].device)
+        return self.dialect.unpack(replace(call, engine=engine)), engine
 
     # -- roles -----------------------------------------------------------------------------------
 
@@ -387,7 +392,6 @@ class Session:
         sidecar.load(path, store)
         means = weakref.ref(self.adapter.means(model))
         state = self.models[model] = ModelState(store, loaded=means)
-        self.expect_rows(model, state, str(path))
         self.follow(model, state)
         self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)
 

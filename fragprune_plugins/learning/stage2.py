@@ -130,7 +130,8 @@ class Stage2:
         self.plan = self.schedule.at(self.steps)
         self._views.begin()
         if self.plan.learn and self.settings.truncate:
-            self.store.open(opacities())
+            if not self.store.opened:
+                self.store.open(opacities())
             self._meet_target(self.plan.progress)
         return self.plan
 

@@ -38,6 +38,7 @@ class ThresholdStore:
         self.logits = logits.detach().clone().requires_grad_(True)
         # eps as the hosts have it: a larger one freezes thresholds whose gradients are tiny.
         self.optimizer = torch.optim.Adam([self.logits], lr=lr, eps=1e-15)
+        self._seen: tuple[Tensor, int] | None = None  # the logits last looked at, and their version
 
     def __len__(self) -> int:
         return len(self.logits)
@@ -49,8 +50,30 @@ class ThresholdStore:
 
     @property
     def neutral(self) -> bool:
-        """True while no threshold decides anything."""
-        return bool((self.logits <= NEUTRAL_LOGIT).all())
+        """True while no threshold decides anything; rows are looked at once for each change."""
+        if not self._is_known():
+            self._look()
+        return self._neutral
+
+    @property
+    def opened(self) -> bool:
+        """True when ``open`` would change nothing: no row has been neutral since it was called."""
+        return self._is_known() and self._opened
+
+    def _is_known(self) -> bool:
+        """Whether nobody has written to the logits, or replaced them, since the last look."""
+        return self._seen is not None and (
+            self._seen[0] is self.logits and self._seen[1] == self.logits._version
+        )
+
+    def _look(self, opened: bool = False) -> None:
+        self._know(bool((self.logits <= NEUTRAL_LOGIT).all()), opened)
+
+    def _know(self, neutral: bool, opened: bool) -> None:
+        """Remember whether all rows are neutral, and whether none is, of the logits as they are."""
+        self._neutral, self._opened = neutral, opened
+        counted = not self.logits.is_inference()  # made in inference mode, they have no version
+        self._seen = (self.logits, self.logits._version) if counted else None
 
     def open(self, opacities: Tensor) -> None:
         """Start learning: neutral rows move to just below the skip limit 1/(255 o).
@@ -62,19 +85,25 @@ class ThresholdStore:
         """
         opacities = opacities.detach().reshape(-1).to(self.logits)
         self._expect(len(opacities), "open")
+        if self.opened:
+            return
         limit = (ALPHA_MIN / opacities.clamp_min(1e-12)).clamp_max(_START_MAX)
         start = torch.logit(limit * (1 - _START_MARGIN))
         with torch.no_grad():
             neutral = self.logits <= NEUTRAL_LOGIT
             self.logits.copy_(torch.where(neutral, start, self.logits))
+        self._look(opened=True)
 
     def step(self, lr: float | None = None) -> None:
         """One optimizer step on the gradient gathered since the last; clears it."""
         if lr is not None:
             self.optimizer.param_groups[0]["lr"] = lr
+        learning = not self.neutral
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.steps += 1
+        if learning:  # no step comes near the 24 logits from the skip limit down to neutral
+            self._know(neutral=False, opened=self._opened)
 
     def keep(self, mask: Tensor) -> None:
         """Keep the rows where mask (N,) bool is True, in their order, with their moments."""

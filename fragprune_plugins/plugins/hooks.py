@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import ENGINES, Engine, create_engine
-from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.errors import EngineError
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
@@ -129,15 +129,8 @@ def rasterize(
         EngineError: no such engine here.
         PluginError: a plugin raised, or gave an answer that cannot be used.
     """
-    n = len(inputs.splats)
     thresholds = thresholds_for(inputs, thresholds)
-    if thresholds is not None and tuple(thresholds.shape) != (n,):
-        raise InputError(
-            "thresholds",
-            f"shape {tuple(thresholds.shape)}",
-            f"({n},), one per Gaussian",
-            "Pass the thresholds of this very model.",
-        )
+    inputs.check_thresholds(thresholds)  # also for engines that are not ours
     if isinstance(engine, str):
         engine = engine_for(engine, inputs.splats.device)
     return engine.rasterize(inputs, thresholds)

@@ -29,7 +29,7 @@ def load_model(
 
     Raises:
         ModelFileError: the model cannot be read.
-        SidecarError: the sidecar beside it is lost, broken or another model's.
+    SidecarError: the sidecar beside it is lost, broken, another model's, or has other rows.
     """
     import torch
 

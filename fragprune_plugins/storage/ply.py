@@ -71,10 +71,12 @@ class SplatFile:
             "opacity": (n, 1),
             "scaling": (n, 3),
             "rotation": (n, 4),
+            "thresholds": (n,),
+            "filter_3d": (n, 1),
         }
         for name, shape in shapes.items():
-            if tuple(getattr(self, name).shape) != shape:
-                found = tuple(getattr(self, name).shape)
+            if (part := getattr(self, name)) is not None and tuple(part.shape) != shape:
+                found = tuple(part.shape)
                 raise InputError(f"SplatFile.{name}", f"shape {found}", f"{shape}", "Check it.")
         if 3 * self.f_rest.shape[1] not in _REST_COUNTS:
             raise InputError(

@@ -99,10 +99,16 @@ def save(
 
 
 def load(model: Path, store: ThresholdStore | None = None) -> tuple[ThresholdStore, SidecarInfo]:
-    """Read the sidecar of a model file, into ``store`` or a new one on the CPU.
+    """Read the sidecar of a model file.
+
+    Args:
+        model: the file.
+        store: filled in; whoever has the model passes one of its rows, and other rows are refused.
+            None makes one on the CPU of as many rows as the sidecar says that the model has.
 
     Raises:
-        SidecarError: missing, unreadable, or written for another model file.
+        SidecarError: missing, unreadable, written for another model file, or of other rows than the
+            store. The store stays as it was.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -140,6 +146,14 @@ def load(model: Path, store: ThresholdStore | None = None) -> tuple[ThresholdSto
             f"those of {Path(model).name} (sha256 {digest(model)[:12]})",
             remedy,
         )
-    store = ThresholdStore(info.rows) if store is None else store  # an empty store is false
+    if store is None:
+        store = ThresholdStore(info.rows)
+    elif len(store) != info.rows:
+        raise SidecarError(
+            str(path),
+            f"thresholds of {info.rows} Gaussian(s)",
+            f"{len(store)}, one for each in {Path(model).name}",
+            remedy,
+        )
     store.load_state_dict(state)
     return store, info

@@ -9,6 +9,7 @@ import pytest
 import torch
 from rt_4dgs_host import PythonHost, RigidHost, RT4DGSHost
 
+from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
@@ -126,6 +127,28 @@ def test_flow_is_blended_as_colour_is(mini, driver, monkeypatch):
         assert package["flow"].any()
 
 
+@pytest.mark.parametrize("opened", [True, False])
+def test_moments_are_cut_by_the_engine_that_draws(mini, opened):
+    cut = []
+
+    class Noting(ReferenceEngine):
+        def slice(self, splats, moment):
+            cut.append(len(splats))
+            return super().slice(splats, moment)
+
+    class Plugin:
+        @hookimpl
+        def fragprune_create_engine(self, name, device):
+            return Noting()
+
+    with joint(plugins=[Plugin()], **of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera()
+        if opened:
+            host.store(model).open(host.adapter.opacities(model))
+        host.render(camera, model)
+    assert cut == [COUNT]
+
+
 @pytest.mark.parametrize("driver", [RT4DGSHost, RigidHost], ids=["4D rotation", "without"])
 def test_every_parameter_gets_a_gradient_even_if_nobody_is_there(mini, driver):
     with joint(**of(mini, driver())) as host:
@@ -179,9 +202,9 @@ def test_thresholds_leave_radii_alone(mini):
         store = host.store(model)
         found = []
         for tau in (None, 0.7):
-            if tau:
-                store.logits.data.fill_(float(torch.logit(torch.tensor(tau))))
             with torch.no_grad():
+                if tau:
+                    store.logits.fill_(float(torch.logit(torch.tensor(tau))))
                 found.append(host.render(camera, model)["radii"])
         assert torch.equal(*found)
 

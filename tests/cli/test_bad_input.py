@@ -9,6 +9,7 @@ import torch
 from cli.commands import run
 from finetune import tiny
 
+from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply, write_ply
 
@@ -20,6 +21,13 @@ def scene(tmp_path):
     out.write_bytes(b"precious")
     sidecar.path_beside(out).write_bytes(b"also precious")
     return data, path, out
+
+
+def opened(rows):
+    """A store that is not neutral."""
+    store = ThresholdStore(rows)
+    store.open(torch.full((rows,), 0.5))
+    return store
 
 
 def refused(arguments, code, words):
@@ -55,6 +63,7 @@ def untouched(out):
         ("image missing", "dataset", "no such image"),
         ("stale sidecar", "sidecar", "thresholds of another model"),
         ("broken sidecar", "sidecar", "unreadable"),
+        ("sidecar of one row", "sidecar", "thresholds of 1 Gaussian"),
     ],
 )
 @pytest.mark.parametrize("command", ["finetune", "profile", "render", "compare"])
@@ -70,9 +79,9 @@ def test_refused(scene, tmp_path, how, code, words, command):
         data = tmp_path / "nowhere"
     elif how == "image missing":
         (data / "images" / "view04.png").unlink()
+    elif how == "sidecar of one row":
+        sidecar.save(path, opened(1))
     elif how == "stale sidecar":
-        from fragprune_plugins.learning.thresholds import ThresholdStore
-
         sidecar.save(path, ThresholdStore(60))
         path.write_bytes(path.read_bytes()[:-1] + b"\x01")
     elif how == "broken sidecar":
@@ -85,6 +94,26 @@ def test_refused(scene, tmp_path, how, code, words, command):
     }[command]
     refused(arguments, code, words)
     assert untouched(out)
+
+
+RENDER = """
+import json, sys
+from click.testing import CliRunner
+from fragprune_plugins.cli import cli
+result = CliRunner().invoke(cli, ["render", *sys.argv[1:]])
+print(json.dumps([result.exit_code, result.stderr]))
+"""
+
+
+def test_one_threshold_beside_many_gaussians_reads_no_foreign_memory(scene, tmp_path, python):
+    """In a process of its own, because of what became of it once: SIGSEGV."""
+    data, path, _ = scene
+    write_ply(path, tiny.random_model(1_000_000, degree=0))
+    sidecar.save(path, opened(1))
+    code, message = python(RENDER, path, "--data", data, "--out", tmp_path / "pictures")
+    assert code == 1
+    assert message.startswith("[sidecar] ")
+    assert "1000000" in message
 
 
 def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypatch):

@@ -36,7 +36,7 @@ def test_what_is_saved_is_loaded_bit_for_bit(model, trained):
     )
     assert path == model.with_name("point_cloud.fragprune.safetensors")
     assert model.read_bytes() == before
-    for store in (None, ThresholdStore(6), ThresholdStore(0)):
+    for store in (None, ThresholdStore(6)):
         loaded, info = sidecar.load(model, store)
         assert store is None or loaded is store
         for key, value in trained.state_dict().items():
@@ -64,6 +64,20 @@ def test_a_sidecar_of_an_earlier_model_file_is_refused(model, trained):
     model.write_bytes(model.read_bytes() + b" retrained")
     with pytest.raises(SidecarError, match="thresholds of another model"):
         sidecar.load(model)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 5, 7])
+def test_thresholds_of_other_rows_than_the_models_are_refused_with_both_counts(
+    model, trained, rows
+):
+    sidecar.save(model, trained)
+    store = ThresholdStore(rows)
+    with pytest.raises(SidecarError) as caught:
+        sidecar.load(model, store)
+    assert "6" in caught.value.found
+    assert str(rows) in caught.value.expected
+    assert len(store) == rows
+    assert store.neutral
 
 
 def broken(path, how: str) -> None:

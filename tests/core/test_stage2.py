@@ -157,3 +157,20 @@ def test_a_target_is_met_late_and_thresholds_then_stay(target):
     assert held == [number >= 17 for number in range(20)]  # from 85 per cent of the run on
     assert progress.target_reached
     assert progress.speedup == pytest.approx(target, rel=0.02)
+
+
+def test_opacities_are_worked_out_only_while_there_are_rows_to_open():
+    asked = []
+    it = stage()
+
+    def opacities():
+        asked.append(it.steps)
+        return torch.full((len(it.store),), 0.5)
+
+    for count in range(1, 7):
+        it.begin(opacities)
+        it.end()
+        if count == 3:
+            it.store.append(2)
+    assert asked == [1, 4]
+    assert (it.store.logits > -30).all()

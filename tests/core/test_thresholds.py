@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from fragprune_plugins.errors import AlignmentError, SidecarError
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -37,23 +38,19 @@ def stepped(store: ThresholdStore, gradient: list[float], lr: float) -> None:
     store.step(lr)
 
 
-operations = st.lists(
-    st.one_of(
-        st.tuples(st.just("keep"), st.integers(0, 2**12 - 1)),
-        st.tuples(st.just("append"), st.lists(st.integers(0, 99), max_size=4)),
-        st.tuples(st.just("orphans"), st.integers(0, 3)),
-        st.tuples(st.just("copy"), st.tuples(st.integers(0, 99), st.integers(0, 99))),
-        st.tuples(
-            st.just("forget"), st.one_of(st.none(), st.lists(st.integers(0, 99), max_size=4))
-        ),
-        st.tuples(
-            st.just("rearrange"), st.lists(st.tuples(st.integers(0, 99), st.booleans()), max_size=9)
-        ),
-        st.tuples(st.just("replace"), st.integers(0, 6)),
-        st.tuples(st.just("step"), st.integers(1, 1000)),
+operation = st.one_of(
+    st.tuples(st.just("keep"), st.integers(0, 2**12 - 1)),
+    st.tuples(st.just("append"), st.lists(st.integers(0, 99), max_size=4)),
+    st.tuples(st.just("orphans"), st.integers(0, 3)),
+    st.tuples(st.just("copy"), st.tuples(st.integers(0, 99), st.integers(0, 99))),
+    st.tuples(st.just("forget"), st.one_of(st.none(), st.lists(st.integers(0, 99), max_size=4))),
+    st.tuples(
+        st.just("rearrange"), st.lists(st.tuples(st.integers(0, 99), st.booleans()), max_size=9)
     ),
-    max_size=14,
+    st.tuples(st.just("replace"), st.integers(0, 6)),
+    st.tuples(st.just("step"), st.integers(1, 1000)),
 )
+operations = st.lists(operation, max_size=14)
 
 
 def apply(store: ThresholdStore, shadow: Shadow, operation: str, argument) -> None:
@@ -107,6 +104,77 @@ def test_rows_and_moments_follow_every_sequence_of_operations(sequence):
         for column, key in enumerate(("logits", "exp_avg", "exp_avg_sq")):
             expected = torch.tensor([row[column] for row in shadow.rows])
             torch.testing.assert_close(state[key], expected, rtol=1e-4, atol=2e-5)
+
+
+other_changes = st.one_of(
+    st.tuples(st.just("open"), st.floats(0.01, 1.0)),
+    st.tuples(st.just("load"), st.integers(0, 5)),
+    st.tuples(st.just("write"), st.sampled_from([-40.0, -30.0, -29.0, 2.0])),
+    st.tuples(st.just("assign"), st.lists(st.sampled_from([-31.0, -2.0]), max_size=4)),
+)
+
+
+def change(store: ThresholdStore, how: str, argument) -> None:
+    if how == "open":
+        store.open(torch.full((len(store),), argument))
+    elif how == "load":
+        other = ThresholdStore(argument)
+        if argument % 2:
+            other.open(torch.full((argument,), 0.5))
+        store.load_state_dict(other.state_dict())
+    elif how == "write":  # by whoever holds the logits
+        with torch.no_grad():
+            store.logits[: len(store) // 2 + 1] = argument
+    elif how == "assign":
+        store.logits = torch.tensor(argument, requires_grad=True)
+        store.optimizer = torch.optim.Adam([store.logits], lr=0.05)
+    else:
+        if how == "step":  # rows are opened before they learn
+            store.open(torch.full((len(store),), 0.5))
+        apply(store, Shadow(len(store)), how, argument)
+
+
+@given(st.lists(st.one_of(operation, other_changes), max_size=14))
+def test_neutral_is_what_a_look_at_every_row_would_say(sequence):
+    store = ThresholdStore(3)
+    for how, argument in sequence:
+        change(store, how, argument)
+        assert store.neutral == bool((store.logits <= -30).all()), (how, argument)
+
+
+class Looks(TorchDispatchMode):
+    """Counts reductions of all rows to one answer."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += func is torch.ops.aten.all.default
+        return func(*args, **(kwargs or {}))
+
+
+def test_neutral_looks_at_the_rows_no_more_than_once_a_change():
+    store = ThresholdStore(5)
+    with Looks() as looks:
+        for _ in range(9):
+            assert store.neutral
+    assert looks.count == 1
+    store.open(torch.full((5,), 0.5))
+    with Looks() as looks:
+        for _ in range(9):
+            store.open(torch.full((5,), 0.5))
+            stepped(store, [1.0] * 5, 0.05)
+            assert not store.neutral
+    assert looks.count == 0
+
+
+def test_neutral_without_version_counters():
+    with torch.inference_mode():
+        store = ThresholdStore(2)
+        assert store.neutral
+        store.open(torch.ones(2))
+        assert not store.neutral
 
 
 @given(st.integers(0, 2**8 - 1), st.integers(0, 2**8 - 1))

@@ -10,6 +10,7 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
+from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.finetuning import finetune, loop, save
 from fragprune_plugins.finetuning.loop import mean_fragments
 from fragprune_plugins.learning.pressure import calibrate
@@ -140,6 +141,14 @@ def test_going_on_from_a_store(default, model, dataset):
     assert result.store is store
     assert store.steps == default.store.steps + 3
     assert float((store.logits.detach() - start).abs().max()) < 0.5
+
+
+@pytest.mark.parametrize("rows", [0, 1, 61])
+@pytest.mark.parametrize("truncate", [True, False])
+def test_a_store_of_another_model_is_refused_with_both_counts(model, dataset, rows, truncate):
+    settings = Settings(iterations=1, truncate=truncate)
+    with pytest.raises(AlignmentError, match=f"{rows} thresholds; expected 60"):
+        finetune(model, dataset, settings, store=ThresholdStore(rows))
 
 
 def test_save_writes_a_pair_that_reads_back(default, tmp_path):

@@ -201,6 +201,9 @@ def test_shapes_are_checked():
     model = tiny.random_model(4)
     with pytest.raises(InputError, match="opacity"):
         replace(model, opacity=model.opacity[:, 0])
+    for name in ("thresholds", "filter_3d"):
+        with pytest.raises(InputError, match=name):
+            replace(model, **{name: torch.full((3, 1), 0.5)})
     with pytest.raises(InputError, match="f_rest"):
         replace(model, f_rest=torch.zeros(4, 5, 3))
 

@@ -212,11 +212,22 @@ def test_offsets_beyond_all_bounds_are_refused(engine: CudaEngine) -> None:
             engine.rasterize(replace(scenes.random_scene(0), sample_offsets=offsets), None)
 
 
-def test_tensors_elsewhere_are_refused(engine: CudaEngine) -> None:
-    inputs = scenes.random_scene(0)
-    meta = replace(inputs.splats, means=inputs.splats.means.to("meta"))
-    with pytest.raises(InputError, match="meta"):
-        engine.rasterize(replace(inputs, splats=meta), None)
+def test_tensors_elsewhere_are_refused(
+    engine: CudaEngine, device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device, "kind", "cuda")
+    with pytest.raises(InputError, match="Gaussians on cpu"):
+        engine.rasterize(scenes.random_scene(0), None)
+
+
+@pytest.mark.parametrize("rows", [0, 10, 61])
+def test_thresholds_of_another_model_are_refused(
+    engine: CudaEngine, device: EmulatedDevice, rows: int
+) -> None:
+    before = len(device.launched)
+    with pytest.raises(InputError, match=rf"thresholds: shape \({rows},\)"):
+        engine.rasterize(scenes.random_scene(0), torch.full((rows,), 0.1))
+    assert len(device.launched) == before
 
 
 def test_changes_in_place_are_noticed(engine: CudaEngine) -> None:

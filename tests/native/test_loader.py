@@ -31,7 +31,7 @@ def _decide_anew():
 def test_header_and_python_hold_the_same_constants() -> None:
     found = dict(re.findall(r"#define FRAGPRUNE_([A-Z_]+) ([-(0-9][^\n]*)", HEADER))
     assert int(found.pop("API_VERSION")) == binding.API_VERSION
-    assert len(found) == 15
+    assert len(found) == 17
     for name, value in found.items():
         assert eval(value) == getattr(constants, name), name
 
@@ -82,6 +82,16 @@ def test_a_broken_file_is_a_reason_not_a_crash(
     broken.write_bytes(b"not a library")
     monkeypatch.setattr(binding, "_path_of", lambda build: str(broken))
     assert "cannot be opened" in binding.describe()["reason"]
+
+
+@needs_native
+def test_a_build_of_another_interface_is_a_reason_with_both_versions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ours = binding.API_VERSION
+    monkeypatch.setattr(binding, "API_VERSION", ours + 1)
+    reason = binding.describe()["reason"]
+    assert f"speaks version {ours}, this package {ours + 1}; reinstall" in reason
 
 
 def test_an_unknown_build_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -212,6 +212,28 @@ def test_slice_at_takes_the_fastest_engine(monkeypatch):
     assert torch.equal(fragprune_plugins.slice_at(given, when).means, expected.means)
 
 
+@pytest.mark.skipif(not binding.usable_builds(), reason="no compiled rasterizer here")
+def test_slice_at_takes_the_engine_that_was_asked_for():
+    given, when = splats("joint", 50), moment()
+    expected = ReferenceEngine().slice(given, when)
+
+    class Drawing:
+        """Another's engine, which cuts nothing."""
+
+        name = "mine"
+
+        def rasterize(self, inputs, thresholds):
+            raise AssertionError
+
+    for engine in ("reference", ReferenceEngine()):
+        assert torch.equal(
+            fragprune_plugins.slice_at(given, when, engine=engine).means, expected.means
+        )
+    for engine in ("cpu", "auto", Drawing()):
+        cut = fragprune_plugins.slice_at(given, when, engine=engine)
+        assert cut.means.dtype == torch.float32
+
+
 def test_what_does_not_fit_is_refused(engine):
     good = splats("joint", 5)
     for changes in ({"times": None}, {"scales": None}, {"cov3d": torch.ones(5, 6)}):
@@ -231,10 +253,14 @@ def test_the_library_refuses_what_does_not_fit(engine):
     """Below the Python checks: the C interface stands on its own."""
     calls, error = binding.library().calls, binding.Error()
     three = torch.zeros(3).data_ptr()
-    good = {"count": 0, "campos": three, "duration": 1.0}
+    lengths = binding.Lengths(campos=3)
+    good = {"count": 0, "campos": three, "duration": 1.0, "threads": 1, "lengths": lengths}
     to = binding.Sliced()
     assert calls.fragprune_slice(binding.Spacetime(**good), to, error) == binding.OK
-    for change in ({"threads": 1025}, {"count": -1}, {"campos": None}, {"count": 1}):
+    for change in (
+        *({"threads": 1025}, {"threads": 0}, {"count": -1}, {"count": 1}),
+        *({"campos": None}, {"lengths": binding.Lengths(campos=2)}),
+    ):
         status = calls.fragprune_slice(binding.Spacetime(**{**good, **change}), to, error)
         assert status != binding.OK
         assert error.message

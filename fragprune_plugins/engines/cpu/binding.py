@@ -10,7 +10,7 @@ import weakref
 from dataclasses import dataclass
 from typing import Any, Final
 
-API_VERSION: Final = 4
+API_VERSION: Final = 5
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -31,8 +31,18 @@ class Error(ctypes.Structure):
     _fields_ = (("message", ctypes.c_char * 256),)
 
 
-class _Sized(ctypes.Structure):
-    """A struct that begins with its own size; built with every other field zero."""
+class _Named(ctypes.Structure):
+    """A struct built by the names of its fields; those not given are zero."""
+
+    def __init__(self, **fields: Any) -> None:
+        unknown = fields.keys() - {name for name, *_ in self._fields_}
+        if unknown:  # ctypes itself would set attributes that C never sees
+            raise TypeError(f"{type(self).__name__} has no {', '.join(sorted(unknown))}")
+        super().__init__(**fields)
+
+
+class _Sized(_Named):
+    """One that begins with its own size."""
 
     def __init__(self, **fields: Any) -> None:
         super().__init__(size=ctypes.sizeof(type(self)), **fields)
@@ -40,6 +50,24 @@ class _Sized(ctypes.Structure):
 
 def _pointers(names: str) -> tuple[tuple[str, Any], ...]:
     return tuple((name, _POINTER) for name in names.split())
+
+
+def _integers(names: str) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, ctypes.c_int64) for name in names.split())
+
+
+class Lengths(_Named):
+    """fragprune_lengths."""
+
+    _fields_ = (
+        *_integers("viewmatrix projmatrix campos background means opacities scales rotations"),
+        *_integers("cov3d sh colors features thresholds sample_offsets"),
+        *_integers("means2d conics depths tiles times scales_t rotations_r"),
+    )
+
+
+ARRAYS: Final = tuple(name for name, *_ in Lengths._fields_)
+"""The arrays that go in, by name: of a rasterization, and of a cut in time."""
 
 
 class Inputs(_Sized):
@@ -64,6 +92,7 @@ class Inputs(_Sized):
         ("feature_count", ctypes.c_int32),
         ("widen", ctypes.c_int32),
         ("count", ctypes.c_int64),
+        ("lengths", Lengths),
         *_pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
         *_pointers("cov3d sh colors features thresholds sample_offsets"),
         *_pointers("means2d conics depths tiles workspace"),
@@ -119,6 +148,7 @@ class Spacetime(_Sized):
         ("sh_degree_t", ctypes.c_int32),
         ("sh_coefficients", ctypes.c_int32),
         ("count", ctypes.c_int64),
+        ("lengths", Lengths),
         *_pointers("campos means opacities times scales scales_t rotations rotations_r cov3d sh"),
     )
 

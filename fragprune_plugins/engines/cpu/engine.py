@@ -6,16 +6,17 @@ import ctypes
 import math
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NoReturn, get_args
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
 from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.inputs import native_arrays, native_inputs, native_threads
 from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.types import Compensation, Footprints, RasterOutputs, Splats
+from fragprune_plugins.types import RasterOutputs
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,10 +40,6 @@ _NAMES = (
     "depths",
     "background",
 )
-
-_COMPENSATIONS = get_args(Compensation)
-"""In the order of enum fragprune_compensation."""
-
 
 _SMALL = 1 << 16
 """Bytes below which the C library has memory at hand itself."""
@@ -94,32 +91,6 @@ class _Drawing:
     stages: dict[str, float] = field(default_factory=dict)
     found: dict[str, Tensor] = field(default_factory=dict)
 
-    def fill(self, widen: bool) -> binding.Inputs:
-        """The C struct; it points into ``arrays``."""
-        view, splats = self.inputs.view, self.inputs.splats
-        sh = splats.sh if isinstance(splats, Splats) else None
-        return binding.Inputs(
-            threads=_threads(),
-            width=view.width,
-            height=view.height,
-            tan_fov_x=view.tan_fov_x,
-            tan_fov_y=view.tan_fov_y,
-            scale_modifier=self.inputs.scale_modifier,
-            dilation=self.inputs.dilation,
-            near=self.inputs.near,
-            alpha_max=self.inputs.alpha_max,
-            compensation=_COMPENSATIONS.index(self.inputs.compensation),
-            cap_gradient=self.inputs.cap_gradient,
-            absolute_gradient=self.inputs.absolute_gradient,
-            sh_degree=splats.sh_degree if isinstance(splats, Splats) else 0,
-            sh_coefficients=0 if sh is None else sh.shape[1],
-            feature_count=_channels(splats.features),
-            widen=widen,
-            count=len(splats),
-            workspace=self.workspace.handle,
-            **{name: address(array) for name, array in self.arrays.items()},
-        )
-
     def draw(self, wants: dict[str, bool]) -> tuple[Tensor, ...]:
         """Run the forward pass; image, invdepth, alpha, features, radii, fragments per pixel."""
         view, n = self.inputs.view, len(self.inputs.splats)
@@ -143,11 +114,18 @@ class _Drawing:
             features=address(features),
             **{name: address(tensor) for name, tensor in self.found.items()},
         )
+        given = native_inputs(
+            self.inputs,
+            self.arrays,
+            widen=wants["thresholds"],
+            threads=native_threads(),
+            workspace=self.workspace.handle,
+        )
         error = binding.Error()
         handle = ctypes.c_void_p()
         keep = any(wants.values())
         status = self.library.calls.fragprune_forward(
-            ctypes.byref(self.fill(wants["thresholds"])),
+            ctypes.byref(given),
             ctypes.byref(outputs),
             ctypes.byref(handle) if keep else None,
             ctypes.byref(error),
@@ -185,7 +163,7 @@ class _Drawing:
             self.state.handle,
             ctypes.byref(output_grads),
             ctypes.byref(binding.InputGrads(**{k: address(g) for k, g in grads.items()})),
-            _threads(),
+            native_threads(),
             ctypes.byref(error),
         )
         if status != binding.OK:
@@ -266,6 +244,7 @@ class CpuEngine:
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
+        inputs.check_thresholds(thresholds)
         view, splats = inputs.view, inputs.splats
         others = {
             "hook": inputs.means2d_hook,
@@ -273,12 +252,7 @@ class CpuEngine:
             "background": view.background,
         }
         tensors = {name: others.get(name, getattr(splats, name, None)) for name in _NAMES}
-        constants = {k: getattr(view, k) for k in ("viewmatrix", "projmatrix", "campos")}
-        constants["sample_offsets"] = inputs.sample_offsets
-        read = {k: t for k, t in {**tensors, **constants}.items() if t is not None and k != "hook"}
-        arrays = {name: plain(tensor) for name, tensor in read.items()}
-        if isinstance(splats, Footprints):
-            arrays["tiles"] = plain(splats.tiles, dtype=torch.int32)
+        arrays = native_arrays(inputs, thresholds)
         drawing = _Drawing(inputs, self._library, self._workspace, arrays)
         outputs = _Rasterize.apply(  # type: ignore[no-untyped-call]
             drawing, *(tensors[name] for name in _NAMES)
@@ -304,8 +278,3 @@ class CpuEngine:
 
 def _channels(features: Tensor | None) -> int:
     return 0 if features is None else features.shape[1]
-
-
-def _threads() -> int:
-    """As many as torch uses; the C side takes no more than this."""
-    return min(torch.get_num_threads(), 1024)

@@ -104,8 +104,9 @@ class CudaEngine:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
 
         Raises:
-            InputError: the Gaussians are not on a GPU.
+            InputError: the Gaussians are not on a GPU, or thresholds are not one for each.
         """
+        inputs.check_thresholds(thresholds)
         self._on_device(inputs.splats)
         drawing = Drawing(self._device, inputs, thresholds)
         tensors = {

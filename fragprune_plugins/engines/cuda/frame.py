@@ -9,15 +9,16 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import torch
 
 from fragprune_plugins.constants import TILE
 from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.inputs import native_arrays, native_inputs
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.types import Compensation, Footprints, Splats
+from fragprune_plugins.types import Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -258,16 +259,7 @@ class Drawing:
         self._device, self._inputs, self._n = device, inputs, len(inputs.splats)
         self._where = inputs.splats.device
         view = inputs.view
-        given = {
-            **learnable(inputs),
-            **{name: getattr(view, name) for name in ("viewmatrix", "projmatrix", "campos")},
-            "sample_offsets": inputs.sample_offsets,
-            "thresholds": thresholds,
-            "hook": None,  # its values are not used
-        }
-        self._arrays = {k: plain(t, self._where) for k, t in given.items() if t is not None}
-        if isinstance(inputs.splats, Footprints):
-            self._arrays["tiles"] = plain(inputs.splats.tiles, self._where, torch.int32)
+        self._arrays = native_arrays(inputs, thresholds, self._where)
         offsets = self._arrays.get("sample_offsets")
         self._spread = None if offsets is None else offsets.abs().amax()
         self._across, self._down = -(-view.width // TILE), -(-view.height // TILE)
@@ -333,7 +325,7 @@ class Drawing:
         if passes % 2:
             values.reverse()
         frame = Frame(
-            inputs=self._c_inputs("thresholds" in wanted),
+            inputs=native_inputs(inputs, self._arrays, widen="thresholds" in wanted),
             outputs=self._new_outputs(),
             spread=address(self._spread),
             capacity=capacity,
@@ -421,29 +413,6 @@ class Drawing:
                 "Check the offsets.",
             )
         return entries
-
-    def _c_inputs(self, widen: bool) -> binding.Inputs:
-        inputs, view = self._inputs, self._inputs.view
-        sh = self._arrays.get("sh")
-        return binding.Inputs(
-            width=view.width,
-            height=view.height,
-            tan_fov_x=view.tan_fov_x,
-            tan_fov_y=view.tan_fov_y,
-            scale_modifier=inputs.scale_modifier,
-            dilation=inputs.dilation,
-            near=inputs.near,
-            alpha_max=inputs.alpha_max,
-            compensation=get_args(Compensation).index(inputs.compensation),
-            cap_gradient=inputs.cap_gradient,
-            absolute_gradient=inputs.absolute_gradient,
-            sh_degree=inputs.splats.sh_degree if isinstance(inputs.splats, Splats) else 0,
-            sh_coefficients=0 if sh is None else sh.shape[1],
-            feature_count=self._channels,
-            widen=widen,
-            count=self._n,
-            **{name: address(array) for name, array in self._arrays.items()},
-        )
 
     def _new_outputs(self) -> binding.Outputs:
         """Makes the output tensors; their addresses."""

@@ -283,6 +283,7 @@ class GraphdecoAdapter(HostAdapter):
         """The 12-tuple of ``capture``, fresh moments, and the thresholds of the PLY's sidecar."""
         import torch
 
+        from fragprune_plugins.learning.thresholds import ThresholdStore
         from fragprune_plugins.storage import sidecar
         from fragprune_plugins.storage.atomic import replacing
 
@@ -303,7 +304,7 @@ class GraphdecoAdapter(HostAdapter):
         )
         state: dict[str, Any] = optimizer.state_dict()
         if sidecar.lies_beside(ply):
-            state["fragprune"] = sidecar.load(ply)[0].state_dict()
+            state["fragprune"] = sidecar.load(ply, ThresholdStore(rows))[0].state_dict()
         capture = (
             m.sh_degree,
             parameters["xyz"],

@@ -4,6 +4,7 @@
 #include <chrono>
 #include <cmath>
 #include <cstdio>
+#include <initializer_list>
 #include <new>
 #include <optional>
 #include <stdexcept>
@@ -623,11 +624,63 @@ int fail(fragprune_error* error, int status, const char* message) {
   return status;
 }
 
-constexpr int kMostThreads = 1024, kMostCoefficients = 1024;
-constexpr const char* kTooManyThreads = "threads must be at most 1024";
+constexpr const char* kBadThreads = "threads must be 1 to 1024";
+constexpr const char* kBadCoefficients = "sh_coefficients must be 0 to 1024";
 constexpr const char* kBadCount = "count must be 0 to 2^31 - 1";
 constexpr const char* kOtherVersion = "structs of another version of fragprune.h";
 constexpr const char* kNotGiven = "a gradient of something that was not given";
+
+bool is_bad_thread_count(int32_t threads) { return threads < 1 || threads > FRAGPRUNE_THREADS_MAX; }
+
+bool is_bad_coefficient_count(int32_t count) {
+  return count < 0 || count > FRAGPRUNE_COEFFICIENTS_MAX;
+}
+
+// An array that went in: the numbers that it holds and those that will be read.
+struct Length {
+  const char* name;
+  const void* array;
+  int64_t held, read;
+};
+
+// Refuses where one holds other than what will be read; else FRAGPRUNE_OK.
+int check_lengths(std::initializer_list<Length> lengths, fragprune_error* error) {
+  for (const Length& each : lengths) {
+    const int64_t expected = each.array ? each.read : 0;
+    if (each.held == expected) continue;
+    char message[sizeof error->message];
+    std::snprintf(message, sizeof message, "%s holds %lld numbers where %lld are read", each.name,
+                  static_cast<long long>(each.held), static_cast<long long>(expected));
+    return fail(error, FRAGPRUNE_BAD_INPUT, message);
+  }
+  return FRAGPRUNE_OK;
+}
+
+#define FP_HELD(array, read) {#array, in.array, in.lengths.array, read}
+
+int check_lengths(const fragprune_inputs& in, fragprune_error* error) {
+  const int64_t n = in.count, pixels = int64_t{in.width} * in.height;
+  return check_lengths(
+      {FP_HELD(viewmatrix, 16), FP_HELD(projmatrix, 16), FP_HELD(campos, 3), FP_HELD(background, 3),
+       FP_HELD(means, 3 * n), FP_HELD(opacities, n), FP_HELD(scales, 3 * n),
+       FP_HELD(rotations, 4 * n), FP_HELD(cov3d, 6 * n), FP_HELD(sh, 3 * n * in.sh_coefficients),
+       FP_HELD(colors, 3 * n), FP_HELD(features, n * in.feature_count), FP_HELD(thresholds, n),
+       FP_HELD(sample_offsets, 2 * pixels), FP_HELD(means2d, 2 * n), FP_HELD(conics, 3 * n),
+       FP_HELD(depths, n), FP_HELD(tiles, 4 * n)},
+      error);
+}
+
+int check_lengths(const fragprune_spacetime& in, fragprune_error* error) {
+  const int64_t n = in.count;
+  return check_lengths(
+      {FP_HELD(campos, 3), FP_HELD(means, 3 * n), FP_HELD(opacities, n), FP_HELD(times, n),
+       FP_HELD(scales, 3 * n), FP_HELD(scales_t, n), FP_HELD(rotations, 4 * n),
+       FP_HELD(rotations_r, 4 * n), FP_HELD(cov3d, 6 * n),
+       FP_HELD(sh, 3 * n * in.sh_coefficients)},
+      error);
+}
+
+#undef FP_HELD
 
 const char* footprints_fault_of(const fragprune_inputs* in) {
   if (in->means || in->scales || in->rotations || in->cov3d || in->sh)
@@ -648,9 +701,8 @@ const char* splats_fault_of(const fragprune_inputs* in) {
     return "either scales and rotations or cov3d is needed";
   if (!in->sh == !in->colors) return "either sh or colors is needed";
   if (in->sh && (in->sh_degree < 0 || in->sh_degree > 3 ||
-                 in->sh_coefficients < (in->sh_degree + 1) * (in->sh_degree + 1) ||
-                 in->sh_coefficients > kMostCoefficients))
-    return "sh_degree must be 0 to 3, sh_coefficients (sh_degree + 1)^2 to 1024";
+                 in->sh_coefficients < (in->sh_degree + 1) * (in->sh_degree + 1)))
+    return "sh_degree must be 0 to 3, sh_coefficients (sh_degree + 1)^2 or more";
   if (!in->features != !in->feature_count) return "features and feature_count do not agree";
   return nullptr;
 }
@@ -661,7 +713,8 @@ const char* fault_of(const fragprune_inputs* in, const fragprune_outputs* out) {
   if (in->width < 1 || in->height < 1 || in->width > 1 << 16 || in->height > 1 << 16)
     return "width and height must be 1 to 65536 pixels";
   if (in->count < 0 || in->count > INT32_MAX) return kBadCount;
-  if (in->threads > kMostThreads) return kTooManyThreads;
+  if (is_bad_thread_count(in->threads)) return kBadThreads;
+  if (is_bad_coefficient_count(in->sh_coefficients)) return kBadCoefficients;
   if (!in->background) return "background is needed";
   if (!out->image || (in->count && !out->radii)) return "image and radii are needed";
   if (!(in->near >= 0)) return "near must be 0 or more";
@@ -709,7 +762,8 @@ const char* slice_fault_of(const fragprune_spacetime* in, const fragprune_sliced
   if (!in || in->size != sizeof *in || !sliced || sliced->size != sizeof *sliced)
     return kOtherVersion;
   if (in->count < 0 || in->count > INT32_MAX) return kBadCount;
-  if (in->threads > kMostThreads) return kTooManyThreads;
+  if (is_bad_thread_count(in->threads)) return kBadThreads;
+  if (is_bad_coefficient_count(in->sh_coefficients)) return kBadCoefficients;
   if (!in->campos) return "campos is needed";
   if (in->count == 0) return nullptr;
   if (!in->means || !in->opacities) return "means and opacities are needed";
@@ -721,8 +775,8 @@ const char* slice_fault_of(const fragprune_spacetime* in, const fragprune_sliced
     return "sh_degree must be 0 to 3, sh_degree_t -1 to 2";
   const int orders = in->sh_degree == 3 ? std::max(in->sh_degree_t, 0) : 0;
   const int terms = (in->sh_degree + 1) * (in->sh_degree + 1);
-  if (in->sh_coefficients < terms + kBands * orders || in->sh_coefficients > kMostCoefficients)
-    return "sh_coefficients must be what the degrees take, to 1024";
+  if (in->sh_coefficients < terms + kBands * orders)
+    return "sh_coefficients must be what the degrees take, or more";
   if (orders && (!in->times || !(in->duration > 0)))
     return "cosines in use need times and a duration above 0";
   return nullptr;
@@ -763,6 +817,7 @@ int fragprune_forward(const fragprune_inputs* inputs, fragprune_outputs* outputs
   if (state) *state = nullptr;
   if (const char* fault = fp::fault_of(inputs, outputs))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fault);
+  if (const int status = fp::check_lengths(*inputs, error)) return status;
   const float spread = fp::spread_of(*inputs);
   if (!(spread >= 0))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, "sample_offsets must be at most 10^6 pixels");
@@ -784,8 +839,8 @@ int fragprune_backward(const fragprune_state* state, const fragprune_output_grad
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kOtherVersion);
   if (input_grads->thresholds && !(state->in.thresholds && state->in.widen))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, "the forward pass did not widen for thresholds");
-  if (threads > fp::kMostThreads)
-    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kTooManyThreads);
+  if (fp::is_bad_thread_count(threads))
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kBadThreads);
   if (fp::wants_absent(state->in, *input_grads))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kNotGiven);
   return fp::guarded(error, [&] { fp::backward(*state, *output_grads, *input_grads, threads); });
@@ -797,6 +852,7 @@ int fragprune_slice(const fragprune_spacetime* inputs, const fragprune_sliced* o
                     fragprune_error* error) {
   if (const char* fault = fp::slice_fault_of(inputs, outputs))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fault);
+  if (const int status = fp::check_lengths(*inputs, error)) return status;
   if (inputs->count && (!outputs->means || !outputs->cov3d || !outputs->opacities ||
                         !inputs->sh != !outputs->colors))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT,
@@ -814,6 +870,7 @@ int fragprune_unslice(const fragprune_spacetime* inputs, const fragprune_sliced*
                       const fragprune_spacetime_grads* input_grads, fragprune_error* error) {
   if (const char* fault = fp::slice_fault_of(inputs, output_grads))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fault);
+  if (const int status = fp::check_lengths(*inputs, error)) return status;
   if (!input_grads || input_grads->size != sizeof *input_grads)
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kOtherVersion);
   if (fp::wants_absent(*inputs, *input_grads))

@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 4
+#define FRAGPRUNE_API_VERSION 5
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
@@ -23,6 +23,8 @@
 #define FRAGPRUNE_ANTIALIASING_FLOOR 2.5e-5
 #define FRAGPRUNE_MIP_FLOOR 1e-6
 #define FRAGPRUNE_FEATURES_MAX 8
+#define FRAGPRUNE_COEFFICIENTS_MAX 1024
+#define FRAGPRUNE_THREADS_MAX 1024
 #define FRAGPRUNE_RIM_WIDTH 0.01
 #define FRAGPRUNE_RIM_REACH 4.6
 #define FRAGPRUNE_FALLOFF_MIN 1e-4
@@ -63,13 +65,40 @@ typedef struct fragprune_error {
 
 typedef struct fragprune_workspace fragprune_workspace;
 
+/* How many numbers each input array holds, by its name in fragprune_inputs or fragprune_spacetime; 0
+ * for NULL. A call is refused, and nothing read, where one holds more or fewer than the shape that is
+ * named there takes. */
+typedef struct fragprune_lengths {
+  int64_t viewmatrix;
+  int64_t projmatrix;
+  int64_t campos;
+  int64_t background;
+  int64_t means;
+  int64_t opacities;
+  int64_t scales;
+  int64_t rotations;
+  int64_t cov3d;
+  int64_t sh;
+  int64_t colors;
+  int64_t features;
+  int64_t thresholds;
+  int64_t sample_offsets;
+  int64_t means2d;
+  int64_t conics;
+  int64_t depths;
+  int64_t tiles;
+  int64_t times;
+  int64_t scales_t;
+  int64_t rotations_r;
+} fragprune_lengths;
+
 /* N Gaussians are given in the world (means, scales and rotations or cov3d, sh or colors) or, when
  * means2d is not NULL, on the image (means2d, conics, depths, tiles, colors): then neither the camera
  * nor what belongs to projection is read, and one draws nothing that has no tiles, a depth that is not
  * positive or a conic that is not positive definite. */
 typedef struct fragprune_inputs {
   uint32_t size;           /* sizeof(fragprune_inputs) */
-  int32_t threads;         /* at most 1024; results do not depend on it */
+  int32_t threads;         /* 1 to 1024; results do not depend on it */
   int32_t width;           /* pixels */
   int32_t height;          /* pixels */
   float tan_fov_x;         /* tangent of half the field of view */
@@ -82,10 +111,11 @@ typedef struct fragprune_inputs {
   int32_t cap_gradient;    /* the gradient passes through the cap; else it is 0 where capped */
   int32_t absolute_gradient; /* fill the hook's third column, see fragprune_input_grads */
   int32_t sh_degree;       /* 0 to 3 */
-  int32_t sh_coefficients; /* K, the second dimension of sh; at most 1024 */
+  int32_t sh_coefficients; /* K, the second dimension of sh; 0 to 1024 */
   int32_t feature_count;   /* F, 0 to 8 */
   int32_t widen;           /* keep rim fragments: thresholds will want a gradient */
   int64_t count;           /* N */
+  fragprune_lengths lengths;
   const float *viewmatrix; /* (4, 4) */
   const float *projmatrix; /* (4, 4) */
   const float *campos;     /* (3) */
@@ -179,15 +209,16 @@ FRAGPRUNE_EXPORT void fragprune_free(fragprune_state *state); /* NULL is fine */
  *   with rotations_r as well   with axes anywhere in space and time, turned by both quaternions */
 typedef struct fragprune_spacetime {
   uint32_t size;
-  int32_t threads;         /* at most 1024; results do not depend on it */
+  int32_t threads;         /* 1 to 1024; results do not depend on it */
   float timestamp;         /* the moment */
   float duration;          /* of the cosines' longest period; above 0 */
   float prefilter_var;     /* when positive, added to the variance in time that the marginal sees */
   float scale_modifier;    /* factor on scales and scales_t */
   int32_t sh_degree;       /* 0 to 3 */
   int32_t sh_degree_t;     /* cosines in use at sh_degree 3, 0 to 2; -1: colours know no time */
-  int32_t sh_coefficients; /* K: (sh_degree + 1)^2 or more, and 16 more for each cosine; at most 1024 */
+  int32_t sh_coefficients; /* K: (sh_degree + 1)^2 or more, and 16 more for each cosine; to 1024 */
   int64_t count;           /* N */
+  fragprune_lengths lengths;
   const float *campos;     /* (3) */
   const float *means;      /* (N, 3) */
   const float *opacities;  /* (N) */

@@ -38,7 +38,7 @@ calls::Scene scene_of(calls::Source& from) {
   in.width = 1 + shape % 48;
   in.height = 1 + shape / 48 % 48;
   in.count = shape / (48 * 48) % 33;
-  in.threads = static_cast<int>(options % 7) - 1;
+  in.threads = 1 + static_cast<int>(options % 5);
   in.compensation = static_cast<int>((options >> 12 & 3) % 3);
   in.cap_gradient = options >> 14 & 1;
   in.absolute_gradient = options >> 15 & 1;

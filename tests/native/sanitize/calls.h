@@ -10,6 +10,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <initializer_list>
 #include <limits>
 #include <memory>
 #include <utility>
@@ -101,6 +102,7 @@ class Array {
   }
   T* get() const { return data_.get(); }
   size_t size() const { return data_ ? size_ : 0; }
+  int64_t length() const { return static_cast<int64_t>(size()); }
   T& operator[](size_t i) const { return data_[i]; }
   bool written() const {
     T pattern;
@@ -154,6 +156,15 @@ struct Scene {
     in.features = features.get(), in.sample_offsets = offsets.get();
     in.means2d = means2d.get(), in.conics = conics.get();
     in.depths = depths.get(), in.tiles = tiles.get();
+    fragprune_lengths& held = in.lengths;
+    held.viewmatrix = viewmatrix.length(), held.projmatrix = projmatrix.length();
+    held.campos = campos.length(), held.background = background.length();
+    held.means = means.length(), held.opacities = opacities.length();
+    held.scales = scales.length(), held.rotations = rotations.length();
+    held.cov3d = cov3d.length(), held.sh = sh.length(), held.colors = colors.length();
+    held.features = features.length(), held.thresholds = thresholds.length();
+    held.sample_offsets = offsets.length(), held.means2d = means2d.length();
+    held.conics = conics.length(), held.depths = depths.length(), held.tiles = tiles.length();
   }
 };
 
@@ -302,7 +313,7 @@ inline Scene make_scene(Source& from, Limits limits) {
   Scene s;
   fragprune_inputs& in = s.in;
   in.size = sizeof in;
-  in.threads = from.one_in(8) ? from.below(20) - 2 : 1 + from.below(4);
+  in.threads = 1 + from.below(from.one_in(8) ? 18 : 4);
   in.width = from.one_in(5) ? 1 : 1 + from.below(limits.pixels);
   in.height = from.one_in(5) ? 16 : 1 + from.below(limits.pixels);
   const bool strip = from.one_in(80);  // as long as an image may be
@@ -506,11 +517,26 @@ struct Tally {
   }
 };
 
+// Says that one of the arrays holds more or less than it does.
+inline void misstate(std::initializer_list<int64_t*> held, Source& from) {
+  int64_t& one = **(held.begin() + from.next() % held.size());
+  one += from.one_in(2) ? -1 - from.below(9) : int64_t{1} << from.below(62);
+}
+
+inline void misstate(fragprune_lengths& held, Source& from) {
+  misstate({&held.viewmatrix, &held.projmatrix, &held.campos,         &held.background,
+            &held.means,      &held.opacities,  &held.scales,         &held.rotations,
+            &held.cov3d,      &held.sh,         &held.colors,         &held.features,
+            &held.thresholds, &held.means2d,    &held.sample_offsets, &held.conics,
+            &held.depths,     &held.tiles},
+           from);
+}
+
 // Breaks the contract in one way; the call must be refused before anything is read or written.
 inline void try_illegal(const Scene& s, Source& from, Tally& tally) {
   Picture p = make_picture(s, 0);
   fragprune_inputs in = s.in;
-  switch (from.below(20)) {
+  switch (from.below(24)) {
     case 0: in.size--; break;
     case 1: p.out.size = 0; break;
     case 2: in.width = -from.below(3); break;
@@ -526,7 +552,9 @@ inline void try_illegal(const Scene& s, Source& from, Tally& tally) {
     case 12: in.alpha_max = 0; break;
     case 13: in.compensation = from.one_in(2) ? 3 : -1; break;
     case 14: in.feature_count = from.one_in(2) ? FRAGPRUNE_FEATURES_MAX + 1 : -1; break;
-    case 15: in.threads = 1025 + from.below(1 << 30); break;
+    case 15: in.threads = from.one_in(2) ? -from.below(3) : 1025 + from.below(1 << 30); break;
+    case 16: in.sh_coefficients = from.one_in(2) ? -1 - from.below(3) : 1025; break;
+    case 17: case 18: case 19: misstate(in.lengths, from); break;
     default:
       if (in.means2d)
         in.means = in.means2d;
@@ -543,11 +571,15 @@ inline void try_illegal(const Scene& s, Source& from, Tally& tally) {
     in = s.in;
     fragprune_outputs out = make_picture(s, 0).out;
     float wild[2] = {0.f, from.one_in(2) ? 2e6f : std::nanf("")};
-    const int choice = from.below(8);
+    const int choice = from.below(9);
     if (choice == 0) in.opacities = nullptr;
     if (choice == 1) in.feature_count = 0, in.features = in.opacities;
     if (choice == 2) in.feature_count = 1, in.features = nullptr, out.features = nullptr;
     if (choice == 3) in.width = in.height = 1, in.sample_offsets = wild;
+    if (choice == 3) in.lengths.sample_offsets = 2;
+    Floats fewer;  // in truth, so that reading on is seen
+    fewer.make(s.count() - 1);
+    if (choice == 8) in.thresholds = fewer.get(), in.lengths.thresholds = fewer.length();
     if (in.means2d) {
       if (choice == 4) in.conics = nullptr;
       if (choice == 5) in.depths = nullptr;
@@ -583,7 +615,9 @@ inline void try_illegal_backward(const Scene& s, const fragprune_state* state, T
   CALLS_CHECK(fragprune_backward(state, &loss.grads, &g.to, 1, &error) == FRAGPRUNE_BAD_INPUT);
   CALLS_CHECK(error.message[0]);
   g = make_gradients(s, ~0);
-  CALLS_CHECK(fragprune_backward(state, &loss.grads, &g.to, 1025, &error) == FRAGPRUNE_BAD_INPUT);
+  for (const int32_t threads : {-1, 0, 1025})
+    CALLS_CHECK(fragprune_backward(state, &loss.grads, &g.to, threads, &error) ==
+                FRAGPRUNE_BAD_INPUT);
   g.to.size++;
   CALLS_CHECK(fragprune_backward(state, &loss.grads, &g.to, 1, nullptr) == FRAGPRUNE_BAD_INPUT);
   tally.refused++;

@@ -18,6 +18,12 @@ struct Recording {
     in.times = times.get(), in.scales = scales.get(), in.scales_t = scales_t.get();
     in.rotations = rotations.get(), in.rotations_r = rotations_r.get();
     in.cov3d = cov3d.get(), in.sh = sh.get();
+    fragprune_lengths& held = in.lengths;
+    held.campos = campos.length(), held.means = means.length();
+    held.opacities = opacities.length(), held.times = times.length();
+    held.scales = scales.length(), held.scales_t = scales_t.length();
+    held.rotations = rotations.length(), held.rotations_r = rotations_r.length();
+    held.cov3d = cov3d.length(), held.sh = sh.length();
   }
 };
 
@@ -123,26 +129,34 @@ inline RecordingGradients differentiate(Recording& r, const Cut& by, int absent,
   return g;
 }
 
+inline void misstate_cut(fragprune_lengths& held, Source& from) {
+  misstate({&held.campos, &held.means, &held.opacities, &held.times, &held.scales, &held.scales_t,
+            &held.rotations, &held.rotations_r, &held.cov3d, &held.sh},
+           from);
+}
+
 inline void try_illegal_cut(const Recording& r, Source& from, Tally& tally) {
   fragprune_spacetime in = r.in;
   Cut c = make_cut(r);
   const float some[3] = {};
-  switch (from.below(in.count ? 16 : 6)) {
+  switch (from.below(in.count ? 18 : 8)) {
     case 0: in.size--; break;
     case 1: c.out.size = 0; break;
     case 2: in.count = -1 - from.below(3); break;
     case 3: in.count = int64_t{INT32_MAX} + 1; break;
-    case 4: in.threads = 1025 + from.below(1 << 30); break;
+    case 4: in.threads = from.one_in(2) ? -from.below(3) : 1025 + from.below(1 << 30); break;
     case 5: in.campos = nullptr; break;
-    case 6: in.means = nullptr; break;
-    case 7: in.opacities = nullptr; break;
-    case 8: in.cov3d = in.scales = nullptr; break;
-    case 9: in.cov3d = in.scales = some; break;
-    case 10: c.out.present = nullptr; break;
-    case 11: c.out.cov3d = nullptr; break;
-    case 12: in.sh = in.sh ? nullptr : some; break;  // colours without, or none with
-    case 13: in.sh = some, in.sh_degree = from.one_in(2) ? INT32_MAX : -1; break;
-    case 14: in.sh = some, in.sh_degree_t = from.one_in(2) ? 3 : -2; break;
+    case 6: in.sh_coefficients = from.one_in(2) ? 1025 : -1; break;
+    case 7: misstate_cut(in.lengths, from); break;
+    case 8: in.means = nullptr; break;
+    case 9: in.opacities = nullptr; break;
+    case 10: in.cov3d = in.scales = nullptr; break;
+    case 11: in.cov3d = in.scales = some; break;
+    case 12: c.out.present = nullptr; break;
+    case 13: c.out.cov3d = nullptr; break;
+    case 14: in.sh = in.sh ? nullptr : some; break;  // colours without, or none with
+    case 15: in.sh = some, in.sh_degree = from.one_in(2) ? INT32_MAX : -1; break;
+    case 16: in.sh = some, in.sh_degree_t = from.one_in(2) ? 3 : -2; break;
     default: in.sh = some, in.sh_coefficients = from.one_in(2) ? 1025 : 0;
   }
   fragprune_error error;

@@ -1,0 +1,94 @@
+"""One rasterization as compiled code takes it, on a CPU and on a GPU alike: arrays and a struct."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, get_args
+
+import torch
+
+from fragprune_plugins.constants import THREADS_MAX
+from fragprune_plugins.engines.arrays import address, plain
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.types import Compensation, Splats
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.types import RasterInputs
+
+_COMPENSATIONS: Final = get_args(Compensation)
+"""In the order of enum fragprune_compensation."""
+
+
+def native_arrays(
+    inputs: RasterInputs, thresholds: Tensor | None, where: torch.device | str = "cpu"
+) -> dict[str, Tensor]:
+    """The tensors that are read, by their names in fragprune_inputs, as ``plain`` gives them.
+
+    Args:
+        inputs: what is drawn; the values of ``means2d_hook`` are not used.
+        thresholds: (N,) or None, as ``inputs.check_thresholds`` lets pass.
+        where: the device that reads them.
+    """
+    given = vars(inputs.view) | vars(inputs.splats) | vars(inputs) | {"thresholds": thresholds}
+    return {
+        name: plain(given[name], where, torch.int32 if name == "tiles" else torch.float32)
+        for name in binding.ARRAYS
+        if given.get(name) is not None
+    }
+
+
+def native_inputs(
+    inputs: RasterInputs,
+    arrays: dict[str, Tensor],
+    *,
+    widen: bool,
+    threads: int = 1,
+    workspace: int | None = None,
+) -> binding.Inputs:
+    """fragprune_inputs; it points into the arrays, which must outlive it.
+
+    Args:
+        inputs: what is drawn; ``counts`` and ``scores`` say what comes back, not what goes in.
+        arrays: as ``native_arrays`` gives them.
+        widen: thresholds will want a gradient.
+        threads: of the cpu engine.
+        workspace: of the cpu engine.
+    """
+    view, splats = inputs.view, inputs.splats
+    return binding.Inputs(
+        threads=threads,
+        width=view.width,
+        height=view.height,
+        tan_fov_x=view.tan_fov_x,
+        tan_fov_y=view.tan_fov_y,
+        scale_modifier=inputs.scale_modifier,
+        dilation=inputs.dilation,
+        near=inputs.near,
+        alpha_max=inputs.alpha_max,
+        compensation=_COMPENSATIONS.index(inputs.compensation),
+        cap_gradient=inputs.cap_gradient,
+        absolute_gradient=inputs.absolute_gradient,
+        sh_degree=splats.sh_degree if isinstance(splats, Splats) else 0,
+        sh_coefficients=_second_length(arrays.get("sh")),
+        feature_count=_second_length(arrays.get("features")),
+        widen=widen,
+        count=len(splats),
+        lengths=native_lengths(arrays),
+        workspace=workspace,
+        **{name: address(array) for name, array in arrays.items()},
+    )
+
+
+def native_lengths(arrays: dict[str, Tensor]) -> binding.Lengths:
+    """fragprune_lengths of arrays by name."""
+    return binding.Lengths(**{name: array.numel() for name, array in arrays.items()})
+
+
+def native_threads() -> int:
+    """As many as torch uses; the C side takes no more than the bound."""
+    return min(torch.get_num_threads(), THREADS_MAX)
+
+
+def _second_length(array: Tensor | None) -> int:
+    return 0 if array is None else array.shape[1]

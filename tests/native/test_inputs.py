@@ -1,0 +1,204 @@
+"""What goes into compiled code: every field arrives, and no array is read beyond its end."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import Field, fields, replace
+from typing import Any
+
+import pytest
+import spacetime
+import torch
+from footprints import footprints_of
+
+from fragprune_plugins.engines.arrays import address
+from fragprune_plugins.engines.cpu import CpuEngine, binding
+from fragprune_plugins.engines.inputs import native_arrays, native_inputs
+from fragprune_plugins.engines.slicing import slice_by
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.testing import scenes
+from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
+
+N = 20
+WORLD = scenes.random_scene(0, N, features=2)
+GIVEN = {
+    "world": WORLD,
+    "colours and covariances": scenes.random_scene(0, N, cov3d=True, colors=True),
+    "offsets": scenes.random_scene(0, N, offsets=True),
+    "image": footprints_of(WORLD),
+}
+THRESHOLDS = scenes.random_thresholds(0, N)
+
+NO_INPUTS = {"view", "splats", "means2d_hook", "counts", "scores"}
+"""Fields that hold others, whose values are not used, or that say what comes back."""
+
+
+def values(inputs: RasterInputs, thresholds: torch.Tensor | None = THRESHOLDS) -> dict[str, Any]:
+    """What the struct says, and what is where it points."""
+    arrays = native_arrays(inputs, thresholds)
+    struct = native_inputs(inputs, arrays, widen=False)
+    found: dict[str, Any] = {}
+    for name, kind in binding.Inputs._fields_:
+        if name in binding.ARRAYS:
+            array = arrays.get(name)
+            assert getattr(struct, name) == address(array)
+            assert getattr(struct.lengths, name) == (0 if array is None else array.numel())
+            found[name] = None if array is None else array.tolist()
+        elif kind is not binding.Lengths:
+            found[name] = getattr(struct, name)
+    return found
+
+
+def other(name: str, value: Any) -> Any:
+    """A value that differs."""
+    if name == "compensation":
+        return "mip"
+    if isinstance(value, bool):
+        return not value
+    return value / 2 if isinstance(value, float) else value + 1
+
+
+def owned(inputs: RasterInputs) -> list[tuple[str, Field]]:
+    """Fields of a rasterization and of what it holds, by the owner's name; those that are given."""
+    owners = {"": inputs, "view": inputs.view, "splats": inputs.splats}
+    return [
+        (place, field)
+        for place, owner in owners.items()
+        for field in fields(owner)
+        if field.name not in NO_INPUTS and getattr(owner, field.name) is not None
+    ]
+
+
+CHANGES = [
+    pytest.param(kind, place, field.name, id=f"{kind}: {field.name}")
+    for kind, inputs in GIVEN.items()
+    for place, field in owned(inputs)
+    if not (kind == "offsets" and field.name in ("width", "height"))  # are as many as pixels
+]
+
+
+@pytest.mark.parametrize(("kind", "place", "name"), CHANGES)
+def test_every_field_reaches_compiled_code(kind: str, place: str, name: str) -> None:
+    """A new field fails here until engines/inputs.py hands it on, or ``NO_INPUTS`` says why not."""
+    inputs = GIVEN[kind]
+    owner = getattr(inputs, place) if place else inputs
+    changed = replace(owner, **{name: other(name, getattr(owner, name))})
+    assert values(replace(inputs, **{place: changed}) if place else changed) != values(inputs)
+
+
+@pytest.mark.parametrize("owner", [View, Splats, Footprints, RasterInputs])
+def test_no_field_is_left_out_above(owner: type) -> None:
+    tried = {
+        field.name
+        for inputs in GIVEN.values()
+        for place, field in owned(inputs)
+        if isinstance(getattr(inputs, place) if place else inputs, owner)
+    }
+    assert tried == {field.name for field in fields(owner)} - NO_INPUTS
+
+
+def test_thresholds_reach_compiled_code() -> None:
+    assert values(WORLD)["thresholds"] == THRESHOLDS.tolist()
+    assert values(WORLD, None)["thresholds"] is None
+
+
+def test_a_struct_has_no_fields_that_c_does_not_know() -> None:
+    with pytest.raises(TypeError, match="gamma"):
+        binding.Inputs(width=3, gamma=2.2)
+
+
+def draw(library: binding.Library, inputs: binding.Inputs) -> tuple[int, str]:
+    """Status and message of a forward pass."""
+    image, radii = torch.empty(3, inputs.height, inputs.width), torch.empty(N, dtype=torch.int32)
+    outputs = binding.Outputs(image=address(image), radii=address(radii))
+    error = binding.Error()
+    status = library.calls.fragprune_forward(
+        ctypes.byref(inputs), ctypes.byref(outputs), None, ctypes.byref(error)
+    )
+    return status, error.message.decode()
+
+
+@pytest.fixture(params=binding.usable_builds(), scope="module")
+def library(request: pytest.FixtureRequest) -> binding.Library:
+    return binding.open_build(request.param)
+
+
+@pytest.mark.parametrize("kind", GIVEN)
+def test_an_array_of_another_length_is_refused_by_its_name(
+    library: binding.Library, kind: str
+) -> None:
+    inputs = GIVEN[kind]
+    arrays = native_arrays(inputs, THRESHOLDS)
+    assert draw(library, native_inputs(inputs, arrays, widen=False)) == (binding.OK, "")
+    for name in dict(binding.Inputs._fields_).keys() & set(binding.ARRAYS):
+        for more in (-1, 1, 2**62):
+            given = native_inputs(inputs, arrays, widen=False)
+            held = getattr(given.lengths, name)
+            setattr(given.lengths, name, held + more)
+            status, message = draw(library, given)
+            assert status != binding.OK
+            assert message.startswith(f"{name} holds {held + more} numbers where {held} are read")
+
+
+class Doubting:
+    """Cuts as the cpu engine does, once it has been refused with each array said to be shorter."""
+
+    where = torch.device("cpu")
+
+    def __init__(self, library: binding.Library) -> None:
+        self.calls, self.refused = library.calls, 0
+
+    def empty(self, *shape: int) -> torch.Tensor:
+        return torch.empty(shape)
+
+    def slice(self, *structs: ctypes.Structure) -> None:
+        self.call(self.calls.fragprune_slice, *structs)
+
+    def unslice(self, *structs: ctypes.Structure) -> None:
+        self.call(self.calls.fragprune_unslice, *structs)
+
+    def call(self, function: Any, given: binding.Spacetime, *more: ctypes.Structure) -> None:
+        error = binding.Error()
+        structs = [ctypes.byref(struct) for struct in (given, *more, error)]
+        for name in dict(binding.Spacetime._fields_).keys() & set(binding.ARRAYS):
+            held = getattr(given.lengths, name)
+            setattr(given.lengths, name, held - 1)
+            assert function(*structs) != binding.OK
+            assert error.message.decode().startswith(f"{name} holds {held - 1} numbers")
+            setattr(given.lengths, name, held)
+            self.refused += 1
+        assert function(*structs) == binding.OK
+
+
+def test_a_cut_of_arrays_of_another_length_is_refused_by_name(library: binding.Library) -> None:
+    blade = Doubting(library)
+    splats = spacetime.leaves(spacetime.splats("joint", N), torch.float32)
+    slice_by(blade, splats, spacetime.moment()).means.sum().backward()
+    assert blade.refused == 2 * 10  # there and back
+
+
+@pytest.mark.parametrize("counts", [{"threads": 0}, {"threads": -5}, {"threads": 1025}])
+def test_absurd_counts_of_threads_are_refused(library: binding.Library, counts: dict) -> None:
+    given = native_inputs(WORLD, native_arrays(WORLD, None), widen=False, **counts)
+    status, message = draw(library, given)
+    assert status != binding.OK
+    assert message == "threads must be 1 to 1024"
+
+
+@pytest.mark.parametrize("coefficients", [-1, 1025, 2**31 - 1])
+def test_absurd_counts_of_coefficients_are_refused(
+    library: binding.Library, coefficients: int
+) -> None:
+    given = native_inputs(WORLD, native_arrays(WORLD, None), widen=False)
+    given.sh_coefficients = coefficients
+    status, message = draw(library, given)
+    assert status != binding.OK
+    assert message == "sh_coefficients must be 0 to 1024"
+
+
+def test_memory_resized_behind_the_checks_is_not_read(engine: CpuEngine) -> None:
+    """Values are checked when they are made; a tensor can be changed in place afterwards."""
+    inputs = scenes.random_scene(0, N)
+    inputs.splats.opacities.resize_(3)
+    with pytest.raises(EngineError, match=f"opacities holds 3 numbers where {N} are read"):
+        engine.rasterize(inputs, None)
