@@ -25,7 +25,7 @@ def drop_invisible(
 ) -> tuple[SplatFile, ThresholdStore]:
     """A model and its thresholds without the rows that are not ``visible``; both stay as they were.
 
-    Thresholds keep their moments.
+    Thresholds keep their moments. It goes by what the store holds, whatever plugins answer.
 
     Raises:
         InputError: none is visible.
