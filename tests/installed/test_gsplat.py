@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from fragprune_gsplat import Gsplat
 from fragprune_plugins.cli import cli
-from fragprune_plugins.errors import InputError, SessionError, UsageError
+from fragprune_plugins.errors import InputError, SessionError, SidecarError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.storage import sidecar
