@@ -108,6 +108,12 @@ class RecordError(FragpruneError):
     code = "record"
 
 
+class NotComparedError(FragpruneError):
+    """Before and after of a host's run cannot be measured on views that it held out."""
+
+    code = "not-compared"
+
+
 class UsageError(FragpruneError):
     """Options that contradict each other; exit code 2."""
 

@@ -18,11 +18,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 from unittest import mock
 
-from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
-from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter
+from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.errors import FragpruneError, Interrupted, NotComparedError, UsageError
+from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter, read_config
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings
@@ -81,14 +82,16 @@ class RunSummary:
         fragments_after: per pixel over training views, at each view's last visit.
         model_before: the host's PLY of stage 1, when there is one.
         model_after: the host's PLY after stage 2; its sidecar lies beside it.
+        output: the host's folder, that of stage 1 where stage 2 has another.
         train_seconds: wall time of both stages.
         target_reached: whether a target speed-up was met within 5% on training views; None
             without a target.
         curves: a dict per learned step: step, loss, fragments_per_pixel, pressure,
             threshold_median.
         settings: of the fine-tuning.
-        drawing: fields of ``RasterInputs`` by which the host draws its model; None where its
-            command leaves no view out, or our readers do not draw what the host does.
+        photographs: by whose held-out views both models can be measured; None where they cannot.
+        drawing: fields of ``RasterInputs`` by which the host draws its models.
+        not_compared: why they cannot, where something was learned.
     """
 
     adapter: str
@@ -105,7 +108,10 @@ class RunSummary:
     target_reached: bool | None
     curves: list[dict[str, float]]
     settings: dict[str, Any]
-    drawing: dict[str, Any] | None = None
+    output: Path | None = None
+    photographs: Photographs | None = None
+    drawing: dict[str, Any] = field(default_factory=dict)
+    not_compared: NotComparedError | None = None
 
 
 @dataclass(frozen=True)
@@ -200,6 +206,7 @@ class _Runner:
         self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
         self.options, self.device, self.scratch = options, device, scratch
         self.output = Path(host.flags.output) if host.flags.output else None
+        self.around: Path | None = None  # of stage 1, where stage 2 has a folder of its own
         self.trained: int | None = None  # iterations of stage 1, once it is over
         self.before: Path | None = None
         self.after: Path | None = None
@@ -268,8 +275,10 @@ class _Runner:
             total = start + settings.iterations + self.host.line.skipped
             log.info("stage 2: %d iterations from %s", settings.iterations, checkpoint)
             extra = {"iterations": total, "resume": str(checkpoint)}
-            if self.host.line.restarts and self.output is not None:
-                self.output = self.output / "finetuned"
+            own = "finetuned" if self.host.line.restarts else ""
+            own = own if settings.truncate else "control"  # what was learned stays where it is
+            if own and self.output is not None:
+                self.around, self.output = self.output, self.output / own
             if self.output is not None and str(self.output) != self.host.flags.output:
                 extra["output"] = str(self.output)
             self._execute(self._saving(total, **extra), learn=True, start=start)
@@ -330,6 +339,7 @@ class _Runner:
             engine=self.options.engine,
             drop_in=True if self.device == "cpu" else None,
             output=self.output,
+            origin=self.around,
         )
         known = set(sys.modules)
         try:
@@ -369,6 +379,7 @@ class _Runner:
     def summary(self, seconds: float) -> RunSummary:
         """Everything the command line prints."""
         learned = self.learned
+        photographs, drawing, not_compared = self._comparison()
         return RunSummary(
             adapter=self.adapter.name,
             engine=learned.engine if learned else "",
@@ -384,8 +395,28 @@ class _Runner:
             target_reached=learned.target_reached if learned else None,
             curves=self.curves,
             settings=self.options.settings.as_dict(),
-            drawing=self.adapter.drawing(self.repo, self.host.arguments),
+            output=self.around or self.output,
+            photographs=photographs,
+            drawing=drawing,
+            not_compared=not_compared,
         )
+
+    def _comparison(self) -> tuple[Photographs | None, dict[str, Any], NotComparedError | None]:
+        """By which views and how before and after are drawn, or why they cannot be."""
+        if not self.learned:
+            return None, {}, None
+        try:
+            if not (self.before and self.after):
+                raise NotComparedError(
+                    f"--stage {self.options.stage}",
+                    f"no model of {'before' if self.after else 'after'} the learning",
+                    "one that the host saved",
+                    "Name two models to fragprune compare.",
+                )
+            drawing = self.adapter.drawing(self.repo, self.host.arguments)
+            return self.adapter.photographs(self.repo, self.host.arguments), drawing, None
+        except NotComparedError as error:
+            return None, {}, error
 
     def _iteration_of(self, resumed: Path) -> int:
         """The iteration that a run from this file goes on after."""
@@ -471,42 +502,9 @@ def _script_of(module: str) -> Path:
     return script
 
 
-class _Flags(argparse.ArgumentParser):
-    """Says what is wrong with a flag as we say everything."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(
-            "the host's command", message, "flags the host understands", "Correct the command."
-        )
-
-
 def _parse(script: Path, arguments: list[str], line: CommandLine, module: str = "") -> _Invocation:
     """Read the few flags we need; the host parses them all itself."""
-    parser = _Flags(add_help=False)
-    parser.add_argument(*line.spellings("iterations"), dest="iterations", type=int)
-    parser.add_argument(*line.output, dest="output")
-    parser.add_argument(*line.source, dest="source")
-    parser.add_argument(line.save_checkpoints, dest="save_checkpoints", type=int, nargs="*")
-    parser.add_argument(*line.spellings("resume"), dest="resume")
-    if line.config:
-        parser.add_argument(line.config.flag, dest="config", type=Path)
-    flags, _ = parser.parse_known_args(arguments)
-    if line.config and flags.config:
-        values = read_config(line.config, flags.config)
-        for name in set(vars(flags)) - {"config"}:
-            key = line.spellings(name)[-1].lstrip("-")
-            setattr(flags, name, values.get(key, getattr(flags, name)))
-    return _Invocation(script, arguments, flags, line, module)
-
-
-def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
-    """What a configuration file says, by argument name."""
-    try:
-        return config.read(path)
-    except (OSError, ValueError) as error:
-        raise UsageError(
-            f"{config.flag} {path}", str(error), "a file the host can read", "Correct the command."
-        ) from error
+    return _Invocation(script, arguments, line.read(arguments), line, module)
 
 
 def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) -> None:
