@@ -198,7 +198,7 @@ class Session:
         """What was gained; observers are told."""
         state = self.last_state
         stage = state.stage if state else None
-        if stage is not None:
+        if stage is not None and stage.taken == stage.steps:
             stage.close()
         done = stage.progress() if stage else None
         summary = Summary(

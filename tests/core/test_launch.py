@@ -226,7 +226,10 @@ for iteration in args.checkpoint_iterations:
 
 
 def test_stage_one_is_asked_for_a_checkpoint_and_stage_two_resumes_it(host, tmp_path):
-    """The number of iterations is nowhere on the command line: it is read from the source."""
+    """The number of iterations is nowhere on the command line: it is read from the source.
+
+    Stage 2 has one more than asked for: the host takes no step in its last.
+    """
     from fragprune_plugins.learning.schedule import Settings
 
     out = tmp_path / "out"
@@ -235,11 +238,11 @@ def test_stage_one_is_asked_for_a_checkpoint_and_stage_two_resumes_it(host, tmp_
     checkpoint = out / "chkpnt12345.pth"
     assert (out / "log").read_text().splitlines() == [
         "12345 [12345] None",
-        f"12445 [] {checkpoint}",
+        f"12446 [] {checkpoint}",
     ]
     (out / "log").unlink()
     run([host(STAGES), "-m", str(out), "--start_checkpoint", str(checkpoint)], options)
-    assert (out / "log").read_text().splitlines() == [f"12445 [] {checkpoint}"]
+    assert (out / "log").read_text().splitlines() == [f"12446 [] {checkpoint}"]
 
 
 def test_insisting_on_a_gpu_that_is_not_there_is_a_usage_error(host):
