@@ -66,6 +66,12 @@ class UnknownHostError(FragpruneError):
     code = "unknown-host"
 
 
+class HostNeedsError(FragpruneError):
+    """Packages that a host imports, or the data it is to read, are missing."""
+
+    code = "host-needs"
+
+
 class SeamError(FragpruneError):
     """A host lacks a function we wrap, or has it with other parameters."""
 

@@ -52,6 +52,11 @@ SETTINGS = (
 class PackageDialect(GraphdecoDialect):
     """Vanilla's call of August 2024, under dotted names."""
 
+    def names(self) -> frozenset[str]:
+        """As ``modules`` has them."""
+        knn = (f"{PACKAGE}.simple_knn", f"{PACKAGE}.simple_knn._C")
+        return frozenset((RASTERIZER, *knn, RELOCATION, *PRUNING))
+
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The rasterizer, the neighbour distances and the relocation, inside their packages."""
         from fragprune_plugins.hosts.graphdeco.stand_ins import compute_relocation

@@ -270,7 +270,6 @@ def load_shots(
     dataset = load_dataset(
         folder, resolution=resolution, white_background=white_background, images=images
     ).to(device)
-    )
     return {
         "test": dataset.test,
         "train": dataset.train,

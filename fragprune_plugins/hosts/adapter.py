@@ -132,6 +132,10 @@ class Dialect(ABC):
             draw: answers a host call without thresholds.
         """
 
+    def names(self) -> frozenset[str]:
+        """The import names that ``modules`` answers: their packages need not be installed."""
+        return frozenset(self.modules(lambda call: None))
+
     def stands_in(self, call: HostCall) -> bool:
         """Whether ours must answer a call because the host's own function could not."""
         return False

@@ -14,6 +14,7 @@ import logging
 import runpy
 import sys
 import tempfile
+import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,6 +24,7 @@ from unittest import mock
 
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import FragpruneError, Interrupted, NotComparedError, UsageError
+from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter, read_config
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
@@ -31,11 +33,13 @@ from fragprune_plugins.plugins.loading import installed
 
 log = logging.getLogger("fragprune")
 
+_OURS = Path(__file__).parents[1]
+
 Stage = Literal["auto", "finetune", "joint", "off"]
 
 
 class HostFailed(FragpruneError):  # noqa: N818 - the host's failure, reported
-    """The host's script ended with a non-zero exit code."""
+    """The host's script raised, or ended with a non-zero exit code."""
 
     code = "host-failed"
 
@@ -155,7 +159,8 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         UsageError: the command names no script, or there is no such device.
         EngineError: no such engine here.
         UnknownHostError: no adapter fits the script's folder.
-        HostFailed: the host ended with an error code.
+        HostNeedsError: packages that the script imports, or its data, are missing.
+        HostFailed: the host raised, or ended with an error code.
         Interrupted: Ctrl-C in stage 2; what was learned has been saved.
     """
     import time
@@ -166,8 +171,9 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     script, arguments, module = _split(command)
     plugins = installed()
     tie = partial(select_adapter, plugins=plugins)
-    package = HostRepo.installed(module.split(".")[0]) if module else None
-    if package is not None:
+    top = module.split(".")[0]
+    package = HostRepo.installed(top) if module else None
+    if package is not None and script.is_relative_to(package.root / top):
         repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
     else:
         repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
@@ -177,6 +183,10 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         engine_for(options.engine, device, plugins)  # refuse before stage 1
     started = time.perf_counter()
     trains = script in (repo.root / name for name in host.line.scripts)
+    dialect = adapter.dialect(repo)
+    answered = {*dialect.names(), *(dialect.spares() if device == "cpu" else ())}
+    data = Path(host.flags.source) if trains and host.flags.source else None
+    preflight.expect(repo, script, answered, data)
     with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
         runner = _Runner(host, repo, adapter, plugins, options, device, Path(scratch))
         if not trains or options.stage == "off":
@@ -266,7 +276,8 @@ class _Runner:
             self._note_after(total)
             return
         again = self.adapter.resumed_by(self.host.script, self.host.arguments)
-        self.host = _parse(*again, self.host.line, self.host.module)
+        module = _beside(self.host.module, again[0]) if self.host.module else ""
+        self.host = _parse(*again, self.host.line, module)
         if self.output is None and self.host.flags.output:
             self.output = Path(self.host.flags.output)
         with self._checkpoint() as (iteration, checkpoint):
@@ -344,7 +355,8 @@ class _Runner:
         known = set(sys.modules)
         try:
             folder = Path.cwd() if self.host.module else self.host.script.parent
-            with session, _host_process(self.host.script, arguments, self.device, folder):
+            process = _host_process(self.host.script, arguments, self.device, folder)
+            with _telling(self.host.script, self.repo.root), session, process:
                 try:
                     if self.host.module:
                         runpy.run_module(self.host.module, run_name="__main__", alter_sys=True)
@@ -489,17 +501,24 @@ def _split(command: list[str]) -> tuple[Path, list[str], str]:
 
 
 def _script_of(module: str) -> Path:
-    """The file of an installed module, found without importing its package."""
-    repo = HostRepo.installed(module.split(".")[0])
-    script = repo.path(module) if repo else None
-    if script is None:
-        raise UsageError(
-            f"python -m {module}",
-            "no such module",
-            "one of an installed package",
-            "Install the package, or check the name.",
-        )
-    return script
+    """The file that ``python -m`` runs, found without importing: here, else an installed one."""
+    for repo in (HostRepo(Path.cwd()), HostRepo.installed(module.split(".")[0])):
+        script = repo.path(module) if repo else None
+        if script is not None and script.name == "__init__.py":
+            script = repo.path(f"{module}.__main__") if repo else None
+        if script is not None:
+            return script
+    raise UsageError(
+        f"python -m {module}",
+        "no such module",
+        "one in this folder, or of an installed package",
+        "Go to the host's folder, install the package, or check the name.",
+    )
+
+
+def _beside(module: str, script: Path) -> str:
+    """The name of a script of the same folder as a module's."""
+    return ".".join([*module.split(".")[:-1], script.stem])
 
 
 def _parse(script: Path, arguments: list[str], line: CommandLine, module: str = "") -> _Invocation:
@@ -587,6 +606,41 @@ def current_gpu(device: str) -> Iterator[None]:
         return
     with torch.cuda.device(device), mock.patch.object(torch.cuda, "set_device"):
         yield
+
+
+@contextlib.contextmanager
+def _telling(script: Path, root: Path) -> Iterator[None]:
+    """What a host raises is told in a line; the whole traceback goes to stderr, for who needs it.
+
+    Args:
+        script: that runs.
+        root: of the host.
+    """
+    try:
+        yield
+    except FragpruneError:
+        raise
+    except Exception as error:
+        traceback.print_exc()
+        frames = traceback.extract_tb(error.__traceback__)
+        inside = [frame for frame in frames if Path(frame.filename).is_relative_to(root)]
+        where = script.name
+        if inside:
+            file = Path(inside[-1].filename).relative_to(root)
+            where = f"{file}:{inside[-1].lineno} in {inside[-1].name}"
+        message = "".join(str(error).strip().splitlines()[:1])
+        remedy = "Read the traceback above."
+        lacking = (error.name or "").split(".")[0] if isinstance(error, ImportError) else ""
+        if isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
+            remedy = f"Run: {preflight.install([preflight.Missing(lacking, where)])}"
+        elif Path(frames[-1].filename).is_relative_to(_OURS):
+            remedy = "It came up in fragprune: report it with the traceback above."
+        raise HostFailed(
+            where,
+            f"{type(error).__name__}{f': {message}' if message else ''}",
+            f"{script.name} to come to its end",
+            remedy,
+        ) from error
 
 
 @contextlib.contextmanager

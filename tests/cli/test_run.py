@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 
 import pytest
 from cli.commands import run, run_json
@@ -11,6 +13,7 @@ from miniature import HOST, TINY
 from PIL import Image
 
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.testing import mutations
 
 WORDS = ["--device", "cpu", "--iters", 6]
 
@@ -123,6 +126,32 @@ def test_what_cannot_be_compared_says_why(scene, tmp_path):
     report = ran(*WORDS, *words)
     assert report["before"] is None
     assert report["not_compared"]["code"] == "not-compared"
+
+
+def test_a_host_that_raises_leaves_one_json_object_on_stdout(tmp_path):
+    host = mutations.copy_source(HOST, tmp_path / "host").root
+    script = host / "train.py"
+    script.write_text(script.read_text().replace("import torch\n", "import torch\n1 / 0\n", 1))
+    result = run("run", "--device", "cpu", "--json", "--", script, "-s", tmp_path, "-m", "out")
+    assert result.exit_code == 1
+    error = json.loads(result.stdout)["error"]
+    assert error["code"] == "host-failed"
+    assert error["found"] == "ZeroDivisionError: division by zero"
+    assert error["where"].startswith("train.py:")
+    assert "Traceback (most recent call last)" in result.stderr
+
+
+def test_the_package_runs_as_a_module(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "fragprune_plugins", "adapters", "--json"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["adapters"]
 
 
 def test_two_models_of_nobody_need_their_photographs_named(tmp_path):

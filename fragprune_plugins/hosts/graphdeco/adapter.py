@@ -118,6 +118,10 @@ class GraphdecoDialect(Dialect):
 
         return CUDA_HOME is not None and is_available()
 
+    def names(self) -> frozenset[str]:
+        """The rasterizer's and simple_knn's, told without importing torch."""
+        return frozenset((self.package, "simple_knn", "simple_knn._C"))
+
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizer and simple_knn."""
         from fragprune_plugins.hosts.graphdeco import stand_ins
