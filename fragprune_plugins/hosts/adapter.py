@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import NotComparedError, UsageError
 from fragprune_plugins.hosts.findings import Finding, Match
+from fragprune_plugins.hosts.flags import Flags
 from fragprune_plugins.hosts.seams import Seam
 from fragprune_plugins.hosts.source import HostRepo, check_seams
 
@@ -172,15 +173,6 @@ class ConfigFile:
         return json.dumps(json.loads(text) | values)
 
 
-class _Flags(argparse.ArgumentParser):
-    """Says what is wrong with a flag as we say everything."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(
-            "the host's command", message, "flags the host understands", "Correct the command."
-        )
-
-
 def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
     """What a configuration file says, by argument name.
 
@@ -252,7 +244,7 @@ class CommandLine:
         Raises:
             UsageError: a flag without its value, or a configuration file that cannot be read.
         """
-        parser = _Flags(add_help=False, conflict_handler="resolve")
+        parser = Flags(add_help=False, conflict_handler="resolve")
         options: dict[str, dict[str, Any]] = {
             "resolution": {"type": int},
             "images": {},
