@@ -66,6 +66,12 @@ class UnknownHostError(FragpruneError):
     code = "unknown-host"
 
 
+class HostNeedsError(FragpruneError):
+    """Packages that a host imports, or the data it is to read, are missing."""
+
+    code = "host-needs"
+
+
 class SeamError(FragpruneError):
     """A host lacks a function we wrap, or has it with other parameters."""
 
@@ -106,6 +112,12 @@ class RecordError(FragpruneError):
     """No figures to report, or a file of them that cannot be read."""
 
     code = "record"
+
+
+class NotComparedError(FragpruneError):
+    """Before and after of a host's run cannot be measured on views that it held out."""
+
+    code = "not-compared"
 
 
 class UsageError(FragpruneError):

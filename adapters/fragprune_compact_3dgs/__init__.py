@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import NotComparedError, UsageError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter
@@ -83,9 +83,14 @@ class Compact3DGS(GraphdecoAdapter):
             "Add --from-iter with the iteration that training should end at.",
         )
 
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
         """Not by us: its colours are a network's."""
-        return None
+        raise NotComparedError(
+            "Compact-3DGS",
+            "models whose colours are a network's and not in the file",
+            "models that our own readers draw",
+            "Draw and measure with the host's render.py and metrics.py.",
+        )
 
     def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
         """The Gaussians', then the hash grid's and the colour network's."""

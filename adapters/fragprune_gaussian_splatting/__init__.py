@@ -13,9 +13,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from fragprune_plugins.errors import AlignmentError, EngineError, SessionError
+from fragprune_plugins.errors import (
+    AlignmentError,
+    EngineError,
+    NotComparedError,
+    SessionError,
+)
 from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo, RowTrace
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect
@@ -46,6 +51,11 @@ SETTINGS = (
 
 class PackageDialect(GraphdecoDialect):
     """Vanilla's call of August 2024, under dotted names."""
+
+    def names(self) -> frozenset[str]:
+        """As ``modules`` has them."""
+        knn = (f"{PACKAGE}.simple_knn", f"{PACKAGE}.simple_knn._C")
+        return frozenset((RASTERIZER, *knn, RELOCATION, *PRUNING))
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The rasterizer, the neighbour distances and the relocation, inside their packages."""
@@ -153,6 +163,15 @@ class GaussianSplatting(GraphdecoAdapter):
             resume=("-l", "--load_ply"),
             default_iterations=30_000,
             restarts=True,
+        )
+
+    def photographs(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
+        """None that it has not learned from."""
+        raise NotComparedError(
+            "gaussian-splatting (pip)",
+            "a package that trains on every view",
+            "views that are held out",
+            "Leave some out of the COLMAP model, then fragprune compare on all of them.",
         )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:

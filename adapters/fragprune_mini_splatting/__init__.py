@@ -67,6 +67,10 @@ class MiniSplattingDialect(GraphdecoDialect):
             return drawn
         return (*drawn, weights, count, wins.float())
 
+    def names(self) -> frozenset[str]:
+        """The lineage's and the scoring rasterizer's."""
+        return super().names() | {SCORING}
+
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The lineage's stand-ins and the scoring rasterizer's."""
         from fragprune_plugins.hosts.graphdeco import stand_ins

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
@@ -114,15 +115,23 @@ class MipSplatting(GraphdecoAdapter):
 
         return read_ply(ply, filtered=True)
 
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """By the 2D filter of the command, or its default; ``--load_allres`` mixes resolutions."""
         parser = ArgumentParser(add_help=False)
         size = default(repo, "ModelParams", "_kernel_size", KERNEL_SIZE)
         parser.add_argument("-k", "--kernel_size", type=float, default=size)
         flags, rest = parser.parse_known_args(arguments)
-        if super().drawing(repo, rest) is None or "--load_allres" in rest:
-            return None
-        return {"dilation": flags.kernel_size, "compensation": "mip"}
+        if "--load_allres" in rest:
+            raise NotComparedError(
+                "--load_allres",
+                "every view at several sizes",
+                "one size",
+                "Measure with the host's render.py and metrics.py.",
+            )
+        return super().drawing(repo, rest) | {
+            "dilation": flags.kernel_size,
+            "compensation": "mip",
+        }
 
 
 @hookimpl

@@ -14,7 +14,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
+from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.hosts.seams import Role
@@ -33,11 +34,12 @@ PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 OWN = ("low_pass", "divide_ratio", "abe_split", "args_dict")
 """A setting of the rasterizer and parameters of the model, of its split and of the scene."""
 
-SCENES = (
-    *("bicycle", "flowers", "garden", "stump", "treehill"),
-    *("room", "counter", "kitchen", "bonsai"),
-)
-"""Scenes of Mip-NeRF 360: where the path holds one's name, the host reads smaller pictures."""
+SMALLER = {
+    **dict.fromkeys(("bicycle", "flowers", "garden", "stump", "treehill"), "images_4"),
+    **dict.fromkeys(("room", "counter", "kitchen", "bonsai"), "images_2"),
+}
+"""Scenes of Mip-NeRF 360: where the path holds one's name the host reads this folder's images;
+where it holds several, that of the last."""
 
 
 @dataclass(frozen=True)
@@ -120,14 +122,16 @@ class RainGS(GraphdecoAdapter):
             rest += ["-m", str(Path("output") / flags.exp_name)]
         return script, rest
 
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
-        """As vanilla's; views are always held out."""
-        parser = ArgumentParser(add_help=False)
-        parser.add_argument("-s", "--source_path", default="")
-        flags, _ = parser.parse_known_args(arguments)
-        if any(scene in flags.source_path for scene in SCENES) or "--white_bg" in arguments:
-            return None
-        return super().drawing(repo, [*arguments, "--eval"])
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """The lineage's, but for its own white; views are always held out."""
+        line = super().command_line(repo)
+        return replace(line, white_background=("--white_bg",), hold_out=())
+
+    def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
+        """The lineage's, from the folder that the scene's name stands for."""
+        read = super().photographs(repo, arguments)
+        folders = [folder for name, folder in SMALLER.items() if name in str(read.folder)]
+        return replace(read, images=folders[-1]) if folders else read
 
 
 @hookimpl

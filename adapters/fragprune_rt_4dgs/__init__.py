@@ -13,7 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
+from fragprune_plugins.errors import (
+    AlignmentError,
+    ModelFileError,
+    NotComparedError,
+    UsageError,
+)
 from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter
@@ -70,13 +75,16 @@ class RT4DGS(GraphdecoAdapter):
     # -- its command line ------------------------------------------------------------------------
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """A YAML file wins over flags; models are checkpoints; the first iteration is 2."""
+        """A YAML file wins over flags; models are checkpoints.
+
+        The first iteration is 2, so that one is left out; the last takes no step.
+        """
         return replace(
             super().command_line(repo),
             save_checkpoints="--save_iterations",
             config=YAMLFile("--config"),
             checkpoints_only=True,
-            skipped=1,
+            skipped=2,
         )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
@@ -97,8 +105,14 @@ class RT4DGS(GraphdecoAdapter):
             )
         return script, arguments
 
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> None:
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
         """Our readers know no time."""
+        raise NotComparedError(
+            "RT-4DGS",
+            "checkpoints of Gaussians in time for models, and no PLY",
+            "models that our own readers draw",
+            "Read the PSNR that the host prints at its test_iterations.",
+        )
 
     def view(self, camera: Any) -> int:
         """Every render gets a copy of its camera; copies keep the number."""

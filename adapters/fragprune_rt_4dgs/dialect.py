@@ -71,6 +71,10 @@ class RT4DGSDialect(GraphdecoDialect):
         assert features is not None  # unpack asked for them
         return outputs.image, outputs.radii, features[:1], outputs.alpha, features[1:]
 
+    def names(self) -> frozenset[str]:
+        """The lineage's and that of the neighbours."""
+        return super().names() | {"pointops2_cuda"}
+
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizer, simple_knn and the neighbours of the rigidity loss."""
         from fragprune_rt_4dgs import neighbours

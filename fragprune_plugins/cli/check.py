@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,19 +11,21 @@ from fragprune_plugins.cli.common import FILE, Command, Report
 
 if TYPE_CHECKING:
     from fragprune_plugins.hosts.adapter import HostAdapter
-    from fragprune_plugins.hosts.findings import Finding, Match
-    from fragprune_plugins.hosts.source import HostRepo, SeamState
+    from fragprune_plugins.hosts.choosing import Tried
+    from fragprune_plugins.hosts.preflight import Missing
+    from fragprune_plugins.hosts.source import HostRepo
 
 
 @click.command("check", cls=Command)
 @click.argument("host", type=FILE)
-@click.option("--adapter", help="Check this adapter only.")
-def command(host: Path, adapter: str | None) -> Report:
+@click.option("--adapter", help="Check this adapter only, in full.")
+@click.option("--verbose", is_flag=True, help="Say where every seam is, and what is wrong.")
+def command(host: Path, adapter: str | None, verbose: bool) -> Report:
     """Read HOST, a training repository, and say which adapter fits and what speaks against it.
 
-    Nothing is imported or run; no GPU is needed. Of every seam it says in which file and line it
-    was found, changed, or expected, and for the adapter that fits also what will not work. Exit
-    code 0 when exactly one adapter fits.
+    Nothing is imported or run; no GPU is needed. Packages that the host imports and that are not
+    installed are listed. --verbose says of every seam in which file and line it was found, changed,
+    or expected, and what will not work. Exit code 0 when exactly one adapter fits.
 
     \b
     Examples:
@@ -33,6 +34,8 @@ def command(host: Path, adapter: str | None) -> Report:
       fragprune check gsplat                                    (an installed package)
     """
     from fragprune_plugins.errors import UnknownHostError
+    from fragprune_plugins.hosts.choosing import attempt
+    from fragprune_plugins.hosts.preflight import install
     from fragprune_plugins.hosts.source import HostRepo
     from fragprune_plugins.plugins.loading import load_plugins
 
@@ -51,105 +54,95 @@ def command(host: Path, adapter: str | None) -> Report:
                 "--adapter", repr(adapter), "an installed adapter", "Run fragprune adapters."
             )
     repo = _repository(host, adapters, adapter)
-    checked = sorted((_check(each, repo) for each in adapters), key=lambda each: each.order)
-    fitting = [each for each in checked if each.match.fits]
+    tried = attempt(repo, adapters)
+    fitting = [each for each in tried if each.match.fits]
     verdict = fitting[0] if len(fitting) == 1 else None
+    missing = _missing(repo, verdict.adapter) if verdict else []
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
-    known = fitting or [each for each in checked if each.held or adapter]
-    shown = fitting or known[:1]
-    for each in shown:
-        lines += ["", *each.lines()]
-    if len(checked) > len(shown):
-        lines += ["", "Others:" if shown else "None of these adapters finds anything of its host:"]
-    lines += [f"  {each.headline()}" for each in checked if each not in shown]
+    lines += _in_full(tried, fitting) if verbose or adapter else _in_short(tried, fitting)
+    if missing:
+        lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
+        lines += [f"  {install(missing)}"]
     lines += ["", _conclusion(repo, fitting)]
     data = {
         "host": str(host),
         "commit": repo.commit,
         "fits": verdict.adapter.name if verdict else None,
-        "adapters": [each.as_dict() for each in checked],
+        "missing": [
+            {"module": each.module, "distribution": each.distribution, "at": each.at}
+            for each in missing
+        ],
+        "adapters": [_as_dict(each) for each in tried],
     }
     return Report(data, "\n".join(lines), exit_code=0 if verdict else 1)
+
+
+def _in_short(tried: list[Tried], fitting: list[Tried]) -> list[str]:
+    """A line for each adapter that fits, or where none does, that finds something of its host."""
+    shown = fitting or [each for each in tried if each.held]
+    if not shown:
+        return [f"None of {len(tried)} adapters finds anything of its host."]
+    others = len(tried) - len(shown)
+    why = "do not fit (--verbose says why)" if fitting else "find nothing of their hosts"
+    return [*(each.brief() for each in shown), *([f"{others} others {why}."] if others else [])]
 
 
 _SIGNS = {"missing": "MISSING in", "changed": "CHANGED at", "at import": "(checked at import)"}
 
 
-@dataclass(frozen=True)
-class _Checked:
-    """One adapter tried on one codebase."""
-
-    adapter: HostAdapter
-    match: Match
-    seams: list[SeamState]
-
-    @property
-    def held(self) -> int:
-        """Seams that are as the adapter needs them."""
-        return sum(state.status == "found" for state in self.seams)
-
-    @property
-    def looked_up(self) -> int:
-        """Seams that source can tell about."""
-        return sum(state.status != "at import" for state in self.seams)
-
-    @property
-    def order(self) -> tuple[int, float, int]:
-        """By kinds of errors, then by the share of seams that hold, then by how much is wrong."""
-        kinds = {finding.code for finding in self.errors}
-        complaint = sum(len(finding.found) for finding in self.errors)
-        return len(kinds), -self.held / max(1, self.looked_up), complaint
-
-    @property
-    def errors(self) -> list[Finding]:
-        """What speaks against the adapter."""
-        return [finding for finding in self.match.findings if finding.level == "error"]
-
-    def verdict(self) -> str:
-        """Whether it fits, and how much of it."""
-        return (
-            f"{self.adapter.name} {'fits' if self.match.fits else 'does not fit'}: "
-            f"{self.held} of {self.looked_up} seams hold"
-        )
-
-    def headline(self) -> str:
-        """The verdict, and where it is no, the first reason."""
-        return self.verdict() + (f"; {self.errors[0]}" if self.errors else "")
-
-    def lines(self) -> list[str]:
-        """Everything, for a person."""
-        info, of_seams = self.adapter.info, [state.finding for state in self.seams]
-        lines = [f"{self.verdict()} ({info.title}, {info.repo})"]
-        lines += [f"  {each}" for each in self.match.findings if each not in of_seams]
-        for state in self.seams:
+def _in_full(tried: list[Tried], fitting: list[Tried]) -> list[str]:
+    """Every seam of the adapters that fit, or of the nearest; of the others what is wrong first."""
+    shown = fitting or tried[:1]
+    lines = []
+    for each in shown:
+        info, of_seams = each.adapter.info, [state.finding for state in each.seams]
+        lines += ["", f"{each.verdict()} ({info.title}, {info.repo})"]
+        lines += [f"  {finding}" for finding in each.match.findings if finding not in of_seams]
+        for state in each.seams:
             at = state.at if state.status == "found" else f"{_SIGNS[state.status]} {state.at}"
             if state.finding and state.status == "changed":
                 at += f": {state.finding.found}; expected {state.finding.expected}"
             lines.append(f"  {state.seam.role.name.lower():<10} {state.seam!s:<62} {at.strip()}")
-        if self.match.fits and self.adapter.info.limits:
-            lines += ["  What will not work:"]
-            lines += [f"  - {limit}" for limit in self.adapter.info.limits]
-        return lines
+        if each.match.fits and info.limits:
+            lines += ["  What will not work:", *(f"  - {limit}" for limit in info.limits)]
+    others = [each for each in tried if each not in shown]
+    lines += ["", "Others:"] if others else []
+    return [*lines, *(f"  {each.verdict()}; {each.errors[0]}" for each in others)]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Everything, for --json."""
-        return {
-            "adapter": self.adapter.name,
-            "confidence": self.match.confidence,
-            "seams_held": self.held,
-            "seams_looked_up": self.looked_up,
-            "findings": [finding.as_dict() for finding in self.match.findings],
-            "limits": list(self.adapter.info.limits),
-            "seams": [
-                {
-                    "role": state.seam.role.name,
-                    "seam": str(state.seam),
-                    "status": state.status,
-                    "at": state.at,
-                }
-                for state in self.seams
-            ],
-        }
+
+def _as_dict(tried: Tried) -> dict[str, Any]:
+    """Everything, for --json."""
+    return {
+        "adapter": tried.adapter.name,
+        "confidence": tried.match.confidence,
+        "seams_held": tried.held,
+        "seams_looked_up": tried.looked_up,
+        "findings": [finding.as_dict() for finding in tried.match.findings],
+        "limits": list(tried.adapter.info.limits),
+        "seams": [
+            {
+                "role": state.seam.role.name,
+                "seam": str(state.seam),
+                "status": state.status,
+                "at": state.at,
+            }
+            for state in tried.seams
+        ],
+    }
+
+
+def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
+    """What the training scripts import and is not here; a host without scripts is its user's."""
+    from fragprune_plugins.errors import UsageError
+    from fragprune_plugins.hosts.preflight import missing_imports
+
+    try:
+        scripts = adapter.command_line(repo).scripts
+    except UsageError:
+        return []
+    dialect = adapter.dialect(repo)
+    answered = {*dialect.names(), *dialect.spares()}
+    return missing_imports(repo, [repo.root / name for name in scripts], answered)
 
 
 def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:
@@ -167,13 +160,7 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
         return HostRepo(host)
 
 
-def _check(adapter: HostAdapter, repo: HostRepo) -> _Checked:
-    from fragprune_plugins.hosts.source import look_up
-
-    return _Checked(adapter, adapter.match(repo), look_up(repo, adapter.seams_for(repo)))
-
-
-def _conclusion(repo: HostRepo, fitting: list[_Checked]) -> str:
+def _conclusion(repo: HostRepo, fitting: list[Tried]) -> str:
     if len(fitting) == 1:
         return f"Use: {fitting[0].adapter.use(repo)}"
     if fitting:

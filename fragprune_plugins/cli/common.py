@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     import torch
 
     from fragprune_plugins.datasets.dataset import Shot
+    from fragprune_plugins.datasets.photographs import Resolution
     from fragprune_plugins.engines import Engine
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -255,8 +255,9 @@ def load_shots(
     folder: Path,
     views: str,
     *,
-    resolution: int,
+    resolution: int | Resolution,
     white_background: bool,
+    images: str = "images",
     device: torch.device | str = "cpu",
 ) -> Sequence[Shot]:
     """The views of a scene folder that were asked for, on a device.
@@ -266,41 +267,14 @@ def load_shots(
     """
     from fragprune_plugins.datasets.dataset import load_dataset
 
-    dataset = load_dataset(folder, resolution=resolution, white_background=white_background).to(
-        device
-    )
+    dataset = load_dataset(
+        folder, resolution=resolution, white_background=white_background, images=images
+    ).to(device)
     return {
         "test": dataset.test,
         "train": dataset.train,
         "all": [*dataset.train, *dataset.test],
     }[views]
-
-
-def describe(columns: dict[str, dict[str, Any]]) -> str:
-    """A table of measurements, one column each, and how the last differs from the one before."""
-    reports = list(columns.values())
-    head = " " * 20 + "".join(f"{name:>16}" for name in columns)
-    lines = [head + f"{'change':>12}" if len(columns) > 1 else head]
-    for label, key, digits in _ROWS:
-        cells = [f"{report[key]:.{digits}f}" for report in reports]
-        if key == "frame_ms":
-            cells = [
-                f"{cell} ± {report['frame_ms_se']:.{digits}f}"
-                for cell, report in zip(cells, reports, strict=True)
-            ]
-        line = f"{label:<20}" + "".join(f"{cell:>16}" for cell in cells)
-        if len(reports) > 1:
-            first, last = reports[-2][key], reports[-1][key]
-            change = (
-                f"{last - first:+.{digits}f}"
-                if key in ("psnr", "ssim")
-                else f"/ {first / max(last, 1e-9):.2f}"
-            )
-            line += f"{change:>12}"
-        lines.append(line)
-    report = reports[-1]
-    lines.append(f"{report['views']} views, {report['engine']} engine on {report['device']}")
-    return "\n".join(lines)
 
 
 def dropping(out: Path, bytes_before: int, before: int, after: int) -> dict[str, int]:
@@ -319,35 +293,3 @@ def describe_dropped(dropped: dict[str, int], why: str) -> str:
         f"Dropped {dropped['gaussians']:,} of {dropped['of']:,} Gaussians, {why}: "
         f"{dropped['bytes_before']:,} -> {dropped['bytes_after']:,} bytes."
     )
-
-
-def gain(first: dict[str, Any], second: dict[str, Any]) -> str:
-    """What the second measurement gains over the first, in a line one can quote.
-
-    Frame times are compared only where their standard errors allow it.
-    """
-    before, after = first["fragments_per_pixel"], second["fragments_per_pixel"]
-    times = [(report["frame_ms"], report["frame_ms_se"]) for report in (first, second)]
-    ratio = times[0][0] / max(times[1][0], 1e-9)
-    error = ratio * math.hypot(*(se / max(ms, 1e-9) for ms, se in times))
-    faster = (
-        f"{ratio:.2f} ± {error:.2f}x faster frames"
-        if error < _NOISE * ratio
-        else "frame times too noisy to compare"
-    )
-    return (
-        f"{before / max(after, 1e-9):.2f}x fewer fragments ({before:.1f} -> {after:.1f} per pixel),"
-        f" {second['psnr'] - first['psnr']:+.2f} dB PSNR, {faster} on {second['views']} views"
-    )
-
-
-_NOISE = 0.1  # relative standard error above which a ratio of frame times says nothing
-
-_ROWS = (
-    ("PSNR, dB", "psnr", 2),
-    ("SSIM", "ssim", 4),
-    ("fragments/pixel", "fragments_per_pixel", 2),
-    ("evaluated/pixel", "evaluated_per_pixel", 2),
-    ("frame, ms", "frame_ms", 2),
-    ("Gaussians", "gaussians", 0),
-)

@@ -2,38 +2,51 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from fragprune_plugins.cli.common import (
     FILE,
     Command,
     Report,
-    data_options,
-    describe,
     engine_options,
-    gain,
+    image_options,
     load_shots,
     open_engine,
     truncation_option,
     views_option,
 )
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.storage.models import load_model
+
+if TYPE_CHECKING:
+    from fragprune_plugins.datasets.photographs import Photographs
 
 
 @click.command("compare", cls=Command)
 @click.argument("a", type=FILE)
 @click.argument("b", type=FILE)
-@data_options
+@click.option(
+    "--data",
+    type=FILE,
+    help="Scene folder: COLMAP (sparse/, images/) or Blender (transforms_*.json). Left out: that "
+    "of the run or fine-tuning that left the models.",
+)
+@image_options
 @click.option("--out", type=FILE, help="Folder for side-by-side pictures.")
 @views_option
 @truncation_option
 @engine_options
+@click.pass_context
 def command(
+    ctx: click.Context,
     a: Path,
     b: Path,
-    data: Path,
+    data: Path | None,
     resolution: int,
     white_background: bool,
     out: Path | None,
@@ -45,26 +58,44 @@ def command(
 ) -> Report:
     """Measure A and B on the same photographs.
 
-    Each is drawn with the thresholds stored beside it; frames are timed in turns.
+    Each is drawn with the thresholds stored beside it; frames are timed in turns. Where a run or a
+    fine-tuning left one of them, its record says which photographs were used, at what size and on
+    what background, and how models are drawn: that is followed, but for what is given here.
 
     \b
-    Example:
+    Examples:
       fragprune compare point_cloud.ply pruned.ply --data scene --out pictures
+      fragprune compare out/point_cloud/iteration_{30000,35001}/point_cloud.ply
     """
     from fragprune_plugins.cli.profile import draw_panels
+    from fragprune_plugins.datasets.photographs import Resolution
     from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.measure.wording import describe, gain
     from fragprune_plugins.storage import records
     from fragprune_plugins.storage.atomic import writable_folder
 
     rasterizer, where = open_engine(engine, device, threads)
     if out is not None:
         writable_folder(out)
-    columns = {
-        label: Candidate(*load_model(path, truncation=not no_truncation, device=where))
-        for label, path in (("A", a), ("B", b))
-    }
+    known = _records(a, b)
+    scene = _scene(data, known)
+    if ctx.get_parameter_source("resolution") is not ParameterSource.DEFAULT:
+        scene = replace(scene, resolution=Resolution(resolution))
+    scene = replace(scene, white_background=scene.white_background or white_background)
+    columns = {}
+    for label, path in (("A", a), ("B", b)):
+        how = known.get(path, {"filtered": False, "drawing": {}})
+        model = load_model(
+            path, truncation=not no_truncation, filtered=how["filtered"], device=where
+        )
+        columns[label] = Candidate(*model, how["drawing"])
     shots = load_shots(
-        data, views, resolution=resolution, white_background=white_background, device=where
+        scene.folder,
+        views,
+        resolution=scene.resolution,
+        white_background=scene.white_background,
+        images=scene.images,
+        device=where,
     )
     first, second = measure(list(columns.values()), shots, engine=rasterizer)
     report = {
@@ -75,9 +106,11 @@ def command(
         "ssim_change": second["ssim"] - first["ssim"],
         "engine": rasterizer.name,
         "device": first["device"],
+        "scene": scene.as_dict(),
     }
+    size = f"{shots[0].view.width}x{shots[0].view.height} pixels"
     lines = [
-        f"A: {a}\nB: {b}\n",
+        f"A: {a}\nB: {b}\nPhotographs: {scene.folder}, the first of {size}\n",
         describe({"A": first, "B": second}),
         f"\nB against A: {gain(first, second)}.",
     ]
@@ -87,3 +120,38 @@ def command(
         records.leave(out / "compare", "compare", report)
         lines.append(f"Wrote {len(files)} pictures to {out}.")
     return Report(report, "\n".join(lines))
+
+
+def _records(*models: Path) -> dict[Path, dict[str, Any]]:
+    """How the commands that left the models read photographs and draw, by model, where known."""
+    from fragprune_plugins.storage import records
+
+    known: dict[Path, dict[str, Any]] = {}
+    for model in models:
+        record = records.beside(model)
+        read = record.data.get("photographs") if record else None
+        if read:
+            known[model] = read
+            before = Path(read["models"][0])
+            known |= {other: read for other in models if other.resolve() == before}
+    return known
+
+
+def _scene(data: Path | None, known: dict[Path, dict[str, Any]]) -> Photographs:
+    """The photographs asked for, read as those of the models' runs were."""
+    from fragprune_plugins.datasets.photographs import Photographs
+
+    read = {Photographs.from_dict(how) for how in known.values()}
+    if len(read) == 1:
+        (scene,) = read
+        return scene if data is None else replace(scene, folder=data)
+    if data is None:
+        raise UsageError(
+            "--data",
+            "none, and the models' runs read photographs in two ways"
+            if read
+            else "none, and no record of a run beside the models",
+            "a scene folder",
+            "Name it with --data.",
+        )
+    return Photographs(data)

@@ -14,11 +14,9 @@ from fragprune_plugins.cli.common import (
     OutFile,
     Report,
     data_options,
-    describe,
     describe_dropped,
     dropping,
     engine_options,
-    gain,
     open_engine,
     require_place,
 )
@@ -79,8 +77,10 @@ def command(
 
     from copy import deepcopy
 
+    from fragprune_plugins.datasets.photographs import Photographs, Resolution
     from fragprune_plugins.finetuning import finetune, load_dataset, save
     from fragprune_plugins.measure import Candidate, drop_invisible, measure
+    from fragprune_plugins.measure.wording import describe, outcome
     from fragprune_plugins.storage import records, sidecar
 
     rasterizer, where = open_engine(engine, device, threads)
@@ -109,25 +109,6 @@ def command(
     if result.thresholds is not None:
         candidates.append(Candidate(result.model))
     before, after, *without = measure(candidates, dataset.test, engine=rasterizer)
-    pressure = f" at pressure {done.pressure:.2g}" if settings.truncate else ""
-    quote = (
-        f"{gain(before, after)} that were held out ({after['engine']} engine, "
-        f"{done.steps} iterations{pressure} in {result.train_seconds:.0f} s)."
-    )
-    lines = [describe({"before": before, "after": after}), "", quote]
-    if done.target_reached is False:
-        lines.append(
-            f"The target of {settings.target_speedup:g}x was missed: "
-            f"{done.speedup or 1:.2f}x fewer fragments on the training views. "
-            "More --iters or another target may help."
-        )
-    if result.interrupted:
-        lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations.")
-    if dropped:
-        lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(views)} views"))
-    lines += [_describe_untruncated(before, plain) for plain in without]
-    together = " Keep the two together." if without else ""
-    lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
     report = {
         "model": str(model),
         "out": str(out),
@@ -147,12 +128,32 @@ def command(
         "seed": seed,
         "settings": settings.as_dict(),
     }
+    control = report["control"] = records.control_of(report, records.files(out.parent))
+    pressure = f" at pressure {done.pressure:.2g}" if settings.truncate else ""
+    lines = [
+        describe({"before": before, "after": after}),
+        "",
+        outcome("finetune", report, control),
+        f"{result.engine} engine, {done.steps} iterations{pressure} in "
+        f"{result.train_seconds:.0f} s.",
+    ]
+    if done.target_reached is False:
+        lines.append(
+            f"The target of {settings.target_speedup:g}x was missed: "
+            f"{done.speedup or 1:.2f}x fewer fragments on the training views. "
+            "More --iters or another target may help."
+        )
+    if result.interrupted:
+        lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations.")
+    if dropped:
+        lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(views)} views"))
+    lines += [_describe_untruncated(before, plain) for plain in without]
+    together = " Keep the two together." if without else ""
+    lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
     more = {
         "curves": rows,
-        "photographs": {
-            "folder": str(data.resolve()),
-            "resolution": resolution,
-            "white_background": white_background,
+        "photographs": Photographs(data, Resolution(resolution), white_background).as_dict()
+        | {
             "models": [str(model.resolve()), str(out.resolve())],
             "filtered": False,
             "drawing": {},

@@ -31,7 +31,12 @@ _OPTIONS = (
         help=f"Weight of drawn fragments per pixel in the loss; default {ELASTICITY:g} of the loss "
         f"per fragment, {LEAST_PRESSURE:g} or more.",
     ),
-    click.option("--target-speedup", type=float, help="Steer for this many times fewer fragments."),
+    click.option(
+        "--target-speedup",
+        type=float,
+        help="Steer for this many times fewer fragments: those of the untruncated model as it came "
+        "in over those drawn now, on the training views that calibration measures.",
+    ),
     click.option(
         "--control", is_flag=True, help="Same iterations without truncation: the honest zero."
     ),

@@ -12,7 +12,6 @@ from fragprune_plugins.cli.common import (
     Command,
     Report,
     data_options,
-    describe,
     engine_options,
     load_shots,
     open_engine,
@@ -61,6 +60,7 @@ def command(
     import torch
 
     from fragprune_plugins.measure import Candidate, measure
+    from fragprune_plugins.measure.wording import describe
     from fragprune_plugins.storage import records
     from fragprune_plugins.storage.atomic import writable_folder
 

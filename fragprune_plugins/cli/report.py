@@ -17,14 +17,14 @@ from fragprune_plugins.cli.common import (
     Command,
     OutFile,
     Report,
-    describe,
     engine_options,
-    gain,
     open_engine,
 )
 from fragprune_plugins.storage.models import load_model
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import torch
 
     from fragprune_plugins.engines import Engine
@@ -53,7 +53,8 @@ def command(
 
     DIR is where run or finetune wrote their models, or compare and profile their pictures (--out).
     The page is a single file without references to others: it can be mailed. The newest run or
-    fine-tuning comes first; where its photographs are still there, some held-out views are drawn.
+    fine-tuning that is no control comes first; where its photographs are still there, some held-out
+    views are drawn.
 
     \b
     Example:
@@ -64,9 +65,12 @@ def command(
     from fragprune_plugins.storage.records import find
 
     records = find(folder)
-    main = next((r for r in reversed(records) if r.command in ("run", "finetune")), records[-1])
+    results = [record for record in records if record.command in ("run", "finetune")]
+    pruned = [record for record in results if record.data.get("settings", {}).get("truncate")]
+    main = [*records, *results, *pruned][-1]
     others = [record for record in records if record is not main]
-    line = _sentence(main)
+    files = [record.path for record in records]
+    line = _sentence(main, files)
     with TemporaryDirectory() as name:
         pictures = Path(name)
         views, learning, missing = _draw(
@@ -79,7 +83,7 @@ def command(
             text=[
                 report_page.preformatted(_table(main)),
                 report_page.paragraph(missing or (_SLIDERS if views else "")),
-                *(block for record in others for block in _block(record)),
+                *(block for record in others for block in _block(record, files)),
             ],
             views=views,
             pictures=more,
@@ -114,6 +118,8 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
 
 def _table(record: Record) -> str:
     """The measurements, else what was seen on training views."""
+    from fragprune_plugins.measure.wording import describe
+
     columns = _columns(record)
     if columns:
         return describe(columns)
@@ -125,23 +131,29 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.2f}"
 
 
-def _sentence(record: Record) -> str:
-    """The outcome in a line one can quote."""
-    columns = list(_columns(record).values())
-    name = record.data.get("adapter") or ""
-    of = f" ({name}, {record.data['iterations']:,} iterations)" if name else ""
+def _sentence(record: Record, among: Sequence[Path]) -> str:
+    """The outcome in a line one can quote; ``among`` are files that may record its control."""
+    from fragprune_plugins.measure.wording import fewer, gain, outcome
+    from fragprune_plugins.storage.records import control_of
+
+    data, columns = record.data, list(_columns(record).values())
+    name = data.get("adapter") or ""
+    of = f"{name}, {data['iterations']:,} iterations: " if name else ""
+    if len(columns) > 1 and record.command in ("run", "finetune"):
+        return of + outcome(record.command, data, control_of(data, among))
     if len(columns) > 1:
-        return f"{gain(columns[0], columns[-1])}{of}."
+        return f"{gain(columns[0], columns[-1])}."
     if columns:
-        return f"{columns[0]['fragments_per_pixel']:.1f} fragments per pixel drawn{of}."
-    seen = record.data["training_views"]
+        drawn, frame = columns[0]["fragments_per_pixel"], columns[0]["frame_ms"]
+        return f"{drawn:.1f} fragments per pixel drawn, frames of {frame:.2f} ms."
+    seen = data["training_views"]
     before, after = seen["fragments_per_pixel_before"], seen["fragments_per_pixel_after"]
     if not before or not after:
-        return f"Nothing was learned{of}."
-    return f"{before / after:.2f}x fewer fragments on training views{of}."
+        return f"{of}nothing was learned."
+    return f"{of}{fewer(before, after)} on training views; frame times were not measured."
 
 
-def _block(record: Record) -> list[str]:
+def _block(record: Record, among: Sequence[Path]) -> list[str]:
     """Another record under its heading."""
     from html import escape
 
@@ -150,7 +162,7 @@ def _block(record: Record) -> list[str]:
     where = escape(f"{record.command}: {record.path.name}")
     return [
         f"<h2>{where}</h2>",
-        report_page.paragraph(_sentence(record)),
+        report_page.paragraph(_sentence(record, among)),
         report_page.preformatted(_table(record)),
     ]
 
@@ -174,7 +186,10 @@ def _draw(
     Returns:
         Names of the views, headed pictures besides, and what is missing and why.
     """
-    from fragprune_plugins.datasets.dataset import load_dataset
+    from dataclasses import replace
+
+    from fragprune_plugins.datasets.dataset import load_photographs
+    from fragprune_plugins.datasets.photographs import Photographs
     from fragprune_plugins.errors import DatasetError, ModelFileError, SidecarError
     from fragprune_plugins.measure import Candidate, report_page
 
@@ -194,11 +209,8 @@ def _draw(
             rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
             report_page.save_learning(folder / report_page.LEARNING, rows, store.values)
             learning = [("How it learned", report_page.LEARNING)]
-        dataset = load_dataset(
-            data or Path(drawn["folder"]),
-            resolution=drawn["resolution"],
-            white_background=drawn["white_background"],
-        )
+        scene = Photographs.from_dict(drawn)
+        dataset = load_photographs(replace(scene, folder=data or scene.folder))
     except (DatasetError, ModelFileError, SidecarError) as error:
         if data is not None:  # they were asked for
             raise

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,7 +14,6 @@ from fragprune_plugins.cli.common import (
     JSON,
     Command,
     Report,
-    describe,
     device_option,
     engine_option,
     open_engine,
@@ -23,6 +22,9 @@ from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import FragpruneError, UsageError
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import records
+
+if TYPE_CHECKING:
+    from fragprune_plugins.injection.launch import RunSummary
 
 
 @click.command(
@@ -100,10 +102,16 @@ def command(
     to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None
     with to_stderr or contextlib.nullcontext():
         summary = run(list(host_command), options)
-        photographs = _photographs(list(host_command), summary)
-        with current_gpu(device):
-            measured = _measure(photographs, engine, device) if evaluate and photographs else None
-    data = {
+        photographs = _photographs(summary)
+        not_compared: FragpruneError | None = summary.not_compared
+        before = after = None
+        if photographs and evaluate:
+            try:
+                with current_gpu(device):
+                    before, after = _measure(photographs, engine, device)
+            except FragpruneError as error:  # after hours of training: what was learned is saved
+                not_compared = error
+    data: dict[str, Any] = {
         "adapter": summary.adapter,
         "engine": summary.engine,
         "device": summary.device,
@@ -114,8 +122,9 @@ def command(
             "fragments_per_pixel_before": summary.fragments_before,
             "fragments_per_pixel_after": summary.fragments_after,
         },
-        "before": measured[0] if measured else None,
-        "after": measured[1] if measured else None,
+        "before": before,
+        "after": after,
+        "not_compared": not_compared and not_compared.as_dict(),
         "model_before": _text(summary.model_before),
         "model_after": _text(summary.model_after),
         "pressure": summary.curves[-1]["pressure"] if summary.curves else None,
@@ -124,26 +133,24 @@ def command(
         "seed": settings.seed,
         "settings": summary.settings,
     }
+    of_folder = records.files(summary.output, below=True) if summary.output else []
+    data["control"] = records.control_of(data, of_folder)
     if summary.iterations and summary.model_after:
-        more = {"curves": summary.curves, "photographs": photographs if measured else None}
+        more = {"curves": summary.curves, "photographs": photographs}
         records.leave(summary.model_after, "run", data | more)
-    return Report(data, _describe(summary, measured))
+    return Report(data, _describe(summary, data, not_compared))
 
 
 def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def _photographs(host_command: list[str], summary: Any) -> dict[str, Any] | None:
+def _photographs(summary: RunSummary) -> dict[str, Any] | None:
     """What our own readers need to draw what the host would; None where they cannot."""
-    source = _flag(host_command, "-s", "--source_path")
-    if not (summary.model_before and summary.model_after and source) or summary.drawing is None:
+    if not (summary.photographs and summary.model_before and summary.model_after):
         return None
-    resolution = _flag(host_command, "-r", "--resolution") or "1"
     return {
-        "folder": str(Path(source).resolve()),
-        "resolution": int(resolution) if resolution in ("1", "2", "4", "8") else 1,
-        "white_background": bool({"-w", "--white_background"} & set(host_command)),
+        **summary.photographs.as_dict(),
         "models": [str(summary.model_before.resolve()), str(summary.model_after.resolve())],
         "filtered": True,
         "drawing": summary.drawing,
@@ -152,63 +159,41 @@ def _photographs(host_command: list[str], summary: Any) -> dict[str, Any] | None
 
 def _measure(
     photographs: dict[str, Any], engine: str = "auto", device: str = "auto"
-) -> list[dict[str, Any]] | None:
+) -> list[dict[str, Any]]:
     """Before and after on held-out views, where the host ran if our engine may draw there."""
-    from fragprune_plugins.finetuning import load_dataset
+    from fragprune_plugins.datasets.dataset import load_photographs
+    from fragprune_plugins.datasets.photographs import Photographs
     from fragprune_plugins.measure import Candidate, measure
     from fragprune_plugins.storage.models import load_model
 
     rasterizer, where = open_engine(engine, "cpu" if device == "cpu" else "auto", None)
-    try:
-        dataset = load_dataset(
-            Path(photographs["folder"]),
-            resolution=photographs["resolution"],
-            white_background=photographs["white_background"],
-        )
-        models = [
-            load_model(Path(path), filtered=True, device=where) for path in photographs["models"]
-        ]
-    except FragpruneError as error:
-        logging.getLogger("fragprune").warning("not compared on held-out views: %s", error)
-        return None
+    dataset = load_photographs(Photographs.from_dict(photographs))
+    models = [load_model(Path(path), filtered=True, device=where) for path in photographs["models"]]
     candidates = [Candidate(*model, photographs["drawing"]) for model in models]
     return measure(candidates, dataset.test, engine=rasterizer)
 
 
-def _flag(words: list[str], *names: str) -> str | None:
-    """The value of a host's flag, as ``--flag value`` or ``--flag=value``."""
-    for index, word in enumerate(words):
-        head, equals, tail = word.partition("=")
-        if head in names:
-            return tail if equals else (words[index + 1] if index + 1 < len(words) else None)
-    return None
+def _describe(
+    summary: RunSummary, data: dict[str, Any], not_compared: FragpruneError | None
+) -> str:
+    from fragprune_plugins.measure.wording import describe, fewer, outcome
 
-
-def _describe(summary: Any, measured: list[dict[str, Any]] | None) -> str:
     if not summary.iterations:
         return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
     lines = []
-    if measured:
-        before, after = measured
-        fewer = before["fragments_per_pixel"] / max(after["fragments_per_pixel"], 1e-9)
-        lines += [
-            describe({"before": before, "after": after}),
-            "",
-            f"{fewer:.2f}x fewer fragments ({before['fragments_per_pixel']:.1f} -> "
-            f"{after['fragments_per_pixel']:.1f} per pixel), "
-            f"{after['psnr'] - before['psnr']:+.2f} dB PSNR on {after['views']} held-out views.",
-        ]
-    elif summary.fragments_before:
-        lines.append(
-            f"{summary.fragments_before / max(summary.fragments_after, 1e-9):.2f}x fewer fragments "
-            f"({summary.fragments_before:.1f} -> {summary.fragments_after:.1f} per pixel, "
-            "training views)."
-        )
-        if summary.model_before and summary.model_after:
-            lines.append(
-                f"Compare: fragprune compare {summary.model_before} {summary.model_after} "
-                "--data SCENE"
-            )
+    if data["before"]:
+        columns = {"before": data["before"], "after": data["after"]}
+        lines += [describe(columns), "", outcome("run", data, data["control"])]
+    else:
+        if summary.fragments_before and summary.fragments_after:
+            change = fewer(summary.fragments_before, summary.fragments_after)
+            lines.append(f"{change} on training views; frame times were not measured.")
+        if not_compared:
+            why = f"{not_compared.where}: {not_compared.found}. {not_compared.remedy}"
+            lines.append(f"Not compared on held-out views because of {why}")
+        elif summary.photographs:
+            models = f"{summary.model_before} {summary.model_after}"
+            lines.append(f"Compare: fragprune compare {models}")
     if summary.target_reached is False:
         lines.append("The target speed-up was missed by more than 5%; see --help of finetune.")
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""

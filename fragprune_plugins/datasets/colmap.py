@@ -51,8 +51,12 @@ def find_model(folder: Path) -> Path | None:
     return None
 
 
-def read(folder: Path) -> tuple[list[Row], list[Row]]:
+def read(folder: Path, images: str = "images") -> tuple[list[Row], list[Row]]:
     """Training and held-out views: name, camera, image path.
+
+    Args:
+        folder: the scene.
+        images: the folder in it that holds the images.
 
     Raises:
         DatasetError: broken files, a camera model with distortion, an image without camera.
@@ -86,7 +90,7 @@ def read(folder: Path) -> tuple[list[Row], list[Row]]:
             cx,
             cy,
         )
-        rows.append((name, camera, _image_path(folder / "images", name)))
+        rows.append((name, camera, _image_path(folder / images, name)))
     rows.sort(key=lambda row: Path(row[0]).stem)
     train = [row for index, row in enumerate(rows) if index % HOLD_OUT]
     return train, rows[::HOLD_OUT]

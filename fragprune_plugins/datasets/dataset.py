@@ -13,6 +13,7 @@ from torch import Tensor
 
 from fragprune_plugins.datasets import blender, colmap
 from fragprune_plugins.datasets.images import image_size, unreadable
+from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.types import View
@@ -88,7 +89,23 @@ class Dataset:
         return Dataset([s.to(device) for s in self.train], [s.to(device) for s in self.test])
 
 
-def load_dataset(folder: Path, *, resolution: int = 1, white_background: bool = False) -> Dataset:
+def load_photographs(photographs: Photographs) -> Dataset:
+    """What ``load_dataset`` gives for the photographs of a run."""
+    return load_dataset(
+        photographs.folder,
+        resolution=photographs.resolution,
+        white_background=photographs.white_background,
+        images=photographs.images,
+    )
+
+
+def load_dataset(
+    folder: Path,
+    *,
+    resolution: int | Resolution = 1,
+    white_background: bool = False,
+    images: str = "images",
+) -> Dataset:
     """Read a COLMAP folder (sparse/, images/) or a Blender one (transforms_train/test.json).
 
     COLMAP holds out every 8th view of the sorted names, as hosts do. Images whose size differs
@@ -96,8 +113,9 @@ def load_dataset(folder: Path, *, resolution: int = 1, white_background: bool = 
 
     Args:
         folder: the scene.
-        resolution: divide the images' sides by this.
+        resolution: divide the images' sides by this; or how large they are read.
         white_background: composite images with alpha over white instead of black, render likewise.
+        images: where a COLMAP folder holds them.
 
     Raises:
         DatasetError: neither or both layouts, missing images, an unknown camera model, sizes that
@@ -118,10 +136,11 @@ def load_dataset(folder: Path, *, resolution: int = 1, white_background: bool = 
         )
         raise DatasetError(str(folder), found, layouts, remedy)
     background = torch.full((3,), float(white_background))
-    reader = colmap if is_colmap else blender
+    size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
+    parts = colmap.read(folder, images) if is_colmap else blender.read(folder)
     train, test = (
-        [make_shot(name, camera, path, background, resolution) for name, camera, path in part]
-        for part in reader.read(folder)
+        [make_shot(name, camera, path, background, size) for name, camera, path in part]
+        for part in parts
     )
     for name, part in (("training", train), ("held-out", test)):
         if not part:
@@ -135,7 +154,7 @@ def load_dataset(folder: Path, *, resolution: int = 1, white_background: bool = 
 
 
 def make_shot(
-    name: str, camera: Camera, path: Path, background: Tensor, resolution: int = 1
+    name: str, camera: Camera, path: Path, background: Tensor, resolution: Resolution
 ) -> Shot:
     """Pair an image file with its camera; only the file's header is read here.
 
@@ -150,5 +169,4 @@ def make_shot(
             f"those of its camera, {camera.width}x{camera.height}, or that aspect",
             "Use the images that the cameras were calibrated with.",
         )
-    size = (max(1, round(width / resolution)), max(1, round(height / resolution)))
-    return Shot(name, camera.resized(*size).view(background), path)
+    return Shot(name, camera.resized(*resolution.of(width, height)).view(background), path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -133,26 +132,10 @@ def run_demo(
 
 
 def quotable(report: dict[str, Any]) -> str:
-    """The outcome in one sentence; it claims faster frames only beyond two standard errors."""
-    before, after = report["before"], report["after"]
-    gain = before["frame_ms"] - after["frame_ms"]
-    faster = gain > 2 * math.hypot(before["frame_ms_se"], after["frame_ms_se"])
-    return (
-        f"{report['fragments_ratio']:.2f}x fewer fragments per pixel "
-        f"({before['fragments_per_pixel']:.1f} to {after['fragments_per_pixel']:.1f})"
-        + (f" and {report['frame_ratio']:.2f}x faster frames" if faster else "")
-        + f" at {report['psnr_change']:+.2f} dB PSNR: {after['gaussians']:,} Gaussians, "
-        f"{after['views']} held-out views."
-    )
+    """The outcome in a line or two, the control's included."""
+    from fragprune_plugins.measure.wording import outcome
 
-
-def honest(report: dict[str, Any]) -> str:
-    """How much of the change in quality is not truncation's, in one sentence."""
-    return (
-        f"The same {report['iterations']:,} iterations with opacities alone: "
-        f"{report['control_psnr_change']:+.2f} dB PSNR "
-        f"at {report['control']['fragments_per_pixel']:.1f} fragments per pixel."
-    )
+    return outcome("run", report, report["control"])
 
 
 def _photograph(folder: Path, settings: DemoSettings) -> None:

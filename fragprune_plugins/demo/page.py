@@ -24,10 +24,10 @@ def write_page(
     out: Path, report: dict[str, Any], scene: Path, summary: RunSummary, settings: DemoSettings
 ) -> list[str]:
     """Write ``pictures/`` and ``index.html``; returns the files, relative to ``out``."""
-    from fragprune_plugins.cli.common import describe
     from fragprune_plugins.datasets.dataset import load_dataset
-    from fragprune_plugins.demo.demo import honest, quotable
+    from fragprune_plugins.demo.demo import quotable
     from fragprune_plugins.measure import Candidate, report_page
+    from fragprune_plugins.measure.wording import describe
     from fragprune_plugins.plugins.hooks import engine_for
     from fragprune_plugins.storage.models import load_model
 
@@ -53,7 +53,6 @@ def write_page(
             report_page.preformatted(
                 describe({"before": report["before"], "after": report["after"]})
             ),
-            report_page.paragraph(honest(report)),
         ],
         views=list(views),
         pictures=learning,

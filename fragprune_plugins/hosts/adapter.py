@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import json
 from abc import ABC, abstractmethod
@@ -13,7 +14,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.errors import NotComparedError, UsageError
 from fragprune_plugins.hosts.findings import Finding, Match
+from fragprune_plugins.hosts.flags import Flags
 from fragprune_plugins.hosts.seams import Seam
 from fragprune_plugins.hosts.source import HostRepo, check_seams
 
@@ -132,6 +136,10 @@ class Dialect(ABC):
             draw: answers a host call without thresholds.
         """
 
+    def names(self) -> frozenset[str]:
+        """The import names that ``modules`` answers: their packages need not be installed."""
+        return frozenset(self.modules(lambda call: None))
+
     def stands_in(self, call: HostCall) -> bool:
         """Whether ours must answer a call because the host's own function could not."""
         return False
@@ -168,9 +176,23 @@ class ConfigFile:
         return json.dumps(json.loads(text) | values)
 
 
+def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
+    """What a configuration file says, by argument name.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
+    try:
+        return config.read(path)
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"{config.flag} {path}", str(error), "a file the host can read", "Correct the command."
+        ) from error
+
+
 @dataclass(frozen=True)
 class CommandLine:
-    """How a host's training script is told what we need to tell it.
+    """How a host's training script is told what we need to tell it, and tells what we must know.
 
     Attributes:
         scripts: paths of training scripts in the checkout, the usual one first; others (render.py)
@@ -185,9 +207,14 @@ class CommandLine:
             names one it is stage 1's, not ours to start stage 2 from.
         config: the file whose values the host puts over its command line, where it has one.
         checkpoints_only: no other file holds the model, so every stage asks for a last one.
-        skipped: iterations that a run, fresh or resumed, counts and does not execute.
+        skipped: iterations of a run, fresh or resumed, in which no optimizer steps: hosts take no
+            step in their last one. Stage 2 has as many more, and so all the steps it is asked for.
         restarts: there are no checkpoints: ``resume`` names a model's PLY, from which a new run
             begins. It counts from 0 and empties its output folder, so stage 2 gets one of its own.
+        resolution: flags of the images' size, () where there are none.
+        images: flags of the folder with the images, likewise.
+        white_background: flags that ask for white behind transparent images, likewise.
+        hold_out: flags without which no view is held out; () where views always are.
     """
 
     scripts: tuple[str, ...]
@@ -202,11 +229,48 @@ class CommandLine:
     checkpoints_only: bool = False
     skipped: int = 0
     restarts: bool = False
+    resolution: tuple[str, ...] = ()
+    images: tuple[str, ...] = ()
+    white_background: tuple[str, ...] = ()
+    hold_out: tuple[str, ...] = ()
 
     def spellings(self, field: str) -> tuple[str, ...]:
         """Every spelling of a flag, the one to use last."""
         flags = getattr(self, field)
         return (flags,) if isinstance(flags, str) else flags
+
+    def read(self, arguments: list[str]) -> argparse.Namespace:
+        """The values of the flags above, by field, as the host will read them; it reads them all.
+
+        None (False for those without a value) where the command does not say.
+
+        Raises:
+            UsageError: a flag without its value, or a configuration file that cannot be read.
+        """
+        parser = Flags(add_help=False, conflict_handler="resolve")
+        options: dict[str, dict[str, Any]] = {
+            "resolution": {"type": int},
+            "images": {},
+            "white_background": {"action": "store_true"},
+            "hold_out": {"action": "store_true"},
+            "iterations": {"type": int},  # a spelling that two have is the later's
+            "output": {},
+            "source": {},
+            "save_checkpoints": {"type": int, "nargs": "*"},
+            "resume": {},
+        }
+        for name, options_of in options.items():
+            if flags := self.spellings(name):
+                parser.add_argument(*flags, dest=name, **options_of)
+        if self.config:
+            parser.add_argument(self.config.flag, dest="config", type=Path)
+        values, _ = parser.parse_known_args(arguments, argparse.Namespace(**dict.fromkeys(options)))
+        if self.config and values.config:
+            written = read_config(self.config, values.config)
+            for name in options:
+                key = ("", *self.spellings(name))[-1].lstrip("-")
+                setattr(values, name, written.get(key, getattr(values, name)))
+        return values
 
 
 class HostAdapter(ABC):
@@ -272,14 +336,29 @@ class HostAdapter(ABC):
         """The command that can resume what a training script left; the same one by default."""
         return script, arguments
 
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
+    def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
+        """What a training command reads its photographs from, and how.
+
+        Raises:
+            NotComparedError: no view is held out, or our own readers would read them otherwise.
+        """
+        raise NotComparedError(
+            self.name,
+            "photographs that only the host knows how to read",
+            "an adapter that says how",
+            "Have the adapter define photographs().",
+        )
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """How the finished model of a training command is drawn, beyond vanilla's rules.
 
         Returns:
-            Fields of ``RasterInputs``; None where no held-out view is left, or the command asks
-            for what our own readers would draw or read otherwise.
+            Fields of ``RasterInputs``.
+
+        Raises:
+            NotComparedError: our engines would draw it otherwise than the host.
         """
-        return None
+        return {}
 
     def read_model(self, ply: Path) -> SplatFile:
         """The host's own PLY."""

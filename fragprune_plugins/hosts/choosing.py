@@ -4,11 +4,76 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.hosts.findings import Finding, Match
+from fragprune_plugins.hosts.source import HostRepo, SeamState, look_up
+
+_SHORT = 100
+"""Characters of a line that sums an adapter up."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One adapter tried on one codebase.
+
+    Attributes:
+        adapter: that was tried.
+        match: what its fingerprint and its seams say.
+        seams: each as the source has it.
+    """
+
+    adapter: HostAdapter
+    match: Match
+    seams: list[SeamState]
+
+    @property
+    def held(self) -> int:
+        """Seams that are as the adapter needs them."""
+        return sum(state.status == "found" for state in self.seams)
+
+    @property
+    def looked_up(self) -> int:
+        """Seams that source can tell about."""
+        return sum(state.status != "at import" for state in self.seams)
+
+    @property
+    def order(self) -> tuple[int, float, int]:
+        """By kinds of errors, then by the share of seams that hold, then by how much is wrong."""
+        kinds = {finding.code for finding in self.errors}
+        complaint = sum(len(finding.found) for finding in self.errors)
+        return len(kinds), -self.held / max(1, self.looked_up), complaint
+
+    @property
+    def errors(self) -> list[Finding]:
+        """What speaks against the adapter."""
+        return [finding for finding in self.match.findings if finding.level == "error"]
+
+    def verdict(self) -> str:
+        """Whether it fits, and how much of it."""
+        return (
+            f"{self.adapter.name} {'fits' if self.match.fits else 'does not fit'}: "
+            f"{self.held} of {self.looked_up} seams hold"
+        )
+
+    def brief(self) -> str:
+        """The verdict, and where it is no, what speaks against it first; in one short line."""
+        line = self.verdict() + (f"; {self.errors[0].found}" if self.errors else "")
+        return line if len(line) <= _SHORT else f"{line[: _SHORT - 3].rstrip()}..."
+
+
+def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> list[Tried]:
+    """Each adapter tried on a codebase, the one that fits best first."""
+    tried = []
+    for adapter in adapters:
+        match = adapter.match(repo)
+        failed = any(finding.code == "adapter-failed" for finding in match.findings)
+        seams = [] if failed else look_up(repo, adapter.seams_for(repo))
+        tried.append(Tried(adapter, match, seams))
+    return sorted(tried, key=lambda each: each.order)
 
 
 def locate(
@@ -67,15 +132,11 @@ def choose(
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:
-        reasons = "; ".join(
-            f"{adapter.name}: {next((str(f) for f in match.findings if f.level == 'error'), '')}"
-            for adapter, match in matches
-        )
         raise UnknownHostError(
             str(repo.root),
-            f"no adapter fits ({reasons or 'none is installed'})",
+            f"no adapter fits ({_nearest(repo, wanted)})",
             "a codebase that an installed adapter knows",
-            "Run fragprune check on the folder to see every seam, or write an adapter.",
+            "Run fragprune check on the folder to see more, or write an adapter.",
         )
     tied = [match for _, match in matches if match.fits]
     selected = select(repo=repo, matches=tied) if select else None
@@ -88,3 +149,13 @@ def choose(
         "one",
         "Name it with --adapter.",
     )
+
+
+def _nearest(repo: HostRepo, adapters: Sequence[HostAdapter]) -> str:
+    """What speaks against the adapter that comes nearest."""
+    if not adapters:
+        return "none is installed"
+    best = attempt(repo, adapters)[0]
+    if len(adapters) == 1:
+        return f"{best.adapter.name}: {'; '.join(map(str, best.errors[:1]))}"
+    return f"the nearest, {best.brief()}" if best.held else "none finds anything of its host"

@@ -14,15 +14,18 @@ import logging
 import runpy
 import sys
 import tempfile
+import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 from unittest import mock
 
-from fragprune_plugins.errors import FragpruneError, Interrupted, UsageError
-from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter
+from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.errors import FragpruneError, Interrupted, NotComparedError, UsageError
+from fragprune_plugins.hosts import preflight
+from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter, read_config
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings
@@ -30,11 +33,13 @@ from fragprune_plugins.plugins.loading import installed
 
 log = logging.getLogger("fragprune")
 
+_OURS = Path(__file__).parents[1]
+
 Stage = Literal["auto", "finetune", "joint", "off"]
 
 
 class HostFailed(FragpruneError):  # noqa: N818 - the host's failure, reported
-    """The host's script ended with a non-zero exit code."""
+    """The host's script raised, or ended with a non-zero exit code."""
 
     code = "host-failed"
 
@@ -81,14 +86,16 @@ class RunSummary:
         fragments_after: per pixel over training views, at each view's last visit.
         model_before: the host's PLY of stage 1, when there is one.
         model_after: the host's PLY after stage 2; its sidecar lies beside it.
+        output: the host's folder, that of stage 1 where stage 2 has another.
         train_seconds: wall time of both stages.
         target_reached: whether a target speed-up was met within 5% on training views; None
             without a target.
         curves: a dict per learned step: step, loss, fragments_per_pixel, pressure,
             threshold_median.
         settings: of the fine-tuning.
-        drawing: fields of ``RasterInputs`` by which the host draws its model; None where its
-            command leaves no view out, or our readers do not draw what the host does.
+        photographs: by whose held-out views both models can be measured; None where they cannot.
+        drawing: fields of ``RasterInputs`` by which the host draws its models.
+        not_compared: why they cannot, where something was learned.
     """
 
     adapter: str
@@ -105,7 +112,10 @@ class RunSummary:
     target_reached: bool | None
     curves: list[dict[str, float]]
     settings: dict[str, Any]
-    drawing: dict[str, Any] | None = None
+    output: Path | None = None
+    photographs: Photographs | None = None
+    drawing: dict[str, Any] = field(default_factory=dict)
+    not_compared: NotComparedError | None = None
 
 
 @dataclass(frozen=True)
@@ -149,7 +159,8 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         UsageError: the command names no script, or there is no such device.
         EngineError: no such engine here.
         UnknownHostError: no adapter fits the script's folder.
-        HostFailed: the host ended with an error code.
+        HostNeedsError: packages that the script imports, or its data, are missing.
+        HostFailed: the host raised, or ended with an error code.
         Interrupted: Ctrl-C in stage 2; what was learned has been saved.
     """
     import time
@@ -160,8 +171,9 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     script, arguments, module = _split(command)
     plugins = installed()
     tie = partial(select_adapter, plugins=plugins)
-    package = HostRepo.installed(module.split(".")[0]) if module else None
-    if package is not None:
+    top = module.split(".")[0]
+    package = HostRepo.installed(top) if module else None
+    if package is not None and script.is_relative_to(package.root / top):
         repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
     else:
         repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
@@ -171,6 +183,10 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         engine_for(options.engine, device, plugins)  # refuse before stage 1
     started = time.perf_counter()
     trains = script in (repo.root / name for name in host.line.scripts)
+    dialect = adapter.dialect(repo)
+    answered = {*dialect.names(), *(dialect.spares() if device == "cpu" else ())}
+    data = Path(host.flags.source) if trains and host.flags.source else None
+    preflight.expect(repo, script, answered, data)
     with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
         runner = _Runner(host, repo, adapter, plugins, options, device, Path(scratch))
         if not trains or options.stage == "off":
@@ -200,6 +216,7 @@ class _Runner:
         self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
         self.options, self.device, self.scratch = options, device, scratch
         self.output = Path(host.flags.output) if host.flags.output else None
+        self.around: Path | None = None  # of stage 1, where stage 2 has a folder of its own
         self.trained: int | None = None  # iterations of stage 1, once it is over
         self.before: Path | None = None
         self.after: Path | None = None
@@ -259,7 +276,8 @@ class _Runner:
             self._note_after(total)
             return
         again = self.adapter.resumed_by(self.host.script, self.host.arguments)
-        self.host = _parse(*again, self.host.line, self.host.module)
+        module = _beside(self.host.module, again[0]) if self.host.module else ""
+        self.host = _parse(*again, self.host.line, module)
         if self.output is None and self.host.flags.output:
             self.output = Path(self.host.flags.output)
         with self._checkpoint() as (iteration, checkpoint):
@@ -268,8 +286,10 @@ class _Runner:
             total = start + settings.iterations + self.host.line.skipped
             log.info("stage 2: %d iterations from %s", settings.iterations, checkpoint)
             extra = {"iterations": total, "resume": str(checkpoint)}
-            if self.host.line.restarts and self.output is not None:
-                self.output = self.output / "finetuned"
+            own = "finetuned" if self.host.line.restarts else ""
+            own = own if settings.truncate else "control"  # what was learned stays where it is
+            if own and self.output is not None:
+                self.around, self.output = self.output, self.output / own
             if self.output is not None and str(self.output) != self.host.flags.output:
                 extra["output"] = str(self.output)
             self._execute(self._saving(total, **extra), learn=True, start=start)
@@ -330,11 +350,13 @@ class _Runner:
             engine=self.options.engine,
             drop_in=True if self.device == "cpu" else None,
             output=self.output,
+            origin=self.around,
         )
         known = set(sys.modules)
         try:
             folder = Path.cwd() if self.host.module else self.host.script.parent
-            with session, _host_process(self.host.script, arguments, self.device, folder):
+            process = _host_process(self.host.script, arguments, self.device, folder)
+            with _telling(self.host.script, self.repo.root), session, process:
                 try:
                     if self.host.module:
                         runpy.run_module(self.host.module, run_name="__main__", alter_sys=True)
@@ -369,6 +391,7 @@ class _Runner:
     def summary(self, seconds: float) -> RunSummary:
         """Everything the command line prints."""
         learned = self.learned
+        photographs, drawing, not_compared = self._comparison()
         return RunSummary(
             adapter=self.adapter.name,
             engine=learned.engine if learned else "",
@@ -384,8 +407,28 @@ class _Runner:
             target_reached=learned.target_reached if learned else None,
             curves=self.curves,
             settings=self.options.settings.as_dict(),
-            drawing=self.adapter.drawing(self.repo, self.host.arguments),
+            output=self.around or self.output,
+            photographs=photographs,
+            drawing=drawing,
+            not_compared=not_compared,
         )
+
+    def _comparison(self) -> tuple[Photographs | None, dict[str, Any], NotComparedError | None]:
+        """By which views and how before and after are drawn, or why they cannot be."""
+        if not self.learned:
+            return None, {}, None
+        try:
+            if not (self.before and self.after):
+                raise NotComparedError(
+                    f"--stage {self.options.stage}",
+                    f"no model of {'before' if self.after else 'after'} the learning",
+                    "one that the host saved",
+                    "Name two models to fragprune compare.",
+                )
+            drawing = self.adapter.drawing(self.repo, self.host.arguments)
+            return self.adapter.photographs(self.repo, self.host.arguments), drawing, None
+        except NotComparedError as error:
+            return None, {}, error
 
     def _iteration_of(self, resumed: Path) -> int:
         """The iteration that a run from this file goes on after."""
@@ -458,55 +501,29 @@ def _split(command: list[str]) -> tuple[Path, list[str], str]:
 
 
 def _script_of(module: str) -> Path:
-    """The file of an installed module, found without importing its package."""
-    repo = HostRepo.installed(module.split(".")[0])
-    script = repo.path(module) if repo else None
-    if script is None:
-        raise UsageError(
-            f"python -m {module}",
-            "no such module",
-            "one of an installed package",
-            "Install the package, or check the name.",
-        )
-    return script
+    """The file that ``python -m`` runs, found without importing: here, else an installed one."""
+    for repo in (HostRepo(Path.cwd()), HostRepo.installed(module.split(".")[0])):
+        script = repo.path(module) if repo else None
+        if script is not None and script.name == "__init__.py":
+            script = repo.path(f"{module}.__main__") if repo else None
+        if script is not None:
+            return script
+    raise UsageError(
+        f"python -m {module}",
+        "no such module",
+        "one in this folder, or of an installed package",
+        "Go to the host's folder, install the package, or check the name.",
+    )
 
 
-class _Flags(argparse.ArgumentParser):
-    """Says what is wrong with a flag as we say everything."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(
-            "the host's command", message, "flags the host understands", "Correct the command."
-        )
+def _beside(module: str, script: Path) -> str:
+    """The name of a script of the same folder as a module's."""
+    return ".".join([*module.split(".")[:-1], script.stem])
 
 
 def _parse(script: Path, arguments: list[str], line: CommandLine, module: str = "") -> _Invocation:
     """Read the few flags we need; the host parses them all itself."""
-    parser = _Flags(add_help=False)
-    parser.add_argument(*line.spellings("iterations"), dest="iterations", type=int)
-    parser.add_argument(*line.output, dest="output")
-    parser.add_argument(*line.source, dest="source")
-    parser.add_argument(line.save_checkpoints, dest="save_checkpoints", type=int, nargs="*")
-    parser.add_argument(*line.spellings("resume"), dest="resume")
-    if line.config:
-        parser.add_argument(line.config.flag, dest="config", type=Path)
-    flags, _ = parser.parse_known_args(arguments)
-    if line.config and flags.config:
-        values = read_config(line.config, flags.config)
-        for name in set(vars(flags)) - {"config"}:
-            key = line.spellings(name)[-1].lstrip("-")
-            setattr(flags, name, values.get(key, getattr(flags, name)))
-    return _Invocation(script, arguments, flags, line, module)
-
-
-def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
-    """What a configuration file says, by argument name."""
-    try:
-        return config.read(path)
-    except (OSError, ValueError) as error:
-        raise UsageError(
-            f"{config.flag} {path}", str(error), "a file the host can read", "Correct the command."
-        ) from error
+    return _Invocation(script, arguments, line.read(arguments), line, module)
 
 
 def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) -> None:
@@ -589,6 +606,41 @@ def current_gpu(device: str) -> Iterator[None]:
         return
     with torch.cuda.device(device), mock.patch.object(torch.cuda, "set_device"):
         yield
+
+
+@contextlib.contextmanager
+def _telling(script: Path, root: Path) -> Iterator[None]:
+    """What a host raises is told in a line; the whole traceback goes to stderr, for who needs it.
+
+    Args:
+        script: that runs.
+        root: of the host.
+    """
+    try:
+        yield
+    except FragpruneError:
+        raise
+    except Exception as error:
+        traceback.print_exc()
+        frames = traceback.extract_tb(error.__traceback__)
+        inside = [frame for frame in frames if Path(frame.filename).is_relative_to(root)]
+        where = script.name
+        if inside:
+            file = Path(inside[-1].filename).relative_to(root)
+            where = f"{file}:{inside[-1].lineno} in {inside[-1].name}"
+        message = "".join(str(error).strip().splitlines()[:1])
+        remedy = "Read the traceback above."
+        lacking = (error.name or "").split(".")[0] if isinstance(error, ImportError) else ""
+        if isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
+            remedy = f"Run: {preflight.install([preflight.Missing(lacking, where)])}"
+        elif Path(frames[-1].filename).is_relative_to(_OURS):
+            remedy = "It came up in fragprune: report it with the traceback above."
+        raise HostFailed(
+            where,
+            f"{type(error).__name__}{f': {message}' if message else ''}",
+            f"{script.name} to come to its end",
+            remedy,
+        ) from error
 
 
 @contextlib.contextmanager

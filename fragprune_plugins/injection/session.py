@@ -71,6 +71,7 @@ class Session:
         drop_in: put our stand-ins in place of the host's compiled packages: True, False, or None
             for those that cannot be imported.
         output: the host's output folder, when known.
+        origin: stage 1's, where stage 2 has another.
     """
 
     def __init__(
@@ -88,13 +89,14 @@ class Session:
         engine: str = "auto",
         drop_in: bool | None = None,
         output: Path | None = None,
+        origin: Path | None = None,
     ) -> None:
         self.adapter, self.repo, self.plugins = adapter, repo, plugins
         self.settings = settings or Settings()
         self.learn, self.from_step, self.freeze = learn, from_step, freeze
         self.start = start
         self.schedule = schedule or schedule_for(self.settings, plugins)
-        self.output = output
+        self.output, self.origin = output, origin
         self.curves: list[dict[str, float]] = []
         self._engine_name = engine
         self._engines: dict[torch.device, Engine] = {}
@@ -197,7 +199,7 @@ class Session:
         """What was gained; observers are told."""
         state = self.last_state
         stage = state.stage if state else None
-        if stage is not None:
+        if stage is not None and stage.taken == stage.steps:
             stage.close()
         done = stage.progress() if stage else None
         summary = Summary(

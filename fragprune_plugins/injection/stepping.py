@@ -126,7 +126,7 @@ def begin_step(session: Session, model: Any, state: ModelState) -> None:
     state.steps += 1
     if session.standing_still(model):
         if not state.prepared:
-            session.adapter.prepare_stage2(model, session.output)
+            session.adapter.prepare_stage2(model, session.origin or session.output)
             state.prepared = True
         freeze(session, model)
     if state.stage is not None and state.steps > session.from_step:

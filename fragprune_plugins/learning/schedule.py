@@ -29,7 +29,8 @@ class Settings:
         train: what moves beside the thresholds: "opacity", "appearance" (opacity and SH) or "all".
         pressure: lambda, weight of drawn fragments per pixel in the loss; None for one that
             follows the loss per fragment.
-        target_speedup: fragments before over after to steer for; overrides pressure.
+        target_speedup: fragments of the untruncated model as it came in over fragments drawn now,
+            on the training views that calibration measures, to steer for; overrides pressure.
         threshold_lr: initial learning rate of threshold logits.
         opacity_lr: initial learning rate of opacity logits in stage 2.
         truncate: False trains without thresholds, the honest control for a comparison.

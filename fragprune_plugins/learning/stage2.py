@@ -55,7 +55,7 @@ class Progress:
     """What a stage 2 has done so far.
 
     Attributes:
-        steps: begun.
+        steps: that the driver's optimizer took.
         gaussians: N.
         fragments_before: per pixel, mean over views; None where no view was drawn.
         fragments_after: likewise.
@@ -98,7 +98,8 @@ class Stage2:
         self.store, self.settings = store, settings
         self.schedule = schedule or Schedule(settings)
         self.pressure = settings.make_pressure()
-        self.steps = 0
+        self.steps = 0  # begun
+        self.taken = 0  # the last that the driver's optimizer took: hosts take none at their end
         self.plan: StepPlan | None = None
         self._truncate, self._again, self._watch = truncate, views, watch
         self._held = False  # thresholds have met their target and stay
@@ -195,6 +196,7 @@ class Stage2:
 
     def end(self) -> None:
         """The driver's optimizer has stepped: so do the thresholds."""
+        self.taken = self.steps
         if self.learning:
             assert self.plan is not None
             self.store.step(self.plan.threshold_lr)
@@ -232,7 +234,7 @@ class Stage2:
         if target is not None:
             reached = speedup is not None and abs(target / speedup - 1) <= TARGET_TOLERANCE
         return Progress(
-            steps=self.steps,
+            steps=self.taken,
             gaussians=len(self.store),
             fragments_before=before,
             fragments_after=after,

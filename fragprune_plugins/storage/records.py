@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from fragprune_plugins.storage.atomic import replacing
 
 SUFFIX = ".fragprune.json"
 FORMAT = "fragprune-record-1"
+_SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
 
 
 @dataclass(frozen=True)
@@ -30,17 +33,32 @@ class Record:
     data: dict[str, Any]
 
 
-def leave(beside: Path, command: str, data: dict[str, Any]) -> Path:
+def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
     """Write a record beside a result, in place of the one an earlier command left there.
 
     Raises:
         OutputError: the place cannot be written.
     """
-    target = Path(beside).with_suffix(SUFFIX)
+    target = path_beside(model)
     content = {"format": FORMAT, "command": command, "data": data}
     with replacing(target) as temporary:
         temporary.write_text(json.dumps(strict(content), indent=1) + "\n", encoding="utf-8")
     return target
+
+
+def path_beside(model: Path) -> Path:
+    """Where the record of a result lies."""
+    return Path(model).with_suffix(SUFFIX)
+
+
+def beside(model: Path) -> Record | None:
+    """The record of the command that left a model; None without one.
+
+    Raises:
+        RecordError: it cannot be read.
+    """
+    path = path_beside(model)
+    return _read(path) if path.exists() else None
 
 
 def find(folder: Path) -> list[Record]:
@@ -49,15 +67,56 @@ def find(folder: Path) -> list[Record]:
     Raises:
         RecordError: there is none, or one cannot be read.
     """
-    files = sorted(Path(folder).rglob(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime)
-    if not files:
+    found = files(folder, below=True)
+    if not found:
         raise RecordError(
             str(folder),
             f"no file *{SUFFIX} in it or below",
             "a folder in which fragprune run, finetune, or compare and profile with --out, worked",
             "Run one of them, then report.",
         )
-    return [_read(path) for path in files]
+    return [_read(path) for path in found]
+
+
+def files(folder: Path, *, below: bool = False) -> list[Path]:
+    """The files of records in a folder, or also below it, oldest first."""
+    find_files = Path(folder).rglob if below else Path(folder).glob
+    return sorted(find_files(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime)
+
+
+def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
+    """What was measured after the control of a fine-tuning, where one of the files records it.
+
+    The control began with the same model and learned for as many iterations, likewise but without
+    truncation. Files that are no records are passed over.
+
+    Args:
+        data: of the fine-tuning, "before", "iterations" and "settings" among it.
+        among: files to look through; the last that fits counts.
+    """
+    for path in reversed(among):
+        with contextlib.suppress(RecordError):
+            other = _read(path).data
+            if _is_control(other, data):
+                after: dict[str, Any] = other["after"]
+                return after
+    return None
+
+
+def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
+    mine, theirs = data.get("settings", {}), other.get("settings", {})
+    begun, before = other.get("before"), data.get("before")
+    return bool(
+        mine.get("truncate")
+        and theirs.get("truncate") is False
+        and all(mine[key] == theirs.get(key) for key in ("train", "opacity_lr"))
+        and other["iterations"] == data["iterations"]
+        and begun
+        and before
+        and all(begun[key] == before[key] for key in ("views", "gaussians"))
+        and begun["psnr"] is not None
+        and abs(begun["psnr"] - before["psnr"]) < _SAME_DB
+    )
 
 
 def _read(path: Path) -> Record:

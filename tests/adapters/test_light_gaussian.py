@@ -249,7 +249,7 @@ def trained(mini, photographs, tmp_path_factory):
     """Trained with pruning, then fine-tuned; a checkpoint of each stage."""
     out = tmp_path_factory.mktemp("trained")
     words = command(mini, "train_densify_prune.py", photographs, out, 20, "--sh_degree", 2)
-    words += ["--prune_iterations", "15", "18", "22", "--checkpoint_iterations", "28"]
+    words += ["--prune_iterations", "15", "18", "22", "--checkpoint_iterations", "29"]
     return run(words, OPTIONS), out
 
 
@@ -257,7 +257,7 @@ def test_training_resumes_itself_and_pruning_stands_still(trained):
     summary, out = trained
     assert (summary.adapter, summary.iterations) == ("light-gaussian", 8)
     before, after = summary.model_before, summary.model_after
-    assert (before.parent.name, after.parent.name) == ("iteration_20", "iteration_28")
+    assert (before.parent.name, after.parent.name) == ("iteration_20", "iteration_29")
     assert frozen_differences(before, after) == []  # though --prune_iterations names 22
     store, info = sidecar.load(after)
     assert len(store) == info.rows == summary.gaussians
@@ -279,9 +279,9 @@ def survivors(before, after):
 def test_pruning_keeps_the_survivors_thresholds(mini, photographs, trained, tmp_path, start):
     """Saved one iteration after pruning: no parameter has moved yet."""
     summary, out = trained
-    at = 28 if start == "checkpoint" else 0
+    at = 29 if start == "checkpoint" else 0
     given = {
-        "checkpoint": ("--start_checkpoint", out / "chkpnt28.pth"),
+        "checkpoint": ("--start_checkpoint", out / "chkpnt29.pth"),
         "point cloud": ("--start_pointcloud", summary.model_after),
     }[start]
     words = command(mini, "prune_finetune.py", photographs, tmp_path, at + 2, "--sh_degree", 2)
@@ -300,22 +300,22 @@ def test_pruning_keeps_the_survivors_thresholds(mini, photographs, trained, tmp_
 @pytest.mark.parametrize("given", ["checkpoint", "point cloud"])
 def test_pruning_is_stage_one_of_its_own_script(mini, photographs, trained, tmp_path, given):
     summary, out = trained
-    at = 28 if given == "checkpoint" else 0
+    at = 29 if given == "checkpoint" else 0
     words = command(mini, "prune_finetune.py", photographs, tmp_path, at + 6, "--sh_degree", 2)
     words += ["--prune_percent", "0.3", "--prune_iterations", str(at + 1)]
     if given == "checkpoint":
-        words += ["--start_checkpoint", str(out / "chkpnt28.pth")]
+        words += ["--start_checkpoint", str(out / "chkpnt29.pth")]
     else:
         words += ["--start_pointcloud", str(summary.model_after)]
-        shutil.copy(out / "chkpnt28.pth", tmp_path)  # of another run, and later
+        shutil.copy(out / "chkpnt29.pth", tmp_path)  # of another run, and later
     again = run(words, OPTIONS)
     assert again.gaussians < 0.75 * summary.gaussians
     assert again.iterations == 8
     names = [path.parent.name for path in (again.model_before, again.model_after)]
-    assert names == [f"iteration_{at + 6}", f"iteration_{at + 14}"]
+    assert names == [f"iteration_{at + 6}", f"iteration_{at + 15}"]
     assert frozen_differences(again.model_before, again.model_after) == []
     stage1, stage2 = (sidecar.load(path)[0] for path in (again.model_before, again.model_after))
-    assert (stage1.steps, stage2.steps) == (7, 14)  # thresholds came along and learned on
+    assert (stage1.steps, stage2.steps) == (8, 16)  # thresholds came along and learned on
 
 
 def test_thresholds_learn_on_while_the_host_prunes(mini, photographs, trained, tmp_path):
@@ -335,14 +335,14 @@ def test_a_point_cloud_alone_is_resumed_with_the_hosts_weight_decay(
 ):
     summary, _ = trained
     made = tmp_path / "made.pth"
-    LightGaussian().checkpoint_from_ply(summary.model_after, 28, made)
+    LightGaussian().checkpoint_from_ply(summary.model_after, 29, made)
     (capture, _) = torch.load(made, weights_only=False)
     state = LightGaussian().checkpoint_state(capture)
     assert {group["weight_decay"] for group in state["param_groups"]} == {0.01}
     shutil.copytree(summary.model_after.parent, tmp_path / "point_cloud" / "iteration_28")
     words = command(mini, "train_densify_prune.py", photographs, tmp_path, 20, "--sh_degree", 2)
     again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
-    assert again.model_after.parent.name == "iteration_36"
+    assert again.model_after.parent.name == "iteration_37"
     assert frozen_differences(again.model_before, again.model_after) == []
 
 
@@ -352,14 +352,14 @@ def test_finetune_alone_resumes_the_checkpoint_that_pruning_was_given(
     """Asked for stage 2 only, the host's pruning is what has to wait."""
     summary, out = trained
     words = command(mini, "prune_finetune.py", photographs, tmp_path, 40, "--sh_degree", 2)
-    words += ["--prune_iterations", "29", "--start_checkpoint", str(out / "chkpnt28.pth")]
+    words += ["--prune_iterations", "30", "--start_checkpoint", str(out / "chkpnt29.pth")]
     again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
     assert (again.gaussians, again.iterations) == (summary.gaussians, 8)
     assert frozen_differences(summary.model_after, again.model_after) == []
 
 
 def distilling(mini, photographs, out, trained, iterations, *more):
-    checkpoint = trained[1] / "chkpnt28.pth"
+    checkpoint = trained[1] / "chkpnt29.pth"
     words = command(mini, "distill_train.py", photographs, out, iterations, "--sh_degree", 2)
     words += ["--start_checkpoint", str(checkpoint), "--teacher_model", str(checkpoint)]
     return [*words, "--new_max_sh", "1", *more]
@@ -367,8 +367,8 @@ def distilling(mini, photographs, out, trained, iterations, *more):
 
 def degree_two(out):
     """Checkpoints of short runs stand at band 0; distillation takes a band away."""
-    capture, iteration = torch.load(out / "chkpnt28.pth", weights_only=False)
-    torch.save(((2, *capture[1:]), iteration), out / "chkpnt28.pth")
+    capture, iteration = torch.load(out / "chkpnt29.pth", weights_only=False)
+    torch.save(((2, *capture[1:]), iteration), out / "chkpnt29.pth")
 
 
 def test_distillation_is_resumed_by_the_training_script(mini, photographs, trained, tmp_path):
@@ -377,7 +377,7 @@ def test_distillation_is_resumed_by_the_training_script(mini, photographs, train
     summary = run(words, OPTIONS)
     assert summary.iterations == 8
     assert [read_ply(p).sh_degree for p in (summary.model_before, summary.model_after)] == [1, 1]
-    assert summary.model_after.parent.name == "iteration_41"
+    assert summary.model_after.parent.name == "iteration_42"
     assert frozen_differences(summary.model_before, summary.model_after) == []
     student, teacher = (
         sidecar.load(summary.model_before)[0],

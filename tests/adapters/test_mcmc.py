@@ -261,7 +261,7 @@ def test_what_stage_two_changes_wins_over_the_configuration_file(mini, photograp
     config.write_text(json.dumps(values))
     summary = run(command(mini, photographs, "elsewhere", 5, "--config", config), OPTIONS)
     assert summary.model_before == out / "point_cloud" / "iteration_12" / "point_cloud.ply"
-    assert summary.model_after == out / "point_cloud" / "iteration_20" / "point_cloud.ply"
+    assert summary.model_after == out / "point_cloud" / "iteration_21" / "point_cloud.ply"
     assert 150 < summary.gaussians <= 170
     assert json.loads(config.read_text()) == values
 

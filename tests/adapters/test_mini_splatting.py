@@ -173,7 +173,7 @@ def test_stage_two_stands_still_where_points_would_be_made_anew(
         assert torch.equal(getattr(before, name), getattr(after, name))
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == len(before.xyz)
-    assert store.steps == 7  # hosts take no step in their last iteration
+    assert store.steps == 8
     assert before.f_rest.shape[1] == 0  # a model saved before simplification has no f_rest
 
 
@@ -209,15 +209,15 @@ def test_thresholds_learn_through_new_points_and_simplification(
 
 def test_a_run_without_learning_keeps_the_thresholds_of_its_checkpoint(mini, photographs, tmp_path):
     """Simplified on, from a checkpoint of stage 2: survivors keep theirs."""
-    out, later = tmp_path / "out", ["--simp_iteration2", 40, "--checkpoint_iterations", 22]
+    out, later = tmp_path / "out", ["--simp_iteration2", 40, "--checkpoint_iterations", 23]
     summary = run(command(mini, "ms", photographs, out, 16, *later), OPTIONS)
     before, whole = read_ply(summary.model_after), sidecar.load(summary.model_after)[0]
-    more = ["--start_checkpoint", out / "chkpnt22.pth", "--simp_iteration2", 23]
+    more = ["--start_checkpoint", out / "chkpnt23.pth", "--simp_iteration2", 24]
     run(
-        command(mini, "ms", photographs, tmp_path / "b", 24, *more),
+        command(mini, "ms", photographs, tmp_path / "b", 25, *more),
         replace(OPTIONS, stage="off"),
     )
-    model = tmp_path / "b/point_cloud/iteration_24/point_cloud.ply"
+    model = tmp_path / "b/point_cloud/iteration_25/point_cloud.ply"
     after, store = read_ply(model), sidecar.load(model)[0]
     assert len(store) == len(after.xyz) < len(before.xyz)
     where = {row.numpy().tobytes(): index for index, row in enumerate(before.f_dc)}
@@ -279,8 +279,8 @@ def test_another_package_of_the_hosts_name_is_refused(mini, photographs, tmp_pat
 def compressed(mini, photographs, tmp_path_factory):
     out = tmp_path_factory.mktemp("compressed")
     summary = run(command(mini, "ms", photographs, out, 16), OPTIONS)
-    run([str(mini / "ms_c/run.py"), "-m", str(out), "--iteration", "22"], OPTIONS)
-    return out, summary, out / "point_cloud/iteration_22/compressed/compressed_gs.npz"
+    run([str(mini / "ms_c/run.py"), "-m", str(out), "--iteration", "23"], OPTIONS)
+    return out, summary, out / "point_cloud/iteration_23/compressed/compressed_gs.npz"
 
 
 def test_compression_takes_each_gaussians_threshold_along(compressed):
@@ -303,8 +303,8 @@ def test_what_is_decompressed_is_drawn_with_its_thresholds(mini, compressed):
     pictures = torch.load(out / "decompressed.pt")
     sidecar.path_beside(file).rename(file.with_suffix(".aside"))
     try:
-        alone = [str(mini / "ms_c/run.py"), "-m", str(out), "--iteration", "22"]
-        ply = out / "point_cloud/iteration_22/point_cloud.ply"
+        alone = [str(mini / "ms_c/run.py"), "-m", str(out), "--iteration", "23"]
+        ply = out / "point_cloud/iteration_23/point_cloud.ply"
         sidecar.path_beside(ply).rename(ply.with_suffix(".aside"))
         run(alone, OPTIONS)
         assert not sidecar.path_beside(file).exists()

@@ -146,6 +146,7 @@ def test_a_step_of_several_views_feels_the_mean_of_their_pressures():
         for index, grad in enumerate(together):
             expected = torch.stack([grads[index] for grads in alone]).mean(dim=0)
             torch.testing.assert_close(grad, expected, rtol=1e-5, atol=1e-9)
+        host.driver.descend(model)
         host.finish()
         single, batch = host.curves[-3:-1], host.curves[-1]
         assert batch["fragments_per_pixel"] == pytest.approx(

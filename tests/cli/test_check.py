@@ -51,7 +51,7 @@ def test_the_host_that_fits_with_every_seam_in_its_place(host):
             file, line = seam["at"].split(":")
             name = seam["seam"].split(":")[1].split(".")[-1]
             assert f"def {name}(" in (host / file).read_text().splitlines()[int(line) - 1]
-    text = run("check", host)
+    text = run("check", host, "--verbose")
     assert text.exit_code == 0
     assert f"{MODEL}:{line_of(host, MODEL, 'def densify_and_split')}" in text.stdout
     assert f"fragprune run -- python {host / 'train.py'}" in text.stdout
@@ -70,6 +70,33 @@ def test_nothing_is_imported(host, python):
     assert python(code, host) == [0, False, False]
 
 
+def test_a_host_that_fits_needs_no_line_of_any_other_adapter(host):
+    text = run("check", host).stdout
+    assert text.splitlines()[1].startswith("vanilla-3dgs fits: ")
+    assert "does not fit" not in text
+    assert "others do not fit (--verbose says why)" in text
+
+
+def test_one_that_fits_none_has_a_short_line_an_adapter_the_nearest_first(host):
+    mutations.rename_function(HostRepo(host), CLONE)
+    lines = [line for line in run("check", host).stdout.splitlines() if "does not fit" in line]
+    assert lines[0].startswith("vanilla-3dgs does not fit: ")
+    assert len(lines) == len({line.split(" does not")[0] for line in lines}) > 1
+    assert max(map(len, lines)) <= 100
+
+
+def test_packages_that_it_imports_and_that_are_not_here_are_listed(host):
+    renderer = host / RENDERER
+    renderer.write_text("import cv2_of_tests, icecream_of_tests\n" + renderer.read_text())
+    report = run_json("check", host)
+    assert report["fits"] == "vanilla-3dgs"
+    assert [(each["module"], each["at"]) for each in report["missing"]] == [
+        ("cv2_of_tests", f"{RENDERER}:1"),
+        ("icecream_of_tests", f"{RENDERER}:1"),
+    ]
+    assert "  pip install cv2_of_tests icecream_of_tests\n" in run("check", host).stdout
+
+
 CLONE = Seam(Role.PARENTS, "scene.gaussian_model", "GaussianModel.densify_and_clone")
 RENDER = Seam(Role.VIEW, "gaussian_renderer", "render")
 
@@ -82,7 +109,7 @@ def test_a_renamed_method_is_missing_from_its_class(host):
     assert (error["code"], error["where"]) == ("seam-missing", f"{CLONE} ({at})")
     (seam,) = [s for s in report["seams"] if s["seam"] == str(CLONE)]
     assert (seam["status"], seam["at"]) == ("missing", at)
-    assert f"MISSING in {at}" in run("check", host).stdout
+    assert f"MISSING in {at}" in run("check", host, "--verbose").stdout
 
 
 def test_a_dropped_parameter_is_named_where_the_method_is(host):
@@ -92,7 +119,8 @@ def test_a_dropped_parameter_is_named_where_the_method_is(host):
     (error,) = [f for f in report["findings"] if f["level"] == "error"]
     assert (error["code"], error["where"]) == ("seam-signature", f"{CLONE} ({MODEL}:{line})")
     assert error["expected"] == "also scene_extent"
-    assert f"CHANGED at {MODEL}:{line}: parameters (grads, " in run("check", host).stdout
+    text = run("check", host, "--verbose").stdout
+    assert f"CHANGED at {MODEL}:{line}: parameters (grads, " in text
 
 
 def test_another_number_of_values_from_the_rasterizer_is_named_in_its_line(host):
@@ -135,7 +163,7 @@ def test_public_states_are_told_apart(tmp_path, state):
 def test_a_cousin_is_called_by_its_name(tmp_path, marker, cousin):
     skeleton(tmp_path, **{marker: ""})
     refused(tmp_path)
-    result = run("check", tmp_path)
+    result = run("check", tmp_path, "--verbose")
     assert f"{marker}, which belongs to {cousin}" in result.stdout
     assert "No adapter fits" in result.stdout
 
@@ -145,7 +173,7 @@ def test_a_folder_that_is_no_host(tmp_path):
     report = refused(tmp_path)
     assert all(each["seams_held"] == 0 for each in report["adapters"])
     text = run("check", tmp_path).stdout
-    assert "None of these adapters finds anything of its host" in text
+    assert "adapters finds anything of its host" in text
     assert "write-an-adapter.md" in text
 
 

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 from skeleton import skeleton
 
-from fragprune_plugins.errors import Interrupted, UnknownHostError, UsageError
+from fragprune_plugins.errors import HostNeedsError, Interrupted, UnknownHostError, UsageError
 from fragprune_plugins.injection.launch import (
     HostFailed,
     RunOptions,
@@ -176,11 +176,43 @@ def test_a_host_that_ends_well_is_no_failure(host, end):
     run([host(f"import sys; {end}")], CPU)
 
 
-def test_a_hosts_exception_is_its_own_and_nothing_stays_patched(host):
-    script = host("import diff_gaussian_rasterization, scene; raise KeyError('theirs')")
-    with pytest.raises(KeyError, match="theirs"):
+def test_a_hosts_exception_is_told_in_a_line_and_nothing_stays_patched(host, capsys):
+    host("def fail():\n    raise KeyError('theirs\\nand more')", name="neighbour.py")
+    script = host("import diff_gaussian_rasterization, scene, neighbour\nneighbour.fail()")
+    with pytest.raises(HostFailed) as caught:
         run([script], CPU)
+    assert caught.value.where == "neighbour.py:2 in fail"
+    assert caught.value.found == r"KeyError: 'theirs\nand more'"
+    assert isinstance(caught.value.__cause__, KeyError)
+    stderr = capsys.readouterr().err
+    assert stderr.startswith("Traceback (most recent call last)")
+    assert f"{script}" in stderr
     assert not {"scene", "diff_gaussian_rasterization"} & set(sys.modules)
+
+
+def test_a_package_that_is_missed_only_while_the_host_runs_is_named_with_the_way_to_get_it(host):
+    with pytest.raises(HostFailed, match="Run: pip install opencv_of_tests"):
+        run([host("def late():\n    import opencv_of_tests.core\nlate()")], CPU)
+
+
+def test_what_a_host_imports_and_reads_is_looked_at_before_it_runs(host, tmp_path):
+    """All at once, not one traceback after the other."""
+    host("import icecream_of_tests", name="neighbour.py")
+    script = host("raise SystemExit('it ran')\nimport neighbour, cv2_of_tests")
+    with pytest.raises(HostNeedsError) as caught:
+        run([script, "-s", str(tmp_path / "nowhere")], CPU)
+    assert "cv2_of_tests (train.py:2), icecream_of_tests (neighbour.py:1)" in caught.value.found
+    assert f"no folder {tmp_path / 'nowhere'}" in caught.value.found
+    assert "pip install cv2_of_tests icecream_of_tests" in caught.value.remedy
+
+
+def test_the_hosts_script_may_be_named_as_a_module_of_its_folder(host, monkeypatch):
+    script = Path(host("import sys; sys.exit('it ran')"))
+    monkeypatch.chdir(script.parent)
+    with pytest.raises(HostFailed, match="it ran"):
+        run(["python", "-m", "train"], CPU)
+    with pytest.raises(UsageError, match="no such module"):
+        run(["python", "-m", "evaluate"], CPU)
 
 
 def test_ctrl_c_before_anything_was_learned_is_stated(host):
@@ -226,7 +258,10 @@ for iteration in args.checkpoint_iterations:
 
 
 def test_stage_one_is_asked_for_a_checkpoint_and_stage_two_resumes_it(host, tmp_path):
-    """The number of iterations is nowhere on the command line: it is read from the source."""
+    """The number of iterations is nowhere on the command line: it is read from the source.
+
+    Stage 2 has one more than asked for: the host takes no step in its last.
+    """
     from fragprune_plugins.learning.schedule import Settings
 
     out = tmp_path / "out"
@@ -235,11 +270,11 @@ def test_stage_one_is_asked_for_a_checkpoint_and_stage_two_resumes_it(host, tmp_
     checkpoint = out / "chkpnt12345.pth"
     assert (out / "log").read_text().splitlines() == [
         "12345 [12345] None",
-        f"12445 [] {checkpoint}",
+        f"12446 [] {checkpoint}",
     ]
     (out / "log").unlink()
     run([host(STAGES), "-m", str(out), "--start_checkpoint", str(checkpoint)], options)
-    assert (out / "log").read_text().splitlines() == [f"12445 [] {checkpoint}"]
+    assert (out / "log").read_text().splitlines() == [f"12446 [] {checkpoint}"]
 
 
 def test_insisting_on_a_gpu_that_is_not_there_is_a_usage_error(host):

@@ -9,6 +9,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from fragprune_plugins.datasets.photographs import Photographs, Resolution
+from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.adapter import CommandLine, Dialect, HostAdapter, HostCall
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco.contract import Contract, read_calls
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
+CAMERAS = "utils.camera_utils"
+WIDEST = 1600
+"""Pixels: hosts shrink wider images to this width where no size is asked for (-r -1)."""
 
 GROUPS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 """Names and order of the host optimizer's param groups; load_state_dict matches by position."""
@@ -113,6 +118,10 @@ class GraphdecoDialect(Dialect):
 
         return CUDA_HOME is not None and is_available()
 
+    def names(self) -> frozenset[str]:
+        """The rasterizer's and simple_knn's, told without importing torch."""
+        return frozenset((self.package, "simple_knn", "simple_knn._C"))
+
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizer and simple_knn."""
         from fragprune_plugins.hosts.graphdeco import stand_ins
@@ -201,7 +210,10 @@ class GraphdecoAdapter(HostAdapter):
         )
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """The flags of ``train.py``; the iteration count's default is read from the source."""
+        """The flags of ``train.py``; the iteration count's default is read from the source.
+
+        The last iteration takes no step.
+        """
         return CommandLine(
             scripts=self.scripts,
             iterations="--iterations",
@@ -210,6 +222,11 @@ class GraphdecoAdapter(HostAdapter):
             save_checkpoints="--checkpoint_iterations",
             resume="--start_checkpoint",
             default_iterations=int(default(repo, "OptimizationParams", "iterations", 30_000)),
+            skipped=1,
+            resolution=("-r", "--resolution"),
+            images=("-i", "--images"),
+            white_background=("-w", "--white_background"),
+            hold_out=("--eval",),
         )
 
     def rows(self, model: Any) -> int:
@@ -322,10 +339,35 @@ class GraphdecoAdapter(HostAdapter):
         with replacing(target) as temporary:
             torch.save((capture, iteration), temporary)
 
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any] | None:
-        """As vanilla draws, where the command holds views out (``--eval``)."""
-        foreign = {"--antialiasing", "--train_test_exp"} & set(arguments)
-        return {} if "--eval" in arguments and not foreign else None
+    def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
+        """The command's, where it holds views out (``--eval``)."""
+        line = self.command_line(repo)
+        flags = line.read(arguments)
+        if line.hold_out and not flags.hold_out:
+            raise NotComparedError(
+                "the host's command",
+                f"no {line.hold_out[-1]}: every view is trained on",
+                "views that are held out",
+                f"Add {line.hold_out[-1]} to both stages.",
+            )
+        return Photographs(
+            Path(flags.source or ""),
+            resolution(repo, flags.resolution),
+            bool(flags.white_background),
+            flags.images or "images",
+        )
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
+        """As vanilla draws."""
+        for flag in ("--antialiasing", "--train_test_exp"):
+            if flag in arguments:
+                raise NotComparedError(
+                    "the host's command",
+                    f"{flag}, which our own readers do not draw by",
+                    "pictures as the host draws them",
+                    "Draw and measure with the host's render.py and metrics.py.",
+                )
+        return {}
 
     def model_file(self, output: Path, iteration: int) -> Path:
         """Where ``scene.save`` writes."""
@@ -351,6 +393,43 @@ def reaches(grads: Tensor, threshold: Any, rows: int) -> Tensor:
     padded[: len(grads)] = grads
     reached: Tensor = padded >= threshold
     return reached
+
+
+def resolution(repo: HostRepo, asked: int | None) -> Resolution:
+    """What the host makes of its ``-r``: a divisor, 1,600 pixels at most, or else a width.
+
+    Args:
+        repo: the checkout; which numbers are divisors is read from its source.
+        asked: the flag's value; None where the command has none.
+
+    Raises:
+        NotComparedError: the host chooses sizes in another way.
+    """
+    tree = repo.tree(CAMERAS)
+    nodes = list(ast.walk(tree)) if tree else []
+    divisors = {
+        element.value
+        for node in nodes
+        if isinstance(node, ast.Compare)
+        and isinstance(node.ops[0], ast.In)
+        and isinstance(node.left, ast.Attribute)
+        and node.left.attr == "resolution"
+        and isinstance(node.comparators[0], ast.List | ast.Tuple)
+        for element in node.comparators[0].elts
+        if isinstance(element, ast.Constant) and isinstance(element.value, int)
+    }
+    capped = any(isinstance(node, ast.Constant) and node.value == WIDEST for node in nodes)
+    value = int(default(repo, "ModelParams", "_resolution", -1)) if asked is None else asked
+    if not divisors or not capped or (value < 1 and value != -1):
+        raise NotComparedError(
+            f"-r {value}" if divisors and capped else repo.place(CAMERAS, "loadCam"),
+            "a size of images that our own readers do not know how to follow",
+            f"a divisor, a width, or -1: at most {WIDEST} pixels wide, as vanilla has it",
+            "Measure with fragprune compare --resolution, or with the host's own metrics.py.",
+        )
+    if value in divisors:
+        return Resolution(divide=value)
+    return Resolution(width=WIDEST if value == -1 else value, shrink_only=value == -1)
 
 
 def default(repo: HostRepo, group: str, name: str, otherwise: float) -> float:

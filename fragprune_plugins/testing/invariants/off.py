@@ -44,7 +44,10 @@ def orders(longest: int) -> list[str]:
 
 def off_is_off(case: Case, order: str) -> str:
     """Whenever we are not active, every object of the host is its own, in this order of events."""
-    compiled = case.adapter.dialect(case.repo).modules(_never_drawn)
+    dialect = case.adapter.dialect(case.repo)
+    compiled = dialect.modules(_never_drawn)
+    untold = compiled.keys() - dialect.names()
+    require(not untold, f"names() leaves out {', '.join(sorted(untold))}, which modules() makes")
     sys.modules.update(compiled)  # as a host's own compiled packages, which outlast us
     originals: dict[Seam, Any] = {}
     session = Session(case.adapter, case.repo, load_plugins(), drop_in=False)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from utils.camera_utils import size_read
 from utils.graphics_utils import BasicPointCloud, focal2fov
 
 from scene.cameras import Camera
@@ -25,9 +26,7 @@ def read_cameras(args):
     for uid, fields in enumerate(sorted(poses, key=lambda pose: pose[9])):
         numbers = np.array([float(x) for x in fields[1:8]])
         with Image.open(Path(args.source_path) / args.images / fields[9]) as picture:
-            if args.resolution > 1:
-                picture = picture.resize([side // args.resolution for side in picture.size])
-            image = np.array(picture.convert("RGB"))
+            image = np.array(picture.convert("RGB").resize(size_read(picture, args)))
         cameras.append(
             Camera(
                 uid,

@@ -1,0 +1,188 @@
+"""Looks, before a host's script runs, at what it needs: the packages that it imports, its data."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TypeGuard
+
+from fragprune_plugins.errors import HostNeedsError
+from fragprune_plugins.hosts.source import HostRepo
+
+DISTRIBUTIONS = {
+    "OpenGL": "PyOpenGL",
+    "PIL": "pillow",
+    "cv2": "opencv-python-headless",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "tinycudann": "git+https://github.com/NVlabs/tiny-cuda-nn/#subdirectory=bindings/torch",
+    "yaml": "pyyaml",
+}
+"""What pip calls a package that is imported under another name."""
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A package that a host imports and that is not installed.
+
+    Attributes:
+        module: its import name.
+        at: "file:line" of the first import found.
+    """
+
+    module: str
+    at: str
+
+    @property
+    def distribution(self) -> str:
+        """What pip calls it."""
+        return DISTRIBUTIONS.get(self.module, self.module)
+
+    def __str__(self) -> str:
+        return f"{self.module} ({self.at})"
+
+
+def install(missing: Iterable[Missing]) -> str:
+    """The command that installs them."""
+    return " ".join(["pip install", *(each.distribution for each in missing)])
+
+
+def missing_imports(
+    repo: HostRepo, scripts: Iterable[Path], provided: Collection[str]
+) -> list[Missing]:
+    """Packages that scripts of a host import as they start, and that cannot be found here.
+
+    Followed are the imports at the top of the scripts and of the host's own modules that these
+    import. Imports inside ``try``, a condition or a function are the host's to answer for.
+
+    Args:
+        repo: the host.
+        scripts: files that are run.
+        provided: import names, dotted, that we answer.
+    """
+    found: dict[str, Missing] = {}
+    for script in scripts:
+        for name, at in _foreign(repo, script, provided):
+            if not _present(name) and not _inside(repo, name):
+                found.setdefault(name, Missing(name, at))
+    return list(found.values())
+
+
+def expect(
+    repo: HostRepo, script: Path, provided: Collection[str], data: Path | None = None
+) -> None:
+    """Raise unless a script's packages and its data are there, naming all that is missing.
+
+    Args:
+        repo: the host.
+        script: that is about to run.
+        provided: import names, dotted, that we answer.
+        data: folder that the command names.
+
+    Raises:
+        HostNeedsError: something is missing.
+    """
+    missing = missing_imports(repo, [script], provided)
+    absent = data is not None and not data.is_dir()
+    if not missing and not absent:
+        return
+    found, remedies = [], []
+    if missing:
+        found.append(f"not installed: {', '.join(map(str, missing))}")
+        remedies.append(f"Run: {install(missing)}")
+    if absent:
+        found.append(f"no folder {data}")
+        remedies.append("Check the path of the data.")
+    raise HostNeedsError(
+        script.name, "; ".join(found), "what the host imports and reads", "\n".join(remedies)
+    )
+
+
+Module = tuple[HostRepo, str]
+"""A module of the host's own: the folder it is found from, and its dotted name."""
+
+
+def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterator[tuple[str, str]]:
+    """Top-level names that a script imports and that are not the host's, and where."""
+    if repo.package:
+        begin = repo, ".".join(script.relative_to(repo.root).with_suffix("").parts)
+    else:
+        begin = HostRepo(script.parent), script.stem
+    roots = [begin[0], repo]
+    waiting, seen = [begin], set()
+    while waiting:
+        module = root, name = waiting.pop()
+        path = root.path(name)
+        if path is None or path in seen:
+            continue
+        seen.add(path)
+        tree = root.tree(name)
+        package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+        for node in _imports(tree.body if tree else [], main=module == begin):
+            for wanted in _names(node, package):
+                if any(wanted == each or wanted.startswith(f"{each}.") for each in provided):
+                    continue
+                own = _own(roots, wanted)
+                waiting += own
+                if not own and not (isinstance(node, ast.ImportFrom) and node.level):
+                    yield wanted.split(".")[0], root.at(name, node.lineno)
+
+
+def _imports(body: list[ast.stmt], main: bool) -> Iterator[ast.Import | ast.ImportFrom]:
+    """The statements of a module that import whatever happens."""
+    for node in body:
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield node
+        elif isinstance(node, ast.With) or (main and _is_main(node)):
+            yield from _imports(node.body, main)
+
+
+def _is_main(node: ast.stmt) -> TypeGuard[ast.If]:
+    """``if __name__ == "__main__"``, whichever way round."""
+    return (
+        isinstance(node, ast.If)
+        and isinstance(node.test, ast.Compare)
+        and any(
+            isinstance(side, ast.Name) and side.id == "__name__"
+            for side in (node.test.left, *node.test.comparators)
+        )
+    )
+
+
+def _names(node: ast.Import | ast.ImportFrom, package: list[str]) -> list[str]:
+    """Dotted names that a statement may import; what it takes from a module may be one too."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    base = package[: len(package) - node.level + 1] if node.level else []
+    module = ".".join([*base, *([node.module] if node.module else [])])
+    return [module, *(f"{module}.{alias.name}" for alias in node.names)]
+
+
+def _own(roots: list[HostRepo], name: str) -> list[Module]:
+    """The modules of the host's own that an import of this name runs."""
+    parts, package = name.split("."), roots[-1].package
+    if package and parts[0] != package:
+        return []
+    prefixes = [".".join(parts[:end]) for end in range(1, len(parts) + 1)]
+    return [
+        module
+        for prefix in prefixes
+        for module in [(root, prefix) for root in roots if root.path(prefix)][:1]
+    ]
+
+
+def _inside(repo: HostRepo, package: str) -> bool:
+    """Whether a checkout holds a package anywhere: hosts put folders of their own on the path."""
+    files = (f"{package}.py", f"{package}/__init__.py")
+    return not repo.package and any(True for file in files for _ in repo.root.rglob(file))
+
+
+def _present(package: str) -> bool:
+    """Whether an import would find a package here."""
+    try:
+        return find_spec(package) is not None
+    except ValueError:  # a module without a spec, which somebody put there
+        return True

@@ -1,0 +1,109 @@
+"""How measurements are put: a table of them, and the sentence that one quotes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+_EQUAL = 0.005  # a ratio of fragments that reads 1.00
+
+CLAIMED = 2
+"""Standard errors that frame times must differ by to be called different."""
+
+_CONTROL = {
+    "run": "--stage finetune --control to the same command",
+    "finetune": "--control to the same command, with another --out in the same folder",
+}
+"""What runs a control where it is found afterwards."""
+
+_ROWS = (
+    ("PSNR, dB", "psnr", 2),
+    ("SSIM", "ssim", 4),
+    ("fragments/pixel", "fragments_per_pixel", 2),
+    ("evaluated/pixel", "evaluated_per_pixel", 2),
+    ("frame, ms", "frame_ms", 2),
+    ("Gaussians", "gaussians", 0),
+)
+
+
+def describe(columns: dict[str, dict[str, Any]]) -> str:
+    """A table of measurements, one column each, and how the last differs from the one before."""
+    reports = list(columns.values())
+    head = " " * 20 + "".join(f"{name:>16}" for name in columns)
+    lines = [head + f"{'change':>12}" if len(columns) > 1 else head]
+    for label, key, digits in _ROWS:
+        cells = [f"{report[key]:.{digits}f}" for report in reports]
+        if key == "frame_ms":
+            cells = [
+                f"{cell} ± {report['frame_ms_se']:.{digits}f}"
+                for cell, report in zip(cells, reports, strict=True)
+            ]
+        line = f"{label:<20}" + "".join(f"{cell:>16}" for cell in cells)
+        if len(reports) > 1:
+            first, last = reports[-2][key], reports[-1][key]
+            change = (
+                f"{last - first:+.{digits}f}"
+                if key in ("psnr", "ssim")
+                else f"/ {first / max(last, 1e-9):.2f}"
+            )
+            line += f"{change:>12}"
+        lines.append(line)
+    report = reports[-1]
+    lines.append(f"{report['views']} views, {report['engine']} engine on {report['device']}")
+    return "\n".join(lines)
+
+
+def gain(before: dict[str, Any], after: dict[str, Any]) -> str:
+    """What the second measurement gains over the first: fragments, frame times, PSNR."""
+    return (
+        f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
+        f"{_frames(before, after)}, {after['psnr'] - before['psnr']:+.2f} dB PSNR "
+        f"on {after['views']} views"
+    )
+
+
+def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) -> str:
+    """What a fine-tuning gained on held-out views, and how much of that is not pruning's.
+
+    Args:
+        command: "run" or "finetune".
+        data: its figures, "before", "after" and "settings" among them.
+        control: measured after as many iterations without truncation; None where that was not run.
+    """
+    before, after = data["before"], data["after"]
+    gained = f"{gain(before, after)} that were held out"
+    if not data["settings"]["truncate"]:
+        return f"{gained}: a control, nothing is truncated."
+    if control is None:
+        return (
+            f"{gained}. More training alone may be a part of the dB: no control was run; "
+            f"to see, add {_CONTROL[command]}."
+        )
+    return (
+        f"{gained}. The control, as many iterations without truncation, has "
+        f"{control['fragments_per_pixel']:.1f} fragments per pixel and "
+        f"{control['psnr'] - before['psnr']:+.2f} dB: pruning itself makes "
+        f"{after['psnr'] - control['psnr']:+.2f} dB."
+    )
+
+
+def fewer(before: float, after: float) -> str:
+    """How many times fewer fragments per pixel, or more."""
+    ratio = before / max(after, 1e-9)
+    change = f"{ratio:.2f}x fewer" if ratio > 1 else f"{1 / max(ratio, 1e-9):.2f}x more"
+    change = "as many" if abs(ratio - 1) < _EQUAL else change
+    return f"{change} fragments ({before:.1f} -> {after:.1f} per pixel)"
+
+
+def _frames(before: dict[str, Any], after: dict[str, Any]) -> str:
+    """Frame times; how many times as fast only where their standard errors allow it."""
+    was, now = before["frame_ms"], after["frame_ms"]
+    ratio = was / max(now, 1e-9)
+    errors = (report["frame_ms_se"] / max(report["frame_ms"], 1e-9) for report in (before, after))
+    error = ratio * math.hypot(*errors)
+    faster = (
+        f"{ratio:.2f} ± {error:.2f}x as fast"
+        if abs(ratio - 1) > CLAIMED * error
+        else "no difference beyond the noise"
+    )
+    return f"frames {was:.2f} -> {now:.2f} ms ({faster})"

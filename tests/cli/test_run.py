@@ -1,0 +1,160 @@
+"""fragprune run, on a small host: what is said of its result, and how it is compared."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+from cli.commands import run, run_json
+from miniature import HOST, TINY
+from PIL import Image
+
+from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.testing import mutations
+
+WORDS = ["--device", "cpu", "--iters", 6]
+
+
+@pytest.fixture(autouse=True)
+def _one_thread(single_thread):
+    """Small pictures are drawn fastest by one."""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    make_scene(folder, SceneSettings(views=6, width=40, height=30, supersample=1, points=150))
+    return folder
+
+
+def ran(*words):
+    """The one JSON object of a run that succeeds; --json is ours only before the command."""
+    result = run("run", "--json", *words)
+    assert result.exit_code == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def command(scene, out, *more):
+    words = ["-s", scene, "-m", out, "--iterations", 10, *TINY, *more]
+    return ["--", HOST / "train.py", *words]
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """A run with half the sides asked for, and what it printed."""
+    out = tmp_path_factory.mktemp("trained") / "out"
+    return out, ran(*WORDS, *command(scene, out, "-r", 2)), scene
+
+
+@pytest.fixture
+def folder(trained, tmp_path):
+    out, _, scene = trained
+    return shutil.copytree(out, tmp_path / "out"), scene
+
+
+def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_path):
+    result = run("run", *WORDS, *command(scene, tmp_path / "out"))
+    assert result.exit_code == 0, result.stderr
+    (line,) = (line for line in result.stdout.splitlines() if "x fewer fragments" in line)
+    assert " ms (" in line
+    assert "no control was run; to see, add --stage finetune --control" in line
+
+
+def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
+    out, scene = folder
+    finetune = ["--stage", "finetune", *WORDS]
+    words = command(scene, out, "-r", 2)
+    kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    zero = ran(*finetune, "--control", *words)
+    assert zero["model_after"].startswith(str(out / "control"))
+    assert {path: path.read_bytes() for path in kept} == kept
+    again = ran(*finetune, *words)
+    assert again["control"] == zero["after"]
+    assert "pruning itself makes" in run_json("report", out)["result"]
+
+
+@pytest.mark.parametrize(("size", "read"), [("2", (20, 15)), ("16", (16, 12)), ("-1", (40, 30))])
+def test_before_and_after_are_measured_at_the_hosts_resolution(scene, tmp_path, size, read):
+    out = tmp_path / "out"
+    ran(*WORDS, *command(scene, out, "-r", size))
+    text = run("compare", *models(out)).stdout
+    assert f"the first of {read[0]}x{read[1]} pixels" in text
+
+
+def models(out):
+    return [out / f"point_cloud/iteration_{i}/point_cloud.ply" for i in (10, 17)]
+
+
+def test_compare_follows_the_run_that_left_the_models(trained):
+    out, report, scene = trained
+    same = run_json("compare", *models(out))
+    assert same["scene"]["folder"] == str(scene)
+    for side, measured in (("a", report["before"]), ("b", report["after"])):
+        for name in ("psnr", "ssim", "fragments_per_pixel"):
+            assert same[side][name] == pytest.approx(measured[name], rel=1e-6)
+    named = run_json("compare", *models(out), "--data", scene)
+    assert named["a"]["psnr"] == same["a"]["psnr"]
+    whole = run_json("compare", *models(out), "--resolution", 1)
+    assert whole["a"]["psnr"] != pytest.approx(same["a"]["psnr"], rel=1e-6)
+
+
+def test_photographs_wider_than_1600_pixels_are_read_as_the_host_reads_them(tmp_path):
+    """Its model is trained on 1,600 pixels, whatever is in the files."""
+    folder = tmp_path / "scene"
+    make_scene(folder, SceneSettings(views=6, width=40, height=3, supersample=1, points=150))
+    for path in (folder / "images").iterdir():
+        Image.open(path).resize((2000, 150)).save(path)
+    out = tmp_path / "out"
+    result = run("run", "--device", "cpu", "--iters", 1, *command(folder, out, "-r", -1))
+    assert result.exit_code == 0, result.stderr
+    assert "1600x120" in run("compare", *out.glob("point_cloud/*/point_cloud.ply")).stdout
+
+
+def test_what_cannot_be_compared_says_why(scene, tmp_path):
+    words = command(scene, tmp_path / "out")
+    words.remove("--eval")
+    result = run("run", *WORDS, *words)
+    assert (
+        "Not compared on held-out views because of the host's command: no --eval" in result.stdout
+    )
+    assert "fragprune compare" not in result.stdout
+    words = command(scene, tmp_path / "again")
+    words.remove("--eval")
+    report = ran(*WORDS, *words)
+    assert report["before"] is None
+    assert report["not_compared"]["code"] == "not-compared"
+
+
+def test_a_host_that_raises_leaves_one_json_object_on_stdout(tmp_path):
+    host = mutations.copy_source(HOST, tmp_path / "host").root
+    script = host / "train.py"
+    script.write_text(script.read_text().replace("import torch\n", "import torch\n1 / 0\n", 1))
+    result = run("run", "--device", "cpu", "--json", "--", script, "-s", tmp_path, "-m", "out")
+    assert result.exit_code == 1
+    error = json.loads(result.stdout)["error"]
+    assert error["code"] == "host-failed"
+    assert error["found"] == "ZeroDivisionError: division by zero"
+    assert error["where"].startswith("train.py:")
+    assert "Traceback (most recent call last)" in result.stderr
+
+
+def test_the_package_runs_as_a_module(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "fragprune_plugins", "adapters", "--json"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["adapters"]
+
+
+def test_two_models_of_nobody_need_their_photographs_named(tmp_path):
+    result = run("compare", tmp_path / "a.ply", tmp_path / "b.ply", "--json")
+    assert result.exit_code == 2
+    assert "no record" in json.loads(result.stdout)["error"]["found"]

@@ -1,0 +1,108 @@
+"""Photographs are read at the size that the host reads them at, or refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from skeleton import skeleton
+
+from fragprune_plugins.datasets.photographs import Photographs, Resolution
+from fragprune_plugins.demo import demo
+from fragprune_plugins.errors import NotComparedError
+from fragprune_plugins.hosts.graphdeco.adapter import resolution
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+HOST = HostRepo(Path(demo.__file__).with_name("host"))
+SIDES = st.integers(1, 6000)
+
+
+def command(*words):
+    return Vanilla3DGS().photographs(HOST, ["-s", "scene", "--eval", *words])
+
+
+@pytest.mark.parametrize(
+    ("words", "size"),
+    [
+        ((), (1600, 1066)),  # 3,000 x 2,000 is wider than hosts read unasked
+        (("-r", "-1"), (1600, 1066)),
+        (("-r", "1"), (3000, 2000)),
+        (("--resolution=4",), (750, 500)),
+        (("-r8",), (375, 250)),
+        (("-r", "800"), (800, 533)),
+        (("-r", "3"), (3, 2)),  # no divisor of this host: a width
+    ],
+)
+def test_the_size_follows_the_command_as_the_host_does(words, size):
+    assert command(*words).resolution.of(3000, 2000) == size
+
+
+def test_small_photographs_are_not_enlarged_unasked():
+    assert command().resolution.of(800, 600) == (800, 600)
+    assert command("-r", "1600").resolution.of(800, 600) == (1600, 1200)
+
+
+@given(SIDES, SIDES)
+def test_unasked_no_side_grows_and_the_aspect_stays(width, height):
+    wide, high = command().resolution.of(width, height)
+    assert wide <= min(width, 1600)
+    assert high <= height
+    assert abs(high - height * min(1, 1600 / width)) <= 1
+
+
+@pytest.mark.parametrize("value", [0, -2])
+def test_a_size_that_makes_no_sense_is_refused(value):
+    with pytest.raises(NotComparedError, match=f"-r {value}"):
+        command("-r", str(value))
+
+
+def test_which_numbers_are_divisors_is_read_from_the_source(tmp_path):
+    file = tmp_path / "utils" / "camera_utils.py"
+    file.parent.mkdir()
+    file.write_text("def loadCam(args):\n    if args.resolution in [1, 16]: 1600\n")
+    assert resolution(HostRepo(tmp_path), 16) == Resolution(divide=16)
+    assert resolution(HostRepo(tmp_path), 8) == Resolution(width=8)
+
+
+@pytest.mark.parametrize(
+    "source", ["", "def loadCam(args):\n    if args.resolution in [1, 2]: 1200\n"]
+)
+def test_another_way_of_choosing_the_size_is_refused(tmp_path, source):
+    file = tmp_path / "utils" / "camera_utils.py"
+    file.parent.mkdir()
+    file.write_text(source)
+    with pytest.raises(NotComparedError, match=r"utils/camera_utils\.py|do not know"):
+        resolution(HostRepo(tmp_path), 2)
+
+
+def test_a_host_without_that_file_is_refused(tmp_path):
+    with pytest.raises(NotComparedError):
+        Vanilla3DGS().photographs(skeleton(tmp_path), ["-s", "x", "--eval"])
+
+
+def test_folder_background_and_images_are_the_commands():
+    read = command("-w", "--images", "images_4")
+    assert read == Photographs(Path("scene"), read.resolution, True, "images_4")
+    assert not command().white_background
+
+
+def test_a_command_that_holds_nothing_out_is_refused():
+    with pytest.raises(NotComparedError, match="no --eval"):
+        Vanilla3DGS().photographs(HOST, ["-s", "scene"])
+
+
+@pytest.mark.parametrize(
+    "size",
+    [Resolution(), Resolution(4), Resolution(width=7), Resolution(width=9, shrink_only=True)],
+)
+def test_photographs_survive_a_record(size, tmp_path):
+    read = Photographs(tmp_path, size, True, "images_2")
+    assert Photographs.from_dict(read.as_dict()) == read
+
+
+def test_records_of_earlier_versions_have_a_divisor(tmp_path):
+    old = {"folder": str(tmp_path), "resolution": 4, "white_background": False}
+    assert Photographs.from_dict(old) == Photographs(tmp_path, Resolution(divide=4))

@@ -1,0 +1,124 @@
+"""What a host's script imports is found in its source, and only what it cannot do without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from miniature import HOST
+
+from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.loading import load_plugins
+
+ADAPTERS = load_plugins().adapters
+
+
+def missing(tmp_path, files, provided=()):
+    for name, text in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    found = missing_imports(HostRepo(tmp_path), [tmp_path / "train.py"], provided)
+    return [(each.module, each.at) for each in found]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import absent_a",
+        "import absent_a.core as a",
+        "from absent_a.core import thing",
+        "with open('x') as f:\n    import absent_a",
+        "if __name__ == '__main__':\n    import absent_a",
+    ],
+)
+def test_an_import_that_the_script_runs_counts(tmp_path, code):
+    ((module, at),) = missing(tmp_path, {"train.py": code})
+    assert module == "absent_a"
+    assert at.startswith("train.py:")
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "try:\n    import absent_a\nexcept ImportError:\n    absent_a = None",
+        "def late():\n    import absent_a",
+        "if False:\n    import absent_a",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import absent_a",
+        "import json, torch, os.path",
+        "not python (",
+    ],
+)
+def test_one_that_it_can_do_without_does_not(tmp_path, code):
+    assert missing(tmp_path, {"train.py": code}) == []
+
+
+def test_the_hosts_own_modules_are_followed_once_however_they_are_named(tmp_path):
+    files = {
+        "train.py": "from scene import Scene\nfrom utils.camera_utils import load\nimport other",
+        "scene/__init__.py": "from scene.model import Model\nfrom .cameras import Camera",
+        "scene/model.py": "import absent_model\nfrom scene import Scene",
+        "scene/cameras.py": "from . import lenses",
+        "scene/lenses.py": "import absent_lens",
+        "utils/camera_utils.py": "import absent_utils",  # a folder without __init__.py
+        "other.py": "if __name__ == '__main__':\n    import absent_other",
+    }
+    assert sorted(missing(tmp_path, files)) == [
+        ("absent_lens", "scene/lenses.py:1"),
+        ("absent_model", "scene/model.py:1"),
+        ("absent_utils", "utils/camera_utils.py:1"),
+    ]
+
+
+def test_what_we_answer_counts_as_there_and_is_not_looked_into(tmp_path):
+    files = {
+        "train.py": "import compiled_x, renderer.compiled\nfrom renderer.compiled import draw",
+        "renderer/__init__.py": "",
+        "renderer/compiled.py": "import absent_compiler",
+    }
+    assert missing(tmp_path, files, ("compiled_x", "renderer.compiled")) == []
+
+
+def test_what_the_checkout_holds_somewhere_is_the_hosts_to_find(tmp_path):
+    """Hosts put folders of theirs on the path."""
+    files = {
+        "train.py": "import sys\nsys.path.append('extern/lib')\nimport vendored_a, vendored_b",
+        "extern/lib/vendored_a.py": "",
+        "extern/lib/vendored_b/__init__.py": "",
+    }
+    assert missing(tmp_path, files) == []
+
+
+def test_scripts_in_a_folder_of_the_checkout_find_its_modules(tmp_path):
+    (tmp_path / "ms").mkdir()
+    (tmp_path / "ms" / "train.py").write_text("import shared")
+    (tmp_path / "shared.py").write_text("import absent_shared")
+    (found,) = missing_imports(HostRepo(tmp_path), [tmp_path / "ms" / "train.py"], ())
+    assert found == Missing("absent_shared", "shared.py:1")
+
+
+def test_an_installed_host_is_followed_and_its_neighbours_are_not(tmp_path):
+    for name in ("toyhost", "neighbour"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(f"import absent_{name}")
+    script = tmp_path / "toyhost" / "train.py"
+    script.write_text("import neighbour\nfrom toyhost import model")
+    found = missing_imports(HostRepo(tmp_path, "toyhost"), [script], ())
+    assert {each.module for each in found} == {"neighbour", "absent_toyhost"}
+
+
+def test_pip_is_told_its_own_names():
+    named = [Missing(name, "a.py:1") for name in ("cv2", "PIL", "icecream")]
+    assert install(named) == "pip install opencv-python-headless pillow icecream"
+
+
+def test_our_own_small_host_lacks_nothing():
+    provided = ("diff_gaussian_rasterization", "simple_knn")
+    assert missing_imports(HostRepo(HOST), [Path(HOST) / "train.py"], provided) == []
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS, ids=lambda adapter: adapter.name)
+def test_the_names_that_an_adapter_says_it_answers_are_those_it_makes(adapter):
+    dialect = adapter.dialect(HostRepo(HOST))
+    assert dialect.names() == set(dialect.modules(lambda call: None))
