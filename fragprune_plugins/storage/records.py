@@ -43,6 +43,18 @@ def leave(beside: Path, command: str, data: dict[str, Any]) -> Path:
     return target
 
 
+def beside(result: Path) -> Record | None:
+    """The record of a result, unless the result was written again since.
+
+    Raises:
+        RecordError: it cannot be read.
+    """
+    path = Path(result).with_suffix(SUFFIX)
+    if not path.exists() or path.stat().st_mtime_ns < result.stat().st_mtime_ns:
+        return None
+    return _read(path)
+
+
 def find(folder: Path) -> list[Record]:
     """All records in a folder and below, oldest first.
 
