@@ -56,3 +56,8 @@ FALLOFF_MIN: Final = 1e-4
 NEUTRAL_LOGIT: Final = -30.0
 """The neutral threshold's logit. Its cutoff Q = 60 exceeds 2 ln 255 = 11.08, the largest radius
 that the 1/255 skip leaves any Gaussian, so a neutral threshold decides nothing, exactly."""
+
+LOGIT_MIN: Final = -80.0
+LOGIT_MAX: Final = 16.0
+"""Ends of a threshold's logit: float32 tells sigmoid(-80) from 0 and sigmoid(16) from 1; from 16.7
+on it would round to 1."""

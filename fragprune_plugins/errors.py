@@ -43,7 +43,7 @@ class DatasetError(FragpruneError):
 
 
 class SidecarError(FragpruneError):
-    """A sidecar that is lost, broken or belongs to another model."""
+    """A sidecar that is lost, broken, not finite, or belongs to another model."""
 
     code = "sidecar"
 
@@ -120,6 +120,12 @@ class NotComparedError(FragpruneError):
     code = "not-compared"
 
 
+class DivergedError(FragpruneError):
+    """NaN or infinity in what was learned; nothing of it is saved."""
+
+    code = "not-finite"
+
+
 class UsageError(FragpruneError):
     """Options that contradict each other; exit code 2."""
 
@@ -130,3 +136,9 @@ class Interrupted(FragpruneError):  # noqa: N818 - a person's wish, not a fault
     """Ctrl-C during stage 2, after what was learned has been saved; exit code 130."""
 
     code = "interrupted"
+
+
+class Terminated(Interrupted):
+    """SIGTERM during stage 2, after what was learned has been saved; exit code 143."""
+
+    code = "terminated"

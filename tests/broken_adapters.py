@@ -60,6 +60,20 @@ class TrainsTooMuch(Vanilla3DGS):
         return groups | {"scaling"} if groups else None
 
 
+class LeavesParametersAsleep(Vanilla3DGS):
+    """Freezes by a mark on the host's own parameters, and the host pickles it."""
+
+    def prepare_stage2(self, model: Any, output: Any) -> None:
+        model._scaling.requires_grad_(False)
+
+
+class LeavesItsRates(Vanilla3DGS):
+    """Sets a rate of stage 2 in the host's optimizer for good."""
+
+    def prepare_stage2(self, model: Any, output: Any) -> None:
+        model.optimizer.param_groups[3]["lr"] = 1e-3
+
+
 class FitsEverything(Vanilla3DGS):
     """Takes any folder for its host."""
 

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from fragprune_plugins.errors import FragpruneError, Interrupted, OutputError, UsageError
+from fragprune_plugins.errors import (
+    FragpruneError,
+    Interrupted,
+    OutputError,
+    Terminated,
+    UsageError,
+)
+from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
 from fragprune_plugins.storage.records import strict
 
 if TYPE_CHECKING:
@@ -73,7 +80,7 @@ class Report:
     Attributes:
         data: for --json.
         text: for a person.
-        exit_code: 0, or 1 when what was asked for was not reached, or 130.
+        exit_code: 0, or 1 when what was asked for was not reached, or 130 or 143.
     """
 
     data: dict[str, Any]
@@ -84,7 +91,8 @@ class Report:
 class Command(click.Command):
     """A command that returns a ``Report``: prints it, as JSON if asked; turns errors into codes.
 
-    1 for a stated failure, 2 for usage, 130 for Ctrl-C. Anything unforeseen keeps its traceback.
+    1 for a stated failure, 2 for usage, 130 for Ctrl-C, 143 for SIGTERM while something learned.
+    Anything unforeseen keeps its traceback.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -119,11 +127,15 @@ class Command(click.Command):
                 click.echo(json.dumps({"error": error.as_dict()}))
             else:
                 click.echo(str(error), err=True)
-            codes: dict[type[FragpruneError], int] = {UsageError: 2, Interrupted: 130}
+            codes: dict[type[FragpruneError], int] = {
+                UsageError: 2,
+                Interrupted: 130,
+                Terminated: EXIT_CODE,
+            }
             ctx.exit(codes.get(type(error), 1))
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
             click.echo("Interrupted.", err=True)
-            ctx.exit(130)
+            ctx.exit(EXIT_CODE if isinstance(error, Terminate) else 130)
         click.echo(json.dumps(strict(report.data)) if as_json else report.text)
         ctx.exit(report.exit_code)
 

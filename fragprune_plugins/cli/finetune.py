@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,8 +21,12 @@ from fragprune_plugins.cli.common import (
     require_place,
 )
 from fragprune_plugins.cli.learning import learning_options
+from fragprune_plugins.learning.interruption import EXIT_CODE, sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage.models import load_model
+
+if TYPE_CHECKING:
+    from fragprune_plugins.finetuning import FinetuneResult
 
 
 @click.command("finetune", cls=Command)
@@ -65,7 +69,7 @@ def command(
     and colours stay bit for bit (but see --train). OUT has the columns of MODEL; the thresholds go
     beside it, into OUT.fragprune.safetensors. The table compares both on views that were not
     learned from, and a line below it says what OUT is without its thresholds, as other viewers draw
-    it. Ctrl-C saves what was learned so far.
+    it. Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
 
     \b
     Examples:
@@ -89,9 +93,12 @@ def command(
     dataset = load_dataset(data, resolution=resolution, white_background=white_background)
     start = Candidate(splat, deepcopy(store))  # the store itself learns
 
-    result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
+    with sigterm_interrupts():
+        result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
+        save(out, result)
     done = result.progress
-    save(out, result)
+    if result.terminated:  # whoever sends SIGTERM does not wait for measurements
+        return _terminated(model, out, result)
     dropped = None
     if drop:
         whole = out.stat().st_size
@@ -161,6 +168,24 @@ def command(
     }
     records.leave(out, "finetune", report | more)
     return Report(report, "\n".join(lines), exit_code=130 if result.interrupted else 0)
+
+
+def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:
+    """What is known when there was time to save and no more."""
+    done, asked = result.progress, result.settings
+    data = {
+        "model": str(model),
+        "out": str(out),
+        "before": None,
+        "after": None,
+        "interrupted": True,
+        "iterations": done.steps,
+        "train_seconds": result.train_seconds,
+        "engine": result.engine,
+        "settings": asked.as_dict(),
+    }
+    text = f"SIGTERM at {done.steps} of {asked.iterations} iterations. Wrote {out} and its sidecar."
+    return Report(data, text, exit_code=EXIT_CODE)
 
 
 def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:

@@ -74,7 +74,8 @@ def command(
 
     Put the unmodified command after --. Stage 1 is the host's own training. Stage 2 resumes it for
     a few thousand iterations in which only opacities and thresholds move (but see --train), and
-    the host saves its model as always; the thresholds go beside it as a sidecar.
+    the host saves its model as always; the thresholds go beside it as a sidecar. In stage 2 Ctrl-C
+    (exit code 130) and SIGTERM (143) save what was learned so far.
 
     \b
     Examples:

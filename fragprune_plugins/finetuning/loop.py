@@ -18,6 +18,7 @@ from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Progress, Stage2
@@ -48,7 +49,8 @@ class FinetuneResult:
         progress: steps done, fragments before and after on the training views, the target.
         train_seconds: wall-clock seconds of the loop.
         engine: the engine's name.
-        interrupted: Ctrl-C ended it early; what was learned by then is here.
+        interrupted: Ctrl-C, or SIGTERM, ended it early; what was learned by then is here.
+        terminated: it was SIGTERM.
     """
 
     model: SplatFile
@@ -59,6 +61,7 @@ class FinetuneResult:
     train_seconds: float
     engine: str
     interrupted: bool
+    terminated: bool
 
     @property
     def thresholds(self) -> Tensor | None:
@@ -95,6 +98,7 @@ def finetune(
         EngineError: no such engine here.
         PluginError: a plugin raised, or gave an answer that cannot be used.
         AlignmentError: store and model differ in length.
+        DivergedError: NaN or infinity in what trains.
     """
     settings, device = settings or Settings(), model.xyz.device
     dataset = dataset.to(device)
@@ -115,11 +119,12 @@ def finetune(
         engine_for(engine, device) if isinstance(engine, str) else engine,
     )
     started = time.perf_counter()
-    interrupted = False
+    interrupted = terminated = False
     try:
         run.learn(progress)
-    except KeyboardInterrupt:
-        interrupted = True
+    except KeyboardInterrupt as error:
+        interrupted, terminated = True, isinstance(error, Terminate)
+    run.stage.check()
     return FinetuneResult(
         model=run.result_model(),
         store=run.stage.store,
@@ -129,6 +134,7 @@ def finetune(
         train_seconds=time.perf_counter() - started,
         engine=run.engine.name,
         interrupted=interrupted,
+        terminated=terminated,
     )
 
 
@@ -187,6 +193,7 @@ class _Run:
             truncate=thresholds_for,
             views=again,
             watch=self.curves.append,
+            parameters=lambda: {name: getattr(self.model, name) for name in self.rates},
         )
         rates = {"opacity": settings.opacity_lr}
         if settings.train in ("appearance", "all"):

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from fragprune_plugins.storage.ply import SplatFile
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
+CHECKPOINT_KEY = "fragprune"
+"""Under which a host's checkpoint carries thresholds."""
+
 
 @dataclass(frozen=True)
 class HostInfo:
@@ -474,7 +477,7 @@ class HostAdapter(ABC):
         return None
 
     def checkpoint_state(self, capture: Any) -> dict[str, Any]:
-        """The dict inside the host's checkpoint tuple that tolerates a key of ours."""
+        """The dict inside the host's checkpoint tuple that tolerates ``CHECKPOINT_KEY``."""
         raise self._lacks("checkpoint_state", "CAPTURE and RESTORE seams")
 
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
@@ -504,5 +507,5 @@ class HostAdapter(ABC):
         raise self._lacks("model_file", "a training script")
 
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """Resumable files in an output folder, (iteration, checkpoint or PLY), oldest first."""
+        """Resumable files of an output folder, (iteration, checkpoint or PLY), newest last."""
         raise self._lacks("saved_iterations", "a training script")

@@ -19,17 +19,33 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, Literal
 from unittest import mock
 
 from fragprune_plugins.datasets.photographs import Photographs
-from fragprune_plugins.errors import FragpruneError, Interrupted, NotComparedError, UsageError
+from fragprune_plugins.errors import (
+    FragpruneError,
+    Interrupted,
+    ModelFileError,
+    NotComparedError,
+    Terminated,
+    UsageError,
+)
 from fragprune_plugins.hosts import preflight
-from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter, read_config
+from fragprune_plugins.hosts.adapter import (
+    CHECKPOINT_KEY,
+    CommandLine,
+    ConfigFile,
+    HostAdapter,
+    read_config,
+)
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings
 from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.storage import records
 
 log = logging.getLogger("fragprune")
 
@@ -161,7 +177,8 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         UnknownHostError: no adapter fits the script's folder.
         HostNeedsError: packages that the script imports, or its data, are missing.
         HostFailed: the host raised, or ended with an error code.
-        Interrupted: Ctrl-C in stage 2; what was learned has been saved.
+        Interrupted: Ctrl-C in stage 2, or (Terminated) SIGTERM; what was learned has been saved.
+        DivergedError: NaN or infinity in stage 2, of which nothing has been saved.
     """
     import time
 
@@ -217,7 +234,7 @@ class _Runner:
         self.options, self.device, self.scratch = options, device, scratch
         self.output = Path(host.flags.output) if host.flags.output else None
         self.around: Path | None = None  # of stage 1, where stage 2 has a folder of its own
-        self.trained: int | None = None  # iterations of stage 1, once it is over
+        self.trained: tuple[int, Path] | None = None  # stage 1's end, once it is over
         self.before: Path | None = None
         self.after: Path | None = None
         self.learned: Any = None
@@ -251,16 +268,21 @@ class _Runner:
         total = self._iterations()
         log.info("stage 1: the host's own training, %d iterations", total)
         arguments = self.host.with_flags(self.scratch, save_checkpoints=self._checkpoints(total))
+        earlier = {path: path.stat().st_mtime_ns for _, path in self._saved()}
         self._execute(arguments, learn=False)
-        saved = self.adapter.saved_iterations(self.output) if self.output else []
-        if total not in (iteration for iteration, _ in saved):  # hosts refuse with exit code 0 too
+        ends = [
+            (path.suffix != ".ply", path)
+            for iteration, path in self._saved()
+            if iteration == total and earlier.get(path) != path.stat().st_mtime_ns
+        ]
+        if not ends:  # hosts refuse with exit code 0 too
             raise HostFailed(
                 self.host.script.name,
                 f"ended without a checkpoint of iteration {total}",
                 "its own training to come to its end",
                 "Read the host's own message above.",
             )
-        self.trained = total
+        self.trained = total, max(ends)[1]
         self.finetune()
 
     def finetune(self) -> None:
@@ -284,7 +306,6 @@ class _Runner:
             self._note_before(iteration)
             start = 0 if self.host.line.restarts else iteration
             total = start + settings.iterations + self.host.line.skipped
-            log.info("stage 2: %d iterations from %s", settings.iterations, checkpoint)
             extra = {"iterations": total, "resume": str(checkpoint)}
             own = "finetuned" if self.host.line.restarts else ""
             own = own if settings.truncate else "control"  # what was learned stays where it is
@@ -298,22 +319,9 @@ class _Runner:
     @contextlib.contextmanager
     def _checkpoint(self) -> Iterator[tuple[int, Path]]:
         """The checkpoint to resume from; one made from a PLY is removed afterwards."""
-        if self.host.flags.resume and self.trained is None:
-            path = Path(self.host.flags.resume)
-            yield self._iteration_of(path), path
-            return
-        saved = self.adapter.saved_iterations(self.output) if self.output else []
-        if self.trained is not None:  # the folder may hold later ones of another run
-            saved = [each for each in saved if each[0] == self.trained]
-        if not saved:
-            raise UsageError(
-                "--stage finetune",
-                f"nothing to start from in {self.output or 'no output folder'}",
-                f"{self.host.line.spellings('resume')[-1]} FILE, or {self.host.line.output[-1]} "
-                "DIR of a finished training",
-                "Name one of them in the host's command.",
-            )
-        iteration, path = saved[-1]
+        iteration, path, why = self._start()
+        steps = self.options.settings.iterations
+        log.info("stage 2: %d iterations from iteration %d, %s: %s", steps, iteration, path, why)
         if path.suffix != ".ply" or self.host.line.restarts:
             yield iteration, path
             return
@@ -323,6 +331,60 @@ class _Runner:
             yield iteration, made
         finally:
             made.unlink(missing_ok=True)
+
+    def _start(self) -> tuple[int, Path, str]:
+        """What stage 2 starts from, and why: iteration, file, reason."""
+        if self.trained is not None:
+            return *self.trained, "the end of stage 1"
+        if self.host.flags.resume:
+            path = Path(self.host.flags.resume)
+            ply = path.suffix == ".ply" and not self.host.line.restarts
+            at = _iteration_of_ply(path) if ply else self._iteration_of(path)
+            return at, path, "the command names it"
+        where, flag = self.output or "no output folder", self.host.line.spellings("resume")[-1]
+        saved, newer = self._saved(), 0
+        while saved and self._learned(saved[-1][1]):
+            saved.pop()
+            newer += 1
+        if not saved and newer:
+            raise UsageError(
+                "--stage finetune",
+                f"nothing in {where} but what was written while thresholds learned",
+                "what training alone wrote",
+                f"To go on from one of these files, name it with {flag}.",
+            )
+        if not saved:
+            raise UsageError(
+                "--stage finetune",
+                f"nothing to start from in {where}",
+                f"{flag} FILE, or {self.host.line.output[-1]} DIR of a finished training",
+                "Name one of them in the host's command.",
+            )
+        iteration, path = saved[-1]
+        later = [(at, file) for at, file in saved if at > iteration and not self._learned(file)]
+        if later:
+            log.warning(
+                "%s is of a later iteration, but older than what stage 2 starts from; "
+                "if you meant it, name it with %s",
+                max(reversed(later), key=lambda each: each[0])[1],
+                flag,
+            )
+        passed = f"; {newer} newer of stage 2 passed over" if newer else ""
+        return iteration, path, f"what training alone wrote last{passed}"
+
+    def _saved(self) -> list[tuple[int, Path]]:
+        return self.adapter.saved_iterations(self.output) if self.output else []
+
+    def _learned(self, path: Path) -> bool:
+        """Whether a file was written while thresholds learned, or by a control: not by stage 1."""
+        from fragprune_plugins.storage import sidecar
+
+        record = records.beside(path)  # version 0.1 marked its controls by nothing else
+        if record is not None and record.command == "run":
+            return True
+        if path.suffix == ".ply":
+            return sidecar.belongs(path)
+        return CHECKPOINT_KEY in self.adapter.checkpoint_state(_read_checkpoint(path)[0])
 
     def _execute(
         self,
@@ -355,8 +417,13 @@ class _Runner:
         known = set(sys.modules)
         try:
             folder = Path.cwd() if self.host.module else self.host.script.parent
-            process = _host_process(self.host.script, arguments, self.device, folder)
-            with _telling(self.host.script, self.repo.root), session, process:
+            with contextlib.ExitStack() as stack:
+                stack.enter_context(_telling(self.host.script, self.repo.root))
+                stack.enter_context(session)
+                process = _host_process(self.host.script, arguments, self.device, folder)
+                stack.enter_context(process)
+                if learn:
+                    stack.enter_context(sigterm_interrupts())
                 try:
                     if self.host.module:
                         runpy.run_module(self.host.module, run_name="__main__", alter_sys=True)
@@ -364,14 +431,7 @@ class _Runner:
                         runpy.run_path(str(self.host.script), run_name="__main__")
                 except KeyboardInterrupt as error:  # here, where saving still writes the sidecar
                     saved = session.save_interrupted() if learn else None
-                    raise Interrupted(
-                        self.host.script.name,
-                        "Ctrl-C" + (f"; thresholds so far are beside {saved}" if saved else ""),
-                        "the run to end",
-                        "Resume with fragprune run --stage finetune."
-                        if saved
-                        else "Start it again.",
-                    ) from error
+                    raise self._interrupted(error, saved) from error
             session.expect_drawn()
         except SystemExit as error:
             if error.code not in (None, 0):
@@ -387,6 +447,20 @@ class _Runner:
             if learn:
                 self.learned = session.finish()
                 self.curves = session.curves
+
+    def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
+        """What to say of Ctrl-C or SIGTERM, and of what was saved then."""
+        by_signal = isinstance(error, Terminate)
+        stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
+        again = "Start it again."
+        if saved:
+            found += f"; thresholds so far are beside {saved}"
+            again = (
+                "Go on from there with fragprune run --stage finetune and "
+                f"{self.host.line.spellings('resume')[-1]} {saved} in the host's command; without, "
+                "stage 2 begins anew."
+            )
+        return stated(self.host.script.name, found, "the run to end", again)
 
     def summary(self, seconds: float) -> RunSummary:
         """Everything the command line prints."""
@@ -558,14 +632,45 @@ def _with_iterations(settings: Settings, iterations: int) -> Settings:
 
 
 def _iteration_of(checkpoint: Path) -> int:
-    """The iteration a checkpoint was written at: hosts save (capture, iteration)."""
+    """The iteration a checkpoint was written at."""
+    return _read_checkpoint(checkpoint)[1]
+
+
+def _iteration_of_ply(ply: Path) -> int:
+    """By its folder, as hosts save: ``iteration_N/point_cloud.ply``."""
+    number = ply.parent.name.removeprefix("iteration_")
+    if ply.is_file() and number.isdigit():
+        return int(number)
+    raise UsageError(
+        str(ply),
+        "a PLY outside iteration_N" if ply.is_file() else "no such file",
+        "a checkpoint, or point_cloud/iteration_N/point_cloud.ply",
+        "Check the path.",
+    )
+
+
+def _read_checkpoint(path: Path) -> tuple[Any, int]:
+    """What a checkpoint holds, its tensors still on disk: hosts save (capture, iteration).
+
+    Raises:
+        UsageError: there is none.
+        ModelFileError: it cannot be read.
+    """
     import torch
 
-    if not checkpoint.is_file():
-        raise UsageError(str(checkpoint), "no such file", "a checkpoint", "Check the path.")
-    with _host_checkpoints():
-        content = torch.load(checkpoint, map_location="cpu")
-    return int(content[-1])
+    if not path.is_file():
+        raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
+    try:
+        with _host_checkpoints():
+            capture, iteration = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            return capture, int(iteration)
+    except (UnpicklingError, RuntimeError, OSError, EOFError, ValueError, TypeError) as error:
+        raise ModelFileError(
+            str(path),
+            f"not readable as a checkpoint ({str(error).splitlines()[0]})",
+            "(capture, iteration), as hosts save it",
+            "It was cut off, or is no checkpoint: remove it, or name another.",
+        ) from error
 
 
 @contextlib.contextmanager

@@ -17,7 +17,11 @@ from fragprune_plugins.hosts.adapter import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, named
-from fragprune_plugins.injection.stepping import begin_step
+from fragprune_plugins.injection.stepping import (
+    asking_for_no_gradient,
+    begin_step,
+    frozen_parameters,
+)
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 if TYPE_CHECKING:
@@ -78,7 +82,8 @@ def draw_view(session: Session, render: Any, model: Any, view: int, args: Any, k
     """The host's function, with its model and view known to the rasterizer's seam."""
     token = session.rendering.set((model, view))
     try:
-        return render(*args, **kwargs)
+        with asking_for_no_gradient(frozen_parameters(session, model)) as cut:
+            return render(*map(cut, args), **{name: cut(each) for name, each in kwargs.items()})
     finally:
         session.rendering.reset(token)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import weakref
 from collections.abc import Callable
 from inspect import signature
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.injection.state import ModelState, named
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -22,14 +24,24 @@ from fragprune_plugins.storage import sidecar
 if TYPE_CHECKING:
     from fragprune_plugins.injection.session import Session
 
+log = logging.getLogger("fragprune")
+
 
 def on_save(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
-    """Thresholds beside the file that the host wrote."""
+    """Thresholds beside the file that the host wrote; nothing is written that is not finite."""
+    check_learned(session, model)
     result = wrapped(*args, **kwargs)
     path = named(wrapped, args, kwargs)[seam.needs[0]]
     if model in session.models and path is not None:
         session.save(model, file_at(session, seam, path))
     return result
+
+
+def check_learned(session: Session, model: Any) -> None:
+    """Raise DivergedError where a model that learns is not finite: its host is about to save."""
+    state = session.models.get(model)
+    if state is not None and state.stage is not None and state.stage.plan is not None:
+        state.stage.check()
 
 
 def file_at(session: Session, seam: Seam, path: Any) -> Path:
@@ -100,12 +112,13 @@ def adopt(session: Session, model: Any, expected: Tensor, store: ThresholdStore)
 def on_capture(
     session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any
 ) -> Any:
-    """Thresholds inside the host's checkpoint."""
+    """Thresholds inside the host's checkpoint; in stage 2 always, so that it is known for one."""
+    check_learned(session, model)
     result = wrapped(*args, **kwargs)
     state = session.models.get(model)
-    if state is not None and not state.store.neutral:
+    if state is not None and (session.standing_still(model) or not state.store.neutral):
         session.expect_rows(model, state, str(seam))
-        session.adapter.checkpoint_state(result)["fragprune"] = state.store.state_dict()
+        session.adapter.checkpoint_state(result)[CHECKPOINT_KEY] = state.store.state_dict()
     return result
 
 
@@ -116,8 +129,9 @@ def on_restore(
     bound = signature(wrapped).bind(*args, **kwargs)
     capture = session.adapter.before_restore(model, bound.arguments[seam.needs[0]])
     bound.arguments[seam.needs[0]] = capture
-    saved = session.adapter.checkpoint_state(capture).pop("fragprune", None)
+    saved = session.adapter.checkpoint_state(capture).pop(CHECKPOINT_KEY, None)
     result = wrapped(*bound.args, **bound.kwargs)
+    revive(session, model)
     state = session.models.get(model)
     if saved is not None:
         if state is None:
@@ -126,6 +140,32 @@ def on_restore(
         state.store.load_state_dict(saved)
         session.expect_rows(model, state, str(seam))
     return result
+
+
+def revive(session: Session, model: Any) -> None:
+    """Let a restored model train as the host sets it up, where its checkpoint would not.
+
+    What version 0.1 froze it left frozen, in its checkpoints too, and at the rates of stage 2. A
+    checkpoint that was made of a PLY has no rates.
+    """
+    groups = [(name, group) for name, group in session.groups(model) if name]
+    names, adapter = {name for name, _ in groups}, session.adapter
+    asleep = {n for n, g in groups if not any(each.requires_grad for each in g["params"])}
+    trained = [adapter.trained_groups(train) for train in ("opacity", "appearance")]
+    frozen = bool(asleep) and asleep in [names - each for each in trained if each is not None]
+    if not frozen and any(group["lr"] for _, group in groups):
+        return
+    for name, group in groups:
+        group["lr"] = session.rates[model].get(name, group["lr"])
+        for parameter in group["params"] if frozen else ():
+            parameter.requires_grad_(True)
+    if frozen:
+        log.warning(
+            "%s: the checkpoint is of a stage 2 of fragprune 0.1, which left %s unable to train; "
+            "they can again",
+            adapter.name,
+            ", ".join(sorted(asleep)),
+        )
 
 
 def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:

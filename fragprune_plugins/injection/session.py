@@ -111,6 +111,7 @@ class Session:
         self.optimizers: weakref.WeakKeyDictionary[Any, list[weakref.ReferenceType[Any]]] = (
             weakref.WeakKeyDictionary()
         )
+        self.rates: weakref.WeakKeyDictionary[Any, dict[str, float]] = weakref.WeakKeyDictionary()
         self.warned = False
         self.last: weakref.ReferenceType[Any] | None = None
         self.last_state: ModelState | None = None  # outlives the host's model
@@ -331,8 +332,17 @@ class Session:
         """This model is the one that reports and summaries are about."""
         self.last, self.last_state = weakref.ref(model), state
 
-    def stage2(self, state: ModelState) -> Stage2:
+    def stage2(self, model: Any, state: ModelState) -> Stage2:
         """Learning for a model's thresholds, as the plugins have it."""
+        reference = weakref.ref(model)
+
+        def parameters() -> dict[str, Tensor]:
+            return {
+                name or f"group {number}": parameter
+                for number, (name, group) in enumerate(self.groups(reference()))
+                for parameter in group["params"]
+            }
+
         return Stage2(
             state.store,
             self.settings,
@@ -340,6 +350,7 @@ class Session:
             truncate=self.truncate,
             views=state.views,
             watch=self.report,
+            parameters=parameters,
         )
 
     def truncate(self, inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
@@ -357,17 +368,20 @@ class Session:
         self.plugins.tell(hookspecs.fragprune_population_changed, store=store, change=change)
 
     def save(self, model: Any, path: Path) -> None:
-        """Write a model's thresholds beside the file ``path`` that holds it; none if neutral.
+        """Write a model's thresholds beside the file ``path`` that holds it.
+
+        Neutral ones only in stage 2, whose files are told by their sidecars: a control's has one.
 
         Raises:
             SessionError: the model is not one of this session's.
             AlignmentError: it has other rows than thresholds.
+            DivergedError: they are not finite.
         """
         state = self.models.get(model)
         if state is None:
             raise SessionError("save()", "a model without thresholds", "one attached", "Train it.")
         self.expect_rows(model, state, str(path))
-        if state.store.neutral:
+        if state.store.neutral and not self.standing_still(model):
             # A sidecar of an earlier model under this name would now be refused as stale.
             sidecar.path_beside(path).unlink(missing_ok=True)
         else:

@@ -30,12 +30,12 @@ class ModelState:
     begun: bool = False  # a step whose loss has not gone backward yet
     pending_parents: Tensor | None = None
     prepared: bool = False
-    base_rates: dict[str, float] = field(default_factory=dict)
     views: dict[int, Callable[[], Any]] = field(default_factory=dict)  # view -> its last render
     loaded: weakref.ReferenceType[Any] | None = None  # the means a sidecar's thresholds came with
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
+    lent: list[list[tuple[dict[str, Any], float]]] = field(default_factory=list)  # the host's rates
 
 
 def named(function: Any, args: Any, kwargs: Any) -> dict[str, Any]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.injection.state import ModelState, named
@@ -38,6 +40,8 @@ def on_attach(
     result = wrapped(*args, **kwargs)
     optimizers = session.adapter.optimizers(model, named(wrapped, args, kwargs))
     session.optimizers[model] = [weakref.ref(optimizer) for optimizer in optimizers]
+    groups = session.groups(model)
+    session.rates[model] = {name: group["lr"] for name, group in groups if name}
     rows = session.adapter.rows(model)
     if state is not None and not kept:
         before = len(state.store)
@@ -51,9 +55,8 @@ def on_attach(
         )
         state = session.models[model] = ModelState(store)
     if state.stage is None:
-        state.stage = session.stage2(state)
+        state.stage = session.stage2(model, state)
     session.follow(model, state)
-    state.base_rates = {name: group["lr"] for name, group in session.groups(model) if name}
     hook_optimizers(session, model, state)
     session.plugins.tell(hookspecs.fragprune_attached, model=model, store=state.store)
     return result
@@ -81,18 +84,27 @@ def hook_optimizers(session: Session, model: Any, state: ModelState) -> None:
 
 
 def before_step(session: Session, reference: Any, optimizer: Any, *_: Any) -> None:
-    """Stage 2: parameters that do not train get no gradient, so no optimizer touches them."""
+    """Stage 2: parameters that do not train get no gradient, so no optimizer touches them.
+
+    Those that do are lent the rates of stage 2 for the step: the host pickles rates, too.
+    """
     model = reference()
-    if model is None or not session.standing_still(model):
+    state = session.models.get(model) if model is not None else None
+    if state is None:
+        return
+    lent: list[tuple[dict[str, Any], float]] = []
+    state.lent.append(lent)
+    if not session.standing_still(model):
         return
     trained = session.adapter.trained_groups(session.settings.train)
-    stage, rates = session.models[model].stage, session.models[model].base_rates
+    stage, rates = state.stage, session.rates[model]
     for group in optimizer.param_groups:
         name = session.adapter.group_name(model, group)
         if trained is not None and name not in trained:
             for parameter in group["params"]:
                 parameter.grad = None
         elif stage is not None and name in rates and name != "xyz":  # the host sets that one
+            lent.append((group, group["lr"]))
             group["lr"] = stage.rate(name, rates[name])
 
 
@@ -100,7 +112,11 @@ def after_step(session: Session, reference: Any, *_: Any) -> None:
     """The store steps once per counted step, however many optimizers the host steps."""
     model = reference()
     state = session.models.get(model) if model is not None else None
-    if state is None or state.stepped == state.steps:
+    if state is None:
+        return
+    for group, rate in state.lent.pop() if state.lent else ():
+        group["lr"] = rate
+    if state.stepped == state.steps:
         return
     state.stepped = state.steps
     if state.stage is not None:
@@ -119,7 +135,7 @@ def on_step(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, k
 
 
 def begin_step(session: Session, model: Any, state: ModelState) -> None:
-    """Count a step of the host; freeze what stands still, and let stage 2 begin its own."""
+    """Count a step of the host, and let stage 2 begin its own."""
     if state.stage is not None:
         state.stage.close()  # before the count: whoever watches may end the run here
     state.begun = True
@@ -128,23 +144,70 @@ def begin_step(session: Session, model: Any, state: ModelState) -> None:
         if not state.prepared:
             session.adapter.prepare_stage2(model, session.origin or session.output)
             state.prepared = True
-        freeze(session, model)
+        fill_gradients_read(session, model)
     if state.stage is not None and state.steps > session.from_step:
         state.stage.begin(lambda: session.adapter.opacities(model))
 
 
-def freeze(session: Session, model: Any) -> None:
-    """Frozen parameters ask for no gradient: the engine then skips their share of the work."""
+def frozen_parameters(session: Session, model: Any) -> list[Tensor]:
+    """Parameters of a model that do not train now."""
     trained = session.adapter.trained_groups(session.settings.train)
-    if trained is None:
-        return
-    for name, group in session.groups(model):
-        for parameter in group["params"]:
-            parameter.requires_grad_(name in trained)
-            if name not in trained and name in session.adapter.gradients_read:
-                parameter.grad = torch.zeros_like(parameter)
-    for parameter in session.adapter.elsewhere(model):
+    if trained is None or not session.standing_still(model):
+        return []
+    groups = [group for name, group in session.groups(model) if name not in trained]
+    own = [parameter for group in groups for parameter in group["params"]]
+    return own + session.adapter.elsewhere(model)
+
+
+@contextlib.contextmanager
+def asking_for_no_gradient(parameters: list[Tensor]) -> Iterator[Callable[[Any], Any]]:
+    """Inside, an engine skips the share of these parameters; outside, they are as the host has it.
+
+    Yields:
+        What to pass arguments through that the host worked out before: a tensor that depends on
+        nothing else is cut off from them.
+    """
+    changed = [parameter for parameter in parameters if parameter.requires_grad]
+    known = {id(parameter) for parameter in parameters}
+
+    def cut(value: Any) -> Any:
+        return value.detach() if depends_only_on(known, value) else value
+
+    for parameter in changed:
         parameter.requires_grad_(False)
+    try:
+        yield cut
+    finally:
+        for parameter in changed:
+            parameter.requires_grad_(True)
+
+
+def depends_only_on(known: set[int], value: Any) -> bool:
+    """Whether a value is a tensor worked out with gradients from leaves of these ids alone."""
+    if not known or not isinstance(value, Tensor) or value.grad_fn is None:
+        return False
+    waiting: list[Any] = [value.grad_fn]
+    seen, leaves = set(), 0
+    while waiting:
+        node = waiting.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if (leaf := getattr(node, "variable", None)) is not None:
+            leaves += 1
+            if id(leaf) not in known:
+                return False
+        waiting += [before for before, _ in node.next_functions]
+    return leaves > 0
+
+
+def fill_gradients_read(session: Session, model: Any) -> None:
+    """Zeros where the host reads a gradient of what stands still: drawing leaves none."""
+    trained = session.adapter.trained_groups(session.settings.train)
+    for name, group in session.groups(model):
+        if trained is not None and name not in trained and name in session.adapter.gradients_read:
+            for parameter in group["params"]:
+                parameter.grad = torch.zeros_like(parameter)
 
 
 OF_CALLS: dict[Role, Callable[..., Any]] = {

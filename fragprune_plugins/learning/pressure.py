@@ -124,7 +124,7 @@ class StepViews:
     expected: int = 1
     _fragments: list[Figure] = field(default_factory=list)
     _untruncated: list[Figure] = field(default_factory=list)
-    _losses: list[Figure] = field(default_factory=list)
+    _losses: list[Figure | None] = field(default_factory=list)
 
     def begin(self) -> None:
         """A new step."""
@@ -135,7 +135,7 @@ class StepViews:
         """A view was drawn with gradients: fragments per pixel, and those before learning."""
         self._fragments.append(fragments)
         self._untruncated.append(untruncated)
-        self._losses.append(math.nan)
+        self._losses.append(None)
 
     def lose(self, loss: Figure) -> None:
         """The loss of the view drawn last went backward."""
@@ -160,8 +160,13 @@ class StepViews:
     @property
     def loss(self) -> float:
         """The sum over the views so far, of those whose loss is known."""
-        known = [loss for loss in map(float, self._losses) if not math.isnan(loss)]
+        known = [float(loss) for loss in self._losses if loss is not None]
         return sum(known) if known else math.nan
+
+    @property
+    def finite(self) -> bool:
+        """Whether the losses that are known are."""
+        return all(math.isfinite(loss) for loss in self._losses if loss is not None)
 
 
 def _mean(figures: list[Figure]) -> float:
@@ -236,10 +241,7 @@ def calibrate(
     Returns:
         The speed-up measured last.
     """
-    import torch
-
-    logits = store.logits
-    start = logits.detach().clone()
+    start = store.logits.detach().clone()
     low, high = -reach, reach
     shift, reached = 0.0, speedup()
     for _ in range(rounds):
@@ -250,7 +252,6 @@ def calibrate(
         else:
             high = shift
         shift = (low + high) / 2
-        with torch.no_grad():
-            logits.copy_(start + shift)
+        store.place(start + shift)
         reached = speedup()
     return reached

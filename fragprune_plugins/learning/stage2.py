@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.finite import CHECK_EVERY, expect_finite
 from fragprune_plugins.learning.pressure import (
     CALIBRATE_AT,
     CALIBRATION_VIEWS,
@@ -83,6 +84,7 @@ class Stage2:
         truncate: gives the thresholds to draw with; the hook ``fragprune_truncate``.
         views: by view, what draws it again, ending in ``drew``; those that a target is met on.
         watch: told of every step that is over.
+        parameters: gives by name what the driver trains; it is looked at that it stays finite.
     """
 
     def __init__(
@@ -94,6 +96,7 @@ class Stage2:
         truncate: Truncate = learned_thresholds,
         views: Mapping[Any, Callable[[], object]] = MappingProxyType({}),
         watch: Callable[[StepStats], None] | None = None,
+        parameters: Callable[[], Mapping[str, Tensor]] = dict,
     ) -> None:
         self.store, self.settings = store, settings
         self.schedule = schedule or Schedule(settings)
@@ -102,6 +105,7 @@ class Stage2:
         self.taken = 0  # the last that the driver's optimizer took: hosts take none at their end
         self.plan: StepPlan | None = None
         self._truncate, self._again, self._watch = truncate, views, watch
+        self._parameters, self._suspect = parameters, False
         self._held = False  # thresholds have met their target and stay
         self._met: float | None = None  # the speed-up they met it with
         self._before: dict[tuple[Hashable, int], Tensor] = {}
@@ -125,8 +129,14 @@ class Stage2:
 
         Args:
             opacities: gives the activated opacities, (N,) or (N, 1), when they are needed.
+
+        Raises:
+            DivergedError: NaN or infinity, seen in the step that is over or by a look every
+                ``CHECK_EVERY`` steps.
         """
         self.close()
+        if self._suspect or (self.steps and self.steps % CHECK_EVERY == 0):
+            self.check()
         self.steps += 1
         self.plan = self.schedule.at(self.steps)
         self._views.begin()
@@ -209,6 +219,7 @@ class Stage2:
         every = max(1, self.settings.iterations // CURVE_POINTS)
         if math.isnan(self._median) or self.steps % every == 0:
             self._median = float(self.store.values.detach().median())
+        self._suspect |= not (math.isfinite(self._median) and views.finite)
         stats = StepStats(
             step=self.steps,
             fragments_per_pixel=views.fragments,
@@ -223,6 +234,12 @@ class Stage2:
         views.begin()  # first, so that whoever watches may raise
         if self._watch is not None:
             self._watch(stats)
+
+    def check(self) -> None:
+        """Raise DivergedError unless everything that trains is finite; before anything is saved."""
+        where = f"stage 2, after step {self.steps}"
+        expect_finite({**self._parameters(), **self.store.numbers}, where)
+        self._suspect = False
 
     def progress(self) -> Progress:
         """What was done so far."""

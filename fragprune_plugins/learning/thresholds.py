@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import ALPHA_MIN, NEUTRAL_LOGIT
+from fragprune_plugins.constants import ALPHA_MIN, LOGIT_MAX, LOGIT_MIN, NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError, SidecarError
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
@@ -45,8 +45,8 @@ class ThresholdStore:
 
     @property
     def values(self) -> Tensor:
-        """(N,) thresholds in (0, 1); differentiable with respect to the logits."""
-        return torch.sigmoid(self.logits)
+        """(N,) thresholds in (0, 1), also in float32; differentiable with respect to the logits."""
+        return torch.sigmoid(self.logits.clamp(LOGIT_MIN, LOGIT_MAX))
 
     @property
     def neutral(self) -> bool:
@@ -101,9 +101,15 @@ class ThresholdStore:
         learning = not self.neutral
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
+        self.place(self.logits)
         self.steps += 1
         if learning:  # no step comes near the 24 logits from the skip limit down to neutral
             self._know(neutral=False, opened=self._opened)
+
+    @torch.no_grad()
+    def place(self, logits: Tensor) -> None:
+        """Take these logits (N,), kept where float32 tells their thresholds from 0 and from 1."""
+        self.logits.copy_(logits.clamp(LOGIT_MIN, LOGIT_MAX))
 
     def keep(self, mask: Tensor) -> None:
         """Keep the rows where mask (N,) bool is True, in their order, with their moments."""
@@ -173,6 +179,14 @@ class ThresholdStore:
         lr = self.optimizer.param_groups[0]["lr"]
         self._bind(torch.full((count,), NEUTRAL_LOGIT, device=self.logits.device), lr)
 
+    @property
+    def numbers(self) -> dict[str, Tensor]:
+        """Everything learned, each (N,), by what a person calls it."""
+        state = self.optimizer.state.get(self.logits, {})
+        moments = {"exp_avg": "their moments", "exp_avg_sq": "their second moments"}
+        named = {name: state[key] for key, name in moments.items() if key in state}
+        return {"thresholds": self.logits.detach(), **named}
+
     def state_dict(self) -> dict[str, Any]:
         """Logits, moments and counters; tensors are copies."""
         state = self.optimizer.state.get(self.logits, {})
@@ -189,16 +203,25 @@ class ThresholdStore:
         """Restore what ``state_dict`` gave, bit for bit.
 
         Raises:
-            SidecarError: the state's parts do not fit together.
+            SidecarError: the state's parts do not fit together, or are no numbers that learning
+                can have left.
         """
         rows = {key: state[key] for key in ("logits", "exp_avg", "exp_avg_sq")}
+        remedy = "Use a sidecar written by fragprune."
         if len({tuple(t.shape) for t in rows.values()}) != 1 or rows["logits"].ndim != 1:
-            raise SidecarError(
-                "threshold state",
-                f"shapes {[tuple(t.shape) for t in rows.values()]}",
-                "three equal (N,)",
-                "Use a sidecar written by fragprune.",
-            )
+            found = f"shapes {[tuple(t.shape) for t in rows.values()]}"
+            raise SidecarError("threshold state", found, "three equal (N,)", remedy)
+        for name, tensor in rows.items():
+            wrong = ~tensor.isfinite()
+            if name == "exp_avg_sq":
+                wrong |= tensor < 0
+            if wrong.any():
+                raise SidecarError(
+                    "threshold state",
+                    f"{name} that cannot be in {int(wrong.sum())} of {len(tensor)} rows",
+                    "finite numbers, and second moments that are not negative",
+                    remedy,
+                )
         device, lr = self.logits.device, self.optimizer.param_groups[0]["lr"]
         self._bind(rows["logits"].to(device), lr)
         self.steps = int(state["steps"])

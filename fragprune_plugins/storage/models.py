@@ -42,6 +42,5 @@ def load_model(
     if truncation and sidecar.lies_beside(path):
         sidecar.load(path, store)
     elif truncation and model.thresholds is not None:
-        with torch.no_grad():
-            store.logits.copy_(torch.logit(model.thresholds))
+        store.place(torch.logit(model.thresholds))
     return model, None if store.neutral else store

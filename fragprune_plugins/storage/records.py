@@ -46,19 +46,21 @@ def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
     return target
 
 
-def path_beside(model: Path) -> Path:
+def path_beside(result: Path) -> Path:
     """Where the record of a result lies."""
-    return Path(model).with_suffix(SUFFIX)
+    return Path(result).with_suffix(SUFFIX)
 
 
-def beside(model: Path) -> Record | None:
-    """The record of the command that left a model; None without one.
+def beside(result: Path) -> Record | None:
+    """The record of a result; None without one, or where the result was written again since.
 
     Raises:
         RecordError: it cannot be read.
     """
-    path = path_beside(model)
-    return _read(path) if path.exists() else None
+    path = path_beside(result)
+    if not path.exists() or path.stat().st_mtime_ns < result.stat().st_mtime_ns:
+        return None
+    return _read(path)
 
 
 def find(folder: Path) -> list[Record]:

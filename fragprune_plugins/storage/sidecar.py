@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from fragprune_plugins.errors import SidecarError
+from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage.atomic import digest, replacing
 from fragprune_plugins.storage.ply import is_marked
@@ -65,6 +66,15 @@ def lies_beside(model: Path) -> bool:
     return path.exists()
 
 
+def belongs(model: Path) -> bool:
+    """Whether a sidecar lies beside a model file and was written for the file as it is now.
+
+    Raises:
+        SidecarError: it cannot be read.
+    """
+    return path_beside(model).exists() and _read(model)[1].model_sha256 == digest(model)
+
+
 def save(
     model: Path,
     store: ThresholdStore,
@@ -76,10 +86,12 @@ def save(
     """Write the store beside a model file that is already there; returns the sidecar's path.
 
     Raises:
+        DivergedError: what was learned is not finite.
         OutputError: the place cannot be written.
     """
     from safetensors.torch import save_file
 
+    expect_finite(store.numbers, str(path_beside(model)))
     state = store.state_dict()
     tensors = {k: v.cpu().contiguous() for k, v in state.items() if isinstance(v, torch.Tensor)}
     metadata = {
@@ -107,15 +119,42 @@ def load(model: Path, store: ThresholdStore | None = None) -> tuple[ThresholdSto
             None makes one on the CPU of as many rows as the sidecar says that the model has.
 
     Raises:
-        SidecarError: missing, unreadable, written for another model file, or of other rows than the
-            store. The store stays as it was.
+        SidecarError: missing, unreadable, not finite, written for another model file, or of other
+            rows than the store. The store stays as it was.
     """
+    state, info = _read(model)
+    shape, wanted = tuple(state["logits"].shape), digest(model)
+    if wanted != info.model_sha256 or shape != (info.rows,):
+        raise SidecarError(
+            str(path_beside(model)),
+            f"thresholds of another model (sha256 {info.model_sha256[:12]}, {info.rows} rows)",
+            f"those of {Path(model).name} (sha256 {wanted[:12]})",
+            _remedy(model),
+        )
+    if store is None:
+        store = ThresholdStore(info.rows)
+    elif len(store) != info.rows:
+        raise SidecarError(
+            str(path_beside(model)),
+            f"thresholds of {info.rows} Gaussian(s)",
+            f"{len(store)}, one for each in {Path(model).name}",
+            _remedy(model),
+        )
+    store.load_state_dict(state)
+    return store, info
+
+
+def _remedy(model: Path) -> str:
+    return f"Remove {path_beside(model).name}, or write it again with fragprune finetune."
+
+
+def _read(model: Path) -> tuple[dict[str, Any], SidecarInfo]:
+    """A sidecar's store state and what it says of itself, whatever model lies beside it."""
     from safetensors import SafetensorError, safe_open
 
     path = path_beside(model)
-    remedy = f"Remove {path.name}, or write it again with fragprune finetune."
     if not path.exists():
-        raise SidecarError(str(path), "no such file", "a sidecar beside the model", remedy)
+        raise SidecarError(str(path), "no such file", "a sidecar beside the model", _remedy(model))
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -137,23 +176,6 @@ def load(model: Path, store: ThresholdStore | None = None) -> tuple[ThresholdSto
             raise KeyError("logits")
     except (SafetensorError, KeyError, ValueError, OSError) as error:
         raise SidecarError(
-            str(path), f"unreadable ({error})", f"a file of format {FORMAT}", remedy
+            str(path), f"unreadable ({error})", f"a file of format {FORMAT}", _remedy(model)
         ) from error
-    if digest(model) != info.model_sha256 or tuple(tensors["logits"].shape) != (info.rows,):
-        raise SidecarError(
-            str(path),
-            f"thresholds of another model (sha256 {info.model_sha256[:12]}, {info.rows} rows)",
-            f"those of {Path(model).name} (sha256 {digest(model)[:12]})",
-            remedy,
-        )
-    if store is None:
-        store = ThresholdStore(info.rows)
-    elif len(store) != info.rows:
-        raise SidecarError(
-            str(path),
-            f"thresholds of {info.rows} Gaussian(s)",
-            f"{len(store)}, one for each in {Path(model).name}",
-            remedy,
-        )
-    store.load_state_dict(state)
-    return store, info
+    return state, info

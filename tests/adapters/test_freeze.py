@@ -6,7 +6,9 @@ import pytest
 import torch
 from miniature import running, tensors
 
+from fragprune_plugins.injection.stepping import asking_for_no_gradient
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.testing.invariants.case import FixedThresholds
 
 MOVES = {
     "opacity": {"opacity"},
@@ -62,12 +64,17 @@ def test_the_rates_of_stage_two_are_the_schedules():
     settings = Settings(iterations=5, train="appearance", opacity_lr=0.02)
     with running(settings) as host:
         model, camera = host.model(20), host.camera()
-        rates = []
+        rates, own = [], rates_of(model)
+        model.optimizer.register_step_pre_hook(lambda *_: rates.append(rates_of(model)))
         for iteration in range(1, 6):
             host.step(model, camera, iteration)
-            rates.append({g["name"]: g["lr"] for g in model.optimizer.param_groups})
+            assert rates_of(model) | {"xyz": 0} == own | {"xyz": 0}  # what the host pickles
     assert [r["opacity"] for r in rates] == pytest.approx([0.02 * 0.1 ** (i / 4) for i in range(5)])
     assert [r["f_dc"] for r in rates] == pytest.approx([0.0025 * 0.1 ** (i / 4) for i in range(5)])
+
+
+def rates_of(model):
+    return {group["name"]: group["lr"] for group in model.optimizer.param_groups}
 
 
 def test_thresholds_step_once_a_counted_step_however_often_the_hosts_optimizer_does():
@@ -93,11 +100,45 @@ def test_the_control_trains_the_same_without_thresholds():
         assert moved == {"opacity"}
 
 
+ASKS = {
+    "opacity": {"opacities"},
+    "appearance": {"opacities", "sh"},
+    "all": {"opacities", "sh", "means", "scales", "rotations"},
+}
+
+
 @pytest.mark.parametrize("train", MOVES)
-def test_frozen_parameters_ask_the_engine_for_no_gradient(train):
-    """That is a third of the backward pass."""
-    with running(Settings(iterations=9, train=train)) as host:
+def test_frozen_parameters_ask_the_engine_for_no_gradient_and_stay_as_the_host_made_them(train):
+    """That is a third of the backward pass; and the host pickles its parameters as they are."""
+    fixed = FixedThresholds()
+    with running(Settings(iterations=9, train=train), plugins=[fixed]) as host:
         model, camera = host.model(20), host.camera()
         host.step(model, camera, 1)
-        asking = {g["name"] for g in model.optimizer.param_groups if g["params"][0].requires_grad}
-        assert asking == MOVES[train]
+        assert fixed.asking == ASKS[train]
+        assert all(g["params"][0].requires_grad for g in model.optimizer.param_groups)
+
+
+def test_a_host_that_fails_to_draw_keeps_its_parameters_as_they_were():
+    with running(Settings(iterations=9)) as host:
+        model = host.model(20)
+        host.step(model, host.camera(), 1)
+        with pytest.raises(AttributeError):
+            host.render(object(), model)
+        assert all(g["params"][0].requires_grad for g in model.optimizer.param_groups)
+
+
+def test_what_a_host_worked_out_before_is_cut_off_from_what_stands_still_alone():
+    still, moving = (torch.ones(3, requires_grad=True) for _ in range(2))
+    with asking_for_no_gradient([still]) as cut:
+        assert not still.requires_grad
+        after = still.exp()
+    assert still.requires_grad
+    assert not after.requires_grad
+    before, mixed, other = still.exp(), still.exp() * moving, moving.exp()
+    with asking_for_no_gradient([still]) as cut:
+        assert not cut(before).requires_grad
+        assert torch.equal(cut(before), before)
+        assert cut(mixed) is mixed
+        assert cut(other) is other
+        assert cut(moving) is moving
+        assert cut("a word") == "a word"

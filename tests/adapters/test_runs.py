@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import gc
+import json
 import random
 import runpy
+import shutil
 import signal
+import subprocess
 import sys
 import weakref
 from dataclasses import replace
@@ -13,8 +16,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from miniature import HOST, TINY, running
 
+from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import Interrupted, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
@@ -90,15 +95,15 @@ def test_a_neutral_run_is_the_hosts_own_to_the_bit(photographs, tmp_path):
 
 
 class InterruptAt:
-    """Ctrl-C at the end of a learned step."""
+    """Ctrl-C, or another signal, at the end of a learned step."""
 
-    def __init__(self, step):
-        self.step, self.finished = step, []
+    def __init__(self, step, number=signal.SIGINT):
+        self.step, self.number, self.finished = step, number, []
 
     @hookimpl
     def fragprune_step(self, stats):
         if stats.step == self.step:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(self.number)
 
     @hookimpl
     def fragprune_finished(self, summary):
@@ -151,10 +156,45 @@ def test_ctrl_c_in_stage_two_keeps_what_was_learned_and_the_run_can_be_resumed(
 
     monkeypatch.undo()
     learned = store.values.detach()
-    summary = run(command(photographs, trained, 10), finetune)
-    resumed, _ = sidecar.load(summary.model_after)
+    assert f"--start_checkpoint {model}" in caught.value.remedy
+    named = command(photographs, trained, 10, "--start_checkpoint", model)
+    resumed, _ = sidecar.load(run(named, finetune).model_after)
     assert resumed.steps == 4 + 8
     assert (resumed.values.detach() - learned).abs().max() < 0.5
+    anew = run(command(photographs, trained, 10), finetune)
+    assert sidecar.load(anew.model_after)[0].steps == 8
+
+
+def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(
+    photographs, trained, monkeypatch
+):
+    before = signal.getsignal(signal.SIGTERM)
+    with_plugin(monkeypatch, InterruptAt(4, signal.SIGTERM))
+    options = ["run", "--device", "cpu", "--stage", "finetune", "--iters", 8, "--json", "--"]
+    words = [*options, *command(photographs, trained, 10)]
+    result = CliRunner().invoke(cli, [str(word) for word in words])
+    assert result.exit_code == 143
+    error = json.loads(result.stdout)["error"]
+    (saved,) = trained.glob("point_cloud/*/*.safetensors")
+    assert error["code"] == "terminated"
+    assert f"SIGTERM; thresholds so far are beside {saved.parent}" in error["found"]
+    assert sidecar.load(saved.with_name("point_cloud.ply"))[0].steps == 4
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_sigterm_in_stage_one_ends_the_process_as_the_host_alone(photographs, tmp_path):
+    script = tmp_path / "host" / "train.py"
+    shutil.copytree(HOST, script.parent)
+    text = script.read_text()
+    loop = "    for iteration in range(first_iter + 1, opt.iterations + 1):\n"
+    kill = "        import signal\n        signal.raise_signal(signal.SIGTERM)\n"
+    assert loop in text
+    script.write_text(text.replace(loop, loop + kill))
+    words = command(photographs, tmp_path / "out", 10)[1:]
+    program = "from fragprune_plugins.cli import main; main()"
+    options = ["run", "--device", "cpu", "--", str(script), *words]
+    done = subprocess.run([sys.executable, "-c", program, *options], capture_output=True)
+    assert done.returncode == -signal.SIGTERM
 
 
 def test_train_then_finetune_then_render(photographs, tmp_path):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -159,6 +161,43 @@ def test_ctrl_c_saves_and_leaves_with_130(scene, tmp_path, monkeypatch):
     assert report["interrupted"] is True
     assert report["iterations"] == 3
     assert sidecar.load(out)[0].steps == 3
+
+
+def test_sigterm_saves_at_once_and_leaves_with_143(scene, tmp_path, monkeypatch):
+    data, path, _ = scene
+    out, before = tmp_path / "out.ply", signal.getsignal(signal.SIGTERM)
+    loss, calls = loop.photometric_loss, []
+
+    def photometric(*args):
+        calls.append(1)
+        if len(calls) == 4:
+            signal.raise_signal(signal.SIGTERM)
+        return loss(*args)
+
+    def measured(*args):
+        assert len(calls) < 4, "whoever sent SIGTERM does not wait for this"
+        return fragments(*args)
+
+    fragments = loop.mean_fragments
+    monkeypatch.setattr(loop, "photometric_loss", photometric)
+    monkeypatch.setattr(loop, "mean_fragments", measured)
+    result = run("finetune", path, "--data", data, "--out", out, "--iters", 50, "--json")
+    assert result.exit_code == 143
+    report = json.loads(result.stdout)
+    assert (report["interrupted"], report["iterations"], report["after"]) == (True, 3, None)
+    assert sidecar.load(out)[0].steps == 3
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_divergence_is_a_stated_failure_and_writes_nothing(scene, tmp_path, monkeypatch):
+    data, path, _ = scene
+    monkeypatch.setattr(loop, "photometric_loss", lambda image, _: image.mean() * math.nan)
+    result = run("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--json")
+    assert result.exit_code == 1
+    error = json.loads(result.stdout)["error"]
+    assert (error["code"], error["where"]) == ("not-finite", "stage 2, after step 1")
+    assert "opacity" in error["found"]
+    assert not list(tmp_path.glob("out*"))
 
 
 @pytest.mark.parametrize(

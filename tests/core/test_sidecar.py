@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from fragprune_plugins.errors import OutputError, SidecarError
+from fragprune_plugins.errors import DivergedError, OutputError, SidecarError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import MARK
@@ -110,6 +110,12 @@ def broken(path, how: str) -> None:
         save_file({k: zero(()) for k in full}, path, metadata=metadata)
     elif how == "unequal parts":
         save_file(full | {"exp_avg": zero(2)}, path, metadata=metadata)
+    elif how == "not a number":
+        save_file(full | {"logits": zero(6) / 0}, path, metadata=metadata)
+    elif how == "infinite moments":
+        save_file(full | {"exp_avg": zero(6) + float("inf")}, path, metadata=metadata)
+    elif how == "negative second moments":
+        save_file(full | {"exp_avg_sq": zero(6) - 1}, path, metadata=metadata)
     elif how == "a folder":
         path.unlink()
         path.mkdir()
@@ -132,6 +138,9 @@ def broken(path, how: str) -> None:
         "fewer rows than stated",
         "a scalar",
         "unequal parts",
+        "not a number",
+        "infinite moments",
+        "negative second moments",
         "a folder",
         "missing",
     ],
@@ -160,3 +169,21 @@ def test_a_place_that_cannot_be_written_is_stated_and_the_old_sidecar_stays(
         sidecar.save(model, ThresholdStore(6))
     assert path.read_bytes() == before
     assert sorted(p.name for p in model.parent.iterdir()) == [path.name, model.name]
+
+
+def test_what_is_not_finite_is_not_written_and_the_old_sidecar_stays(model, trained):
+    path = sidecar.save(model, trained)
+    before = path.read_bytes()
+    with torch.no_grad():
+        trained.logits[2] = float("nan")
+    with pytest.raises(DivergedError, match=r"thresholds \(1 of 6 rows\)"):
+        sidecar.save(model, trained)
+    assert path.read_bytes() == before
+
+
+def test_a_sidecar_belongs_to_the_file_it_was_written_for(model, trained):
+    assert not sidecar.belongs(model)
+    sidecar.save(model, trained)
+    assert sidecar.belongs(model)
+    model.write_bytes(model.read_bytes() + b" retrained")
+    assert not sidecar.belongs(model)

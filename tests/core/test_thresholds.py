@@ -287,3 +287,41 @@ def test_a_state_whose_parts_do_not_fit_is_refused():
     state["exp_avg"] = torch.zeros(2)
     with pytest.raises(SidecarError, match="shapes"):
         ThresholdStore(3).load_state_dict(state)
+
+
+@pytest.mark.parametrize("key", ["logits", "exp_avg", "exp_avg_sq"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_state_that_is_not_finite_is_refused_and_changes_nothing(key, value):
+    state = ThresholdStore(3).state_dict()
+    state[key][1] = value
+    store = ThresholdStore(3)
+    with pytest.raises(SidecarError, match=f"{key} .* 1 of 3 rows"):
+        store.load_state_dict(state)
+    assert store.neutral
+
+
+def test_second_moments_cannot_be_negative():
+    state = ThresholdStore(3).state_dict()
+    state["exp_avg_sq"][2] = -1e-9
+    with pytest.raises(SidecarError, match="second moments that are not negative"):
+        ThresholdStore(3).load_state_dict(state)
+
+
+@given(st.lists(st.sampled_from([-9.0, -1.0, 0.0, 1.0, 9.0]), max_size=30), st.floats(0.05, 40.0))
+def test_values_stay_inside_0_and_1_in_float32_however_far_one_learns(gradients, lr):
+    store = ThresholdStore(2)
+    store.open(torch.tensor([0.5, 0.9]))
+    for gradient in gradients:
+        stepped(store, [gradient, -gradient], lr)
+    values = store.values.detach()
+    assert ((values > 0) & (values < 1)).all()
+    assert torch.equal(torch.sigmoid(store.state_dict()["logits"]), values)  # as others read it
+
+
+def test_values_of_a_state_from_elsewhere_stay_inside_too():
+    state = ThresholdStore(4).state_dict()
+    state["logits"] = torch.tensor([-1e30, -200.0, 20.0, 1e30])
+    store = ThresholdStore(0)
+    store.load_state_dict(state)
+    values = store.values.detach()
+    assert ((values > 0) & (values < 1)).all()

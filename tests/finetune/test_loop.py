@@ -10,7 +10,7 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.errors import AlignmentError, DivergedError
 from fragprune_plugins.finetuning import finetune, loop, save
 from fragprune_plugins.finetuning.loop import mean_fragments
 from fragprune_plugins.learning.pressure import calibrate
@@ -131,6 +131,14 @@ def test_interrupted(model, dataset, monkeypatch):
     assert result.interrupted
     assert result.progress.steps == 5
     assert not torch.equal(result.model.opacity, model.opacity)
+
+
+def test_divergence_that_no_loss_shows_is_noticed_before_there_is_a_result(model, dataset):
+    store = ThresholdStore(len(model))
+    spoiled = replace(model, opacity=model.opacity.clone())
+    spoiled.opacity[:2] = torch.nan  # not drawn, so not in the loss either
+    with pytest.raises(DivergedError, match=rf"opacity \(2 of {len(model)} rows\)"):
+        finetune(spoiled, dataset, Settings(iterations=3), store=store)
 
 
 def test_going_on_from_a_store(default, model, dataset):

@@ -270,6 +270,35 @@ def test_stage_2_moves_opacities_and_thresholds_alone(session_on, kind):
         assert summary.fragments_after < summary.fragments_before
 
 
+@pytest.mark.parametrize(
+    ("train", "asked"),
+    [
+        ("opacity", {"opacities"}),
+        ("appearance", {"opacities", "colors"}),
+        ("all", {"opacities", "colors", "means2d", "conics", "depths"}),
+    ],
+)
+def test_the_engine_works_out_gradients_of_what_trains_alone(session_on, train, asked):
+    """Though the loop activates its parameters before it draws, and they stay as it made them."""
+    with session_on(Gsplat(), settings=Settings(iterations=8, train=train)) as session:
+        from gsplat import DefaultStrategy
+
+        params, optimizers = model()
+        DefaultStrategy().check_sanity(params, optimizers)
+        engine, asking = session.engine(torch.device("cpu")), []
+        rasterize = engine.rasterize
+
+        def noting(inputs, thresholds):
+            fields = vars(inputs.splats).items()
+            asking.append({n for n, t in fields if torch.is_tensor(t) and t.requires_grad})
+            return rasterize(inputs, thresholds)
+
+        engine.rasterize = noting
+        draw(params)[0].mean().backward()
+        assert asking[0] == asked
+        assert all(parameter.requires_grad for parameter in params.values())
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
     """The cameras see ever less, so that no one of them could speak for all."""

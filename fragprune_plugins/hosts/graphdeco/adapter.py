@@ -10,8 +10,14 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.datasets.photographs import Photographs, Resolution
-from fragprune_plugins.errors import NotComparedError
-from fragprune_plugins.hosts.adapter import CommandLine, Dialect, HostAdapter, HostCall
+from fragprune_plugins.errors import ModelFileError, NotComparedError
+from fragprune_plugins.hosts.adapter import (
+    CHECKPOINT_KEY,
+    CommandLine,
+    Dialect,
+    HostAdapter,
+    HostCall,
+)
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco.contract import Contract, read_calls
 from fragprune_plugins.hosts.seams import Role, Seam
@@ -289,7 +295,16 @@ class GraphdecoAdapter(HostAdapter):
 
     def checkpoint_state(self, capture: Any) -> dict[str, Any]:
         """The optimizer's state dict: load_state_dict ignores keys it does not know."""
-        return next(part for part in capture if isinstance(part, dict) and "param_groups" in part)
+        parts = [p for p in capture if isinstance(p, dict) and "param_groups" in p]
+        if parts:
+            state: dict[str, Any] = parts[0]
+            return state
+        raise ModelFileError(
+            f"{self.name}: checkpoint",
+            "no optimizer's state in it",
+            "one, as the host captures it",
+            "Name another, or a PLY.",
+        )
 
     def before_restore(self, model: Any, capture: Any) -> Any:
         """A checkpoint made from a PLY lacks the scene's extent; the fresh model knows it."""
@@ -321,7 +336,7 @@ class GraphdecoAdapter(HostAdapter):
         )
         state: dict[str, Any] = optimizer.state_dict()
         if sidecar.lies_beside(ply):
-            state["fragprune"] = sidecar.load(ply, ThresholdStore(rows))[0].state_dict()
+            state[CHECKPOINT_KEY] = sidecar.load(ply, ThresholdStore(rows))[0].state_dict()
         capture = (
             m.sh_degree,
             parameters["xyz"],
@@ -374,17 +389,20 @@ class GraphdecoAdapter(HostAdapter):
         return output / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """``chkpnt*.pth`` and PLYs; a checkpoint comes after the PLY of the same iteration."""
-        found = [
-            (int(path.parent.name.removeprefix("iteration_")), 0, path)
+        """``chkpnt*.pth`` and PLYs; the host writes a checkpoint after the PLY of its iteration."""
+        plys = {
+            path: path.parent.name.removeprefix("iteration_")
             for path in output.glob("point_cloud/iteration_*/point_cloud.ply")
-            if path.parent.name.removeprefix("iteration_").isdigit()
-        ] + [
-            (int(path.stem.removeprefix("chkpnt")), 1, path)
-            for path in output.glob("chkpnt*.pth")
-            if path.stem.removeprefix("chkpnt").isdigit()
+        }
+        checkpoints = {
+            path: path.stem.removeprefix("chkpnt") for path in output.glob("chkpnt*.pth")
+        }
+        found = [
+            (path.stat().st_mtime_ns, int(number), path in checkpoints, path)
+            for path, number in (plys | checkpoints).items()
+            if number.isdigit()
         ]
-        return [(iteration, path) for iteration, _, path in sorted(found)]
+        return [(iteration, path) for _, iteration, _, path in sorted(found)]
 
 
 def reaches(grads: Tensor, threshold: Any, rows: int) -> Tensor:

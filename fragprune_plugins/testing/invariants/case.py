@@ -62,15 +62,21 @@ def require(condition: object, found: str) -> None:
 
 
 class FixedThresholds:
-    """A plugin that answers with the thresholds it holds and remembers what was drawn."""
+    """A plugin that answers with the thresholds it holds and remembers what was drawn.
+
+    ``asking`` are the fields of the Gaussians that asked the engine for a gradient.
+    """
 
     def __init__(self, values: Tensor | None = None) -> None:
         self.values, self.inputs, self.calls = values, None, 0
+        self.asking: set[str] = set()
 
     @hookimpl(tryfirst=True)
     def fragprune_truncate(self, inputs: Any, store: Any) -> Tensor | None:
         """The thresholds held; those learned when there are none."""
         self.inputs = inputs
+        drawn = vars(inputs.splats)
+        self.asking = {name for name, t in drawn.items() if torch.is_tensor(t) and t.requires_grad}
         self.calls += 1
         return self.values
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.testing.host import Chance, running, tensors
-from fragprune_plugins.testing.invariants.case import Case, require
+from fragprune_plugins.testing.host import Chance, Host, running, tensors
+from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, require
+
+ASKED = {"opacity": {"opacities"}, "appearance": {"opacities", "sh", "colors"}}
+"""Fields of the Gaussians whose gradients an engine works out; the others cost nothing."""
 
 
 def freeze(case: Case) -> str:
@@ -18,11 +23,13 @@ def freeze(case: Case) -> str:
         "all": None,
     }
     for train, named in moving.items():
-        with running(Settings(iterations=9, train=train), from_step=2, **case.options()) as host:  # type: ignore[arg-type]
+        settings, drawn = Settings(iterations=9, train=train), FixedThresholds()  # type: ignore[arg-type]
+        with running(settings, from_step=2, plugins=[drawn], **case.options()) as host:
             model, camera = host.model(20), host.camera()
             model.active_sh_degree = min(1, model.max_sh_degree)  # every band takes part
             for iteration in (1, 2):
                 host.step(model, camera, iteration)
+            asking = _asking(driver, model)
             before, thresholds = tensors(driver, model), host.store(model).logits.detach().clone()
             model_bands = model.active_sh_degree
             for iteration in (3, 4, 5, 6):
@@ -38,7 +45,20 @@ def freeze(case: Case) -> str:
                 moved == expected,
                 f"--train {train}: moved {sorted(moved)}; expected {sorted(expected)}",
             )
+            require(
+                _asking(driver, model) == asking,
+                f"--train {train}: left other parameters asking for a gradient than it found",
+            )
+            require(
+                named is None or drawn.asking <= ASKED[train],
+                f"--train {train}: the engine was asked for gradients of {sorted(drawn.asking)}",
+            )
             learned = host.store(model)
             require(learned.steps == 4, f"--train {train}: {learned.steps} threshold steps of 4")
             require(not torch.equal(learned.logits, thresholds), "thresholds stood still")
     return f"{len(moving)} choices of --train, {len(driver.routine)} routines"
+
+
+def _asking(driver: Host, model: Any) -> set[str]:
+    """Parameters for which the host asks for a gradient."""
+    return {name for name, value in driver.parameters(model).items() if value.requires_grad}

@@ -25,6 +25,7 @@ def round_trip(case: Case) -> str:
             parts.append("model file")
         if case.has(Role.CAPTURE) and case.has(Role.RESTORE):
             _through_a_checkpoint(case, Path(folder) / "chkpnt3.pth")
+            _out_of_stage_two(case, Path(folder) / "chkpnt3.pth")
             parts.append("checkpoint")
     if not parts:
         raise NotApplicable("the adapter wraps neither saving and loading nor checkpoints")
@@ -82,15 +83,39 @@ def _through_a_checkpoint(case: Case, path: Path) -> None:
         state, parameters = host.store(model).state_dict(), tensors(host.driver, model)
         torch.save((host.driver.capture(model), 3), path)
     with joint(**case.options()) as host:
-        model = host.model(5)
-        captured, _ = torch.load(path, weights_only=False)
-        host.driver.restore(model, captured, host.arguments)
+        model = _resumed(host, path)
         _require_same(state, host.store(model).state_dict(), "of a restored model")
         _require_same(parameters, tensors(host.driver, model), "of a restored model")
         host.step(model, host.camera(), 4)
     with running(active=False, **case.options()) as host:
         host.session._install_stand_ins()
-        model = host.model(5)
-        captured, _ = torch.load(path, weights_only=False)
-        host.driver.restore(model, captured, host.arguments)  # the host alone reads it too
+        model = _resumed(host, path)  # the host alone reads it too
         _require_same(parameters, tensors(host.driver, model), "restored without us")
+
+
+def _out_of_stage_two(case: Case, path: Path) -> None:
+    """Resumed without learning, stage 2's checkpoint trains all that the host's own does."""
+    moved, rates = [], []
+    for learn in (False, True):
+        with running(learn=learn, **case.options()) as host:
+            torch.save((host.driver.capture(_trained(host)), 3), path)
+        with running(active=False, **case.options()) as host:  # the host alone
+            host.session._install_stand_ins()
+            model = _resumed(host, path)
+            before = tensors(host.driver, model)
+            for iteration in (4, 5, 6):
+                host.step(model, host.camera(), iteration)
+            after = tensors(host.driver, model)
+            moved.append({name for name in before if not torch.equal(before[name], after[name])})
+        with running(learn=False, **case.options()) as host:
+            model = _resumed(host, path)
+            rates.append({name: group["lr"] for name, group in host.session.groups(model)})
+    require(moved[1] == moved[0], f"resumed, {sorted(moved[1])} move; expected {sorted(moved[0])}")
+    require(rates[1] == rates[0], f"resumed, rates are {rates[1]}; expected {rates[0]}")
+
+
+def _resumed(host: Running, path: Path) -> Any:
+    model = host.model(5)
+    captured, _ = torch.load(path, weights_only=False)
+    host.driver.restore(model, captured, host.arguments)
+    return model

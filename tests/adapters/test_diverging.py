@@ -1,0 +1,130 @@
+"""NaN and infinity end stage 2 with a stated error, and nothing of them is saved."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner
+from miniature import HOST, TINY, joint, running
+
+from fragprune_plugins.cli import cli
+from fragprune_plugins.errors import DivergedError
+from fragprune_plugins.injection import launch
+from fragprune_plugins.learning.finite import CHECK_EVERY
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.storage import sidecar
+
+
+def spoil(tensor, rows, value):
+    with torch.no_grad():
+        tensor[:rows] = value
+
+
+def steps(host, model, camera, first, last):
+    for iteration in range(first, last + 1):
+        host.step(model, camera, iteration)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize("what", ["opacity", "scaling", "thresholds", "moments"])
+def test_a_host_is_not_let_save_what_is_not_finite(tmp_path, what, value):
+    with running(Settings(iterations=9)) as host:
+        model, camera = host.model(20), host.camera()
+        for iteration in (1, 2, 3):
+            host.step(model, camera, iteration)
+        store = host.store(model)
+        spoiled = {
+            "opacity": model._opacity,
+            "scaling": model._scaling,
+            "thresholds": store.logits,
+            "moments": store.optimizer.state[store.logits]["exp_avg"],
+        }[what]
+        spoil(spoiled, 3, value)
+        file = tmp_path / "point_cloud.ply"
+        for save in (lambda: model.save_ply(str(file)), model.capture):
+            with pytest.raises(DivergedError) as caught:
+                save()
+            assert f"{what} (3 of 20 rows)" in caught.value.found
+            assert caught.value.where == "stage 2, after step 3"
+    assert not list(tmp_path.iterdir())
+
+
+def test_before_stage_two_and_without_learning_the_host_saves_what_it_likes(tmp_path):
+    for options in ({"from_step": 5}, {"learn": False}):
+        with running(Settings(iterations=9), **options) as host:
+            model = host.model(20)
+            host.step(model, host.camera(), 1)
+            spoil(model._scaling, 1, torch.nan)
+            model.save_ply(str(tmp_path / "point_cloud.ply"))
+            assert model.capture()
+
+
+@pytest.mark.parametrize("begin", [running, joint])
+def test_what_spoils_the_loss_is_noticed_in_the_next_step(begin):
+    with begin(Settings(iterations=9)) as host:
+        model, camera = host.model(20), host.camera()
+        host.step(model, camera, 1)
+        model.update_learning_rate(2)
+        (host.render(camera, model)["render"].mean() * torch.nan).backward()
+        model.optimizer.step()
+        with pytest.raises(DivergedError, match=r"after step 2: NaN or infinity in .*opacity"):
+            host.step(model, camera, 3)
+
+
+def test_thresholds_that_are_not_finite_are_noticed_in_the_next_step():
+    with running(Settings(iterations=9)) as host:
+        model, camera = host.model(20), host.camera()
+        host.step(model, camera, 1)
+        spoil(host.store(model).logits, 20, torch.nan)
+        with pytest.raises(DivergedError, match="thresholds"):
+            steps(host, model, camera, 2, 3)
+
+
+def test_what_shows_in_no_loss_is_noticed_within_a_hundred_steps():
+    """A Gaussian that is not finite is simply not drawn."""
+    with running(Settings(iterations=300)) as host:
+        model, camera = host.model(5), host.camera(8, 6)
+        host.step(model, camera, 1)
+        spoil(model._scaling, 1, torch.inf)
+        with pytest.raises(DivergedError) as caught:
+            steps(host, model, camera, 2, 299)
+    assert caught.value.where.endswith(f"after step {CHECK_EVERY}")
+
+
+class SpoilAt:
+    """NaN in a host's model in the middle of a run."""
+
+    def __init__(self, step):
+        self.step, self.model = step, None
+
+    @hookimpl
+    def fragprune_attached(self, model):
+        self.model = model
+
+    @hookimpl
+    def fragprune_step(self, stats):
+        if stats.step == self.step:
+            spoil(self.model._opacity, 7, torch.nan)
+
+
+def test_a_run_that_diverges_ends_with_exit_code_1_and_saves_nothing(
+    photographs, tmp_path, monkeypatch
+):
+    plugins = load_plugins()
+    plugins.register(SpoilAt(4), "test")
+    monkeypatch.setattr(launch, "installed", lambda: plugins)
+    out = tmp_path / "out"
+    words = [HOST / "train.py", "-s", photographs, "-m", out, "--iterations", 10, *TINY]
+    options = ["run", "--device", "cpu", "--iters", 8, "--json", "--", *words]
+    result = CliRunner().invoke(cli, [str(word) for word in options])
+    assert result.exit_code == 1
+    error = json.loads(result.stdout)["error"]
+    assert error["code"] == "not-finite"
+    assert "opacity (7 of " in error["found"]
+    assert [p.name for p in sorted(Path(out).glob("point_cloud/*"))] == ["iteration_10"]
+    assert not list(out.rglob(f"*{sidecar.SUFFIX}"))

@@ -1,0 +1,134 @@
+"""A checkpoint that the host writes in stage 2 is the host's: from it everything trains again."""
+
+from __future__ import annotations
+
+import logging
+import runpy
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from miniature import HOST, TINY
+
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import RunOptions, _forget_modules, _host_process, run
+from fragprune_plugins.injection.session import Session
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+NAMES = ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")
+SETTINGS = Settings(iterations=8, threshold_lr=0.3)
+OPTIONS = RunOptions(device="cpu", settings=SETTINGS)
+EVERYTHING = {"xyz", "f_dc", "scaling", "rotation", "opacity"}  # a second band comes much later
+
+
+def command(scene, out, iterations, *more):
+    words = ["-s", scene, "-m", out, "--iterations", iterations, *TINY, *more]
+    return [str(HOST / "train.py"), *map(str, words)]
+
+
+def alone(words):
+    """The host without fragprune, but for what stands in for its compiled packages."""
+    session = Session(Vanilla3DGS(), HostRepo(HOST), load_plugins(), drop_in=True)
+    known = set(sys.modules)
+    with _host_process(Path(words[0]), words[1:], "cpu"):
+        try:
+            session._install_stand_ins()
+            runpy.run_path(words[0], run_name="__main__")
+        finally:
+            session.deactivate()
+            _forget_modules(HOST, known)
+
+
+def parameters(checkpoint):
+    capture, _ = torch.load(checkpoint, weights_only=False)
+    return dict(zip(NAMES, capture[1:7], strict=True))
+
+
+def rates(checkpoint):
+    groups = torch.load(checkpoint, weights_only=False)[0][10]["param_groups"]
+    return {group["name"]: group["lr"] for group in groups if group["name"] != "xyz"}
+
+
+def moved(before, after):
+    one, other = parameters(before), parameters(after)
+    return {name for name in NAMES if not torch.equal(one[name], other[name])}
+
+
+@pytest.fixture(scope="module")
+def trained(photographs, tmp_path_factory):
+    """Twelve iterations and eight of stage 2; checkpoints of iterations 12 and 16."""
+    out = tmp_path_factory.mktemp("trained")
+    run(command(photographs, out, 12, "--checkpoint_iterations", 16), OPTIONS)
+    assert moved(out / "chkpnt12.pth", out / "chkpnt16.pth") == {"opacity"}
+    return out
+
+
+@pytest.mark.parametrize("stage", ["alone", "off", "joint", "finetune"])
+def test_everything_trains_that_would_have_trained(photographs, trained, tmp_path, stage):
+    start, out = trained / "chkpnt16.pth", tmp_path / "out"
+    more = ["--start_checkpoint", start, "--checkpoint_iterations", 23]
+    words = command(photographs, out, 24, *more)
+    if stage == "alone":
+        alone(words)
+    else:
+        settings = replace(SETTINGS, train="all")
+        run(words, replace(OPTIONS, stage=stage, settings=settings))
+    assert moved(start, out / "chkpnt23.pth") == EVERYTHING
+
+
+def test_it_holds_the_hosts_parameters_and_rates_as_the_host_has_them(trained):
+    host, ours = trained / "chkpnt12.pth", trained / "chkpnt16.pth"
+    assert all(parameter.requires_grad for parameter in parameters(ours).values())
+    assert rates(ours) == rates(host)
+
+
+def test_so_does_one_of_a_stage_two_that_began_from_a_ply(photographs, trained, tmp_path):
+    start = Path("point_cloud/iteration_12/point_cloud.ply")
+    (tmp_path / start).parent.mkdir(parents=True)
+    shutil.copy(trained / start, tmp_path / start)
+    words = command(photographs, tmp_path, 12, "--checkpoint_iterations", 16)
+    run(words, replace(OPTIONS, stage="finetune"))
+    assert all(p.requires_grad for p in parameters(tmp_path / "chkpnt16.pth").values())
+    assert rates(tmp_path / "chkpnt16.pth") == rates(trained / "chkpnt12.pth")
+
+
+def frozen(checkpoint, target, asleep):
+    """A checkpoint as version 0.1 left it in stage 2, or as some host does."""
+    capture, iteration = torch.load(checkpoint, weights_only=False)
+    for name, parameter in zip(NAMES, capture[1:7], strict=True):
+        parameter.requires_grad_(name not in asleep)
+    for group in capture[10]["param_groups"]:
+        group["lr"] = 0.0 if group["name"] in asleep else 1e-4
+    torch.save((capture, iteration), target)
+    return target
+
+
+def resumed(photographs, start, out, caplog):
+    words = command(photographs, out, 20, "--start_checkpoint", start, "--densify_until_iter", 0)
+    with caplog.at_level(logging.WARNING, logger="fragprune"):
+        run([*words, "--checkpoint_iterations", "19"], replace(OPTIONS, stage="off"))
+    return out / "chkpnt19.pth"
+
+
+def test_one_that_version_0_1_left_frozen_is_revived_and_it_is_said(
+    photographs, trained, tmp_path, caplog
+):
+    asleep = {"xyz", "f_dc", "f_rest", "scaling", "rotation"}
+    start = frozen(trained / "chkpnt12.pth", tmp_path / "chkpnt12.pth", asleep)
+    end = resumed(photographs, start, tmp_path / "out", caplog)
+    assert moved(start, end) == EVERYTHING
+    assert rates(end) == rates(trained / "chkpnt12.pth")
+    (warning,) = [r.getMessage() for r in caplog.records if "unable to train" in r.getMessage()]
+    assert "f_dc, f_rest, rotation, scaling, xyz" in warning
+
+
+def test_what_a_host_froze_itself_stays_frozen(photographs, trained, tmp_path, caplog):
+    start = frozen(trained / "chkpnt12.pth", tmp_path / "chkpnt12.pth", {"scaling", "rotation"})
+    end = resumed(photographs, start, tmp_path / "out", caplog)
+    assert moved(start, end) == {"xyz", "f_dc", "opacity"}
+    assert not [r for r in caplog.records if "unable to train" in r.getMessage()]

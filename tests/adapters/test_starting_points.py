@@ -1,0 +1,181 @@
+"""``--stage finetune`` starts from what training alone wrote last, and says which file that is."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from miniature import HOST, TINY
+
+from fragprune_plugins.errors import ModelFileError, SidecarError, UsageError
+from fragprune_plugins.injection.launch import HostFailed, RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.storage import records, sidecar
+
+SETTINGS = Settings(iterations=6, threshold_lr=0.3)
+OPTIONS = RunOptions(device="cpu", settings=SETTINGS)
+FINETUNE = replace(OPTIONS, stage="finetune")
+CONTROL = replace(FINETUNE, settings=replace(SETTINGS, truncate=False))
+
+
+def ply(iteration):
+    return Path("point_cloud") / f"iteration_{iteration}" / "point_cloud.ply"
+
+
+@pytest.fixture(scope="module")
+def once(photographs, tmp_path_factory):
+    """Stage 1 of ten iterations with a checkpoint at its end, and six of stage 2."""
+    out = tmp_path_factory.mktemp("once")
+    run(command(photographs, out, 10), OPTIONS)
+    return out
+
+
+@pytest.fixture
+def out(once, tmp_path):
+    return Path(shutil.copytree(once, tmp_path / "out"))
+
+
+def command(scene, out, iterations, *more):
+    words = ["-s", scene, "-m", out, "--iterations", iterations, *TINY, *more]
+    return [str(HOST / "train.py"), *map(str, words)]
+
+
+@pytest.fixture
+def started(photographs, caplog):
+    """Run, and tell what stage 2 says that it starts from."""
+
+    def start(out, iterations, *more, options=FINETUNE):
+        caplog.clear()
+        with caplog.at_level(logging.INFO, logger="fragprune"):
+            run(command(photographs, out, iterations, *more), options)
+        (line,) = [r.getMessage() for r in caplog.records if r.getMessage().startswith("stage 2:")]
+        return line
+
+    return start
+
+
+def test_what_is_taken_is_said_in_one_line(once, out, started):
+    line = started(out, 10)
+    assert line == (
+        f"stage 2: 6 iterations from iteration 10, {out / 'chkpnt10.pth'}: what training alone "
+        "wrote last; 1 newer of stage 2 passed over"
+    )
+
+
+def test_results_do_not_compound_run_after_run(out, started):
+    first = (out / ply(16)).read_bytes()
+    for _ in range(2):
+        started(out, 10)
+        assert (out / ply(16)).read_bytes() == first
+        assert not (out / ply(22)).exists()
+
+
+def test_after_a_control_stage_two_starts_where_the_control_did(out, started):
+    shutil.rmtree(out / ply(16).parent)
+    for _ in range(2):  # the second control is one as well
+        assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10, options=CONTROL)
+        assert sidecar.load(out / ply(16))[0].neutral
+    assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10)
+
+
+def test_a_control_of_version_0_1_is_known_by_its_record(out, started):
+    sidecar.path_beside(out / ply(16)).unlink()  # it wrote none
+    records.leave(out / ply(16), "run", {})
+    assert f"{out / 'chkpnt10.pth'}:" in started(out, 10)
+
+
+@pytest.mark.parametrize("options", [FINETUNE, CONTROL], ids=["learned", "control"])
+def test_checkpoints_of_stage_two_are_no_starting_points(out, started, options):
+    started(out, 10, "--checkpoint_iterations", 13, options=options)
+    assert (out / "chkpnt13.pth").exists()
+    assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10)
+
+
+def test_training_again_for_less_in_the_same_folder_is_what_counts(
+    photographs, out, started, caplog
+):
+    run(command(photographs, out, 7), replace(OPTIONS, stage="off"))
+    assert f"iteration 7, {out / ply(7)}:" in started(out, 7)
+    (warning,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert str(out / "chkpnt10.pth") in warning
+    assert "--start_checkpoint" in warning
+
+
+def test_training_again_as_long_leaves_an_old_checkpoint_behind(photographs, out, started):
+    run(command(photographs, out, 10), replace(OPTIONS, stage="off"))
+    assert f"iteration 10, {out / ply(10)}:" in started(out, 10)
+
+
+def test_training_again_over_a_result_of_stage_two_makes_it_stage_ones(photographs, out, started):
+    run(command(photographs, out, 16), replace(OPTIONS, stage="off"))
+    with pytest.raises(SidecarError, match="thresholds of another model"):
+        started(out, 16)
+    sidecar.path_beside(out / ply(16)).unlink()
+    assert f"iteration 16, {out / ply(16)}:" in started(out, 16)
+
+
+def test_a_checkpoint_goes_before_the_ply_of_its_iteration(photographs, tmp_path, started):
+    words = command(photographs, tmp_path, 10, "--checkpoint_iterations", 10)
+    run(words, replace(OPTIONS, stage="off"))
+    assert f"{tmp_path / 'chkpnt10.pth'}:" in started(tmp_path, 10)
+
+
+def test_a_later_ply_goes_before_an_early_checkpoint(photographs, tmp_path, started):
+    words = command(photographs, tmp_path, 10, "--checkpoint_iterations", 5)
+    run(words, replace(OPTIONS, stage="off"))
+    assert f"{tmp_path / ply(10)}:" in started(tmp_path, 10)
+
+
+def test_what_the_command_names_is_taken_also_of_stage_two(out, started):
+    learned = sidecar.load(out / ply(16))[0].steps
+    line = started(out, 10, "--start_checkpoint", out / ply(16))
+    assert line.endswith(f"iteration 16, {out / ply(16)}: the command names it")
+    assert sidecar.load(out / ply(22))[0].steps == 2 * learned
+    started(out, 10, "--checkpoint_iterations", 13)
+    line = started(out, 10, "--start_checkpoint", out / "chkpnt13.pth")
+    assert line.endswith(f"iteration 13, {out / 'chkpnt13.pth'}: the command names it")
+    assert sidecar.load(out / ply(19))[0].steps == 3 + learned
+
+
+def test_a_ply_whose_folder_tells_no_iteration_is_a_usage_error(photographs, out):
+    alone = shutil.copy(out / ply(10), out / "alone.ply")
+    for named in (alone, out / "nowhere.ply"):
+        with pytest.raises(UsageError, match=r"iteration_N/point_cloud\.ply"):
+            run(command(photographs, out, 10, "--start_checkpoint", named), FINETUNE)
+
+
+def test_a_folder_with_nothing_of_stage_one_says_how_to_go_on(photographs, out):
+    (out / "chkpnt10.pth").unlink()
+    shutil.rmtree(out / ply(10).parent)
+    with pytest.raises(UsageError, match="but what was written while thresholds learned") as caught:
+        run(command(photographs, out, 10), FINETUNE)
+    assert "--start_checkpoint" in caught.value.remedy
+
+
+@pytest.mark.parametrize("content", [b"", b"cut off", "a list"], ids=["empty", "bytes", "a list"])
+def test_a_checkpoint_that_cannot_be_read_is_one_stated_error(photographs, out, content):
+    path = out / "chkpnt12.pth"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        torch.save([content], path)
+    with pytest.raises(ModelFileError) as caught:
+        run(command(photographs, out, 10), FINETUNE)
+    assert caught.value.where == str(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_stage_two_does_not_take_an_earlier_runs_checkpoint_for_its_own_stage_one(
+    photographs, out, tmp_path
+):
+    """Hosts refuse with exit code 0 too, and the folder holds what they should have written."""
+    words = command(photographs, out, 10)
+    host = Path(shutil.copytree(HOST, tmp_path / "host"))
+    script = host / "train.py"
+    script.write_text("raise SystemExit(0)\n" + script.read_text())
+    with pytest.raises(HostFailed, match="without a checkpoint of iteration 10"):
+        run([str(script), *words[1:]], OPTIONS)

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
+
+
+@pytest.fixture(autouse=True)
+def handler():
+    """SIGTERM as a process has it that nobody prepared."""
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_sigterm_interrupts_as_ctrl_c_does_and_once():
+    with sigterm_interrupts():
+        with pytest.raises(KeyboardInterrupt) as caught:
+            signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)  # while what was learned is being saved
+    assert caught.type is Terminate
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_the_handler_before_is_back_however_it_ended():
+    def own(*_):
+        pass
+
+    signal.signal(signal.SIGTERM, own)
+    with sigterm_interrupts():
+        assert signal.getsignal(signal.SIGTERM) is not own
+    assert signal.getsignal(signal.SIGTERM) is own
+    with pytest.raises(ZeroDivisionError), sigterm_interrupts():
+        raise ZeroDivisionError
+    assert signal.getsignal(signal.SIGTERM) is own
+
+
+def test_who_has_it_ignored_is_left_alone():
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    with sigterm_interrupts():
+        signal.raise_signal(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+
+
+def test_another_thread_than_the_main_one_changes_nothing():
+    seen = []
+
+    def inside():
+        with sigterm_interrupts():
+            seen.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=inside)
+    thread.start()
+    thread.join()
+    assert seen == [signal.SIG_DFL]
+
+
+def test_a_forked_worker_just_ends():
+    with sigterm_interrupts():
+        child = os.fork()
+        if child == 0:
+            signal.raise_signal(signal.SIGTERM)
+            os._exit(0)
+        _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 143
