@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from fragprune_plugins.engines.cuda.frame import Device, Drawing, KernelBlade, Wanted, learnable
+from fragprune_plugins.engines.cuda.frame import (
+    Device,
+    Drawing,
+    Drawn,
+    KernelBlade,
+    Wanted,
+    learnable,
+)
 from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterOutputs
@@ -38,20 +45,13 @@ class _Rasterize(torch.autograd.Function):
         wanted = frozenset(
             n for n, needs in zip(names, ctx.needs_input_grad[3:], strict=True) if needs
         )
-        engine.draw(drawing, wanted)
-        ctx.mark_non_differentiable(drawing.radii)
+        drawn = engine.draw(drawing, wanted)
+        ctx.mark_non_differentiable(*(each for each in drawn[5:] if each is not None))
         ctx.set_materialize_grads(False)
         ctx.drawing, ctx.names, ctx.wanted = drawing, names, wanted
         # Saved for the sake of autograd's check against changes in place: the drawing reads these.
         ctx.save_for_backward(*tensors)
-        return (
-            drawing.image,
-            drawing.invdepth,
-            drawing.alpha,
-            drawing.features,
-            drawing.fragments_per_pixel,
-            drawing.radii,
-        )
+        return drawn
 
     @staticmethod
     @once_differentiable
@@ -113,22 +113,12 @@ class CudaEngine:
             **learnable(inputs),
             **({} if thresholds is None else {"thresholds": thresholds}),
         }
-        image, invdepth, alpha, features, per_pixel, radii = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        drawn = _Rasterize.apply(  # type: ignore[no-untyped-call]
             self, drawing, tuple(tensors), *tensors.values()
         )
         return RasterOutputs(
-            image=image,
-            radii=radii,
-            invdepth=invdepth,
-            alpha=alpha,
-            fragments_per_pixel=per_pixel,
             evaluated_per_pixel=drawing.evaluated / (inputs.view.width * inputs.view.height),
-            fragments=drawing.fragments,
-            fragments_per_gaussian=drawing.fragments_per_gaussian,
-            features=features,
-            weights_per_gaussian=drawing.weights_per_gaussian,
-            wins_per_gaussian=drawing.wins_per_gaussian,
-            winners=drawing.winners,
+            **Drawn(*drawn)._asdict(),
         )
 
     def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
@@ -150,18 +140,20 @@ class CudaEngine:
             )
         return where
 
-    def draw(self, drawing: Drawing, wanted: Wanted) -> None:
+    def draw(self, drawing: Drawing, wanted: Wanted) -> Drawn:
         """The forward pass, again with more room when the lists did not fit."""
         deterministic = self._deterministic
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
         how = {"deterministic": deterministic, "packed": self._packed}
-        entries = drawing.draw(self._capacity, wanted, **how)
+        drawn = drawing.draw(self._capacity, wanted, **how)
         if self._device.capturing():
             self._captured.append((drawing, self._capacity))
-        elif entries > self._capacity:
+        elif (entries := drawing.read()) > self._capacity:
             self._capacity = entries + entries // 4
-            drawing.draw(self._capacity, wanted, **how)
+            drawn = drawing.draw(self._capacity, wanted, **how)
+            drawing.read()
+        return drawn
 
     def check(self) -> None:
         """Look at the frames captured into graphs, after a replay; waits for the GPU.

@@ -9,7 +9,8 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import torch
 
@@ -234,26 +235,33 @@ def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in tensors.items() if tensor is not None}
 
 
-class Drawing:
-    """One rasterization: a forward pass, what it leaves behind, a backward pass.
-
-    Attributes:
-        image: and the other outputs, as in ``RasterOutputs``.
-        evaluated: lanes spent on (Gaussian, pixel) pairs; NaN until it is read.
-    """
+class Drawn(NamedTuple):
+    """The outputs of a forward pass, as in ``RasterOutputs``; the first five are differentiable."""
 
     image: Tensor
     invdepth: Tensor
     alpha: Tensor
-    radii: Tensor
+    features: Tensor | None
     fragments_per_pixel: Tensor
-    evaluated: float
-    features: Tensor | None = None
-    fragments: Tensor | None = None
-    fragments_per_gaussian: Tensor | None = None
-    weights_per_gaussian: Tensor | None = None
-    wins_per_gaussian: Tensor | None = None
-    winners: Tensor | None = None
+    radii: Tensor
+    fragments: Tensor | None
+    fragments_per_gaussian: Tensor | None
+    weights_per_gaussian: Tensor | None
+    wins_per_gaussian: Tensor | None
+    winners: Tensor | None
+
+
+class Drawing:
+    """One rasterization: a forward pass, what backward needs of it, a backward pass.
+
+    It does not hold its own outputs. Autograd's graph, which the outputs hold, holds the drawing:
+    a way back from there would be a cycle through C++, which no collector finds.
+
+    Attributes:
+        evaluated: lanes spent on (Gaussian, pixel) pairs; NaN until it is read.
+    """
+
+    evaluated: float = math.nan
 
     def __init__(self, device: Device, inputs: RasterInputs, thresholds: Tensor | None) -> None:
         self._device, self._inputs, self._n = device, inputs, len(inputs.splats)
@@ -264,23 +272,18 @@ class Drawing:
         self._spread = None if offsets is None else offsets.abs().amax()
         self._across, self._down = -(-view.width // TILE), -(-view.height // TILE)
         self._channels = 0 if inputs.splats.features is None else inputs.splats.features.shape[1]
+        self._frame: Frame | None = None
 
     # ---- forward -------------------------------------------------------------------------------
 
-    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool, packed: bool) -> int:
-        """Run the forward pass; void when it returns more than the capacity.
+    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool, packed: bool) -> Drawn:
+        """Launch the forward pass; void when there are more entries than the capacity.
 
         Args:
             capacity: entries of all tiles' lists that there shall be room for.
             wanted: gradients that will be wanted.
             deterministic: give each entry a slot, for backward to add up in order.
             packed: keep less of each Gaussian, where no gradients are wanted.
-
-        Returns:
-            How many entries there are.
-
-        Raises:
-            EngineError: more entries than can be counted.
         """
         inputs, n, where = self._inputs, self._n, self._where
         height, width = inputs.view.height, inputs.view.width
@@ -318,6 +321,7 @@ class Drawing:
             transmittance=4 * pixels * keep,
             stop=4 * pixels * keep,
         )
+        outputs = self._new_outputs()
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
         # The last pass of sorting entries shall end in `kept`.
         keys = [scratch["entry_keys"], scratch["entry_keys_2"]]
@@ -326,7 +330,7 @@ class Drawing:
             values.reverse()
         frame = Frame(
             inputs=native_inputs(inputs, self._arrays, widen="thresholds" in wanted),
-            outputs=self._new_outputs(),
+            outputs=binding.Outputs(**{name: address(each) for name, each in outputs.items()}),
             spread=address(self._spread),
             capacity=capacity,
             tiles_x=self._across,
@@ -380,19 +384,19 @@ class Drawing:
         )
         self._launch("blend", macros, "fp_blend", tiles, frame)
         found = cleared.tensor("counters", 4, torch.int64)
-        self.fragments_per_pixel = (found[2].double() / pixels).float()
-        if weights is not None:
-            self.weights_per_gaussian = (weights.double() * 2.0**-32).float()
-        self._frame = frame if keep else None
+        if keep:
+            frame.outputs = binding.Outputs()  # backward does without
+            self._frame = frame
         self._memory = (cleared, kept)
         self._found = found
-        if self._device.capturing():
-            self.evaluated = math.nan
-            return 0
-        return self.read()
+        return Drawn(
+            fragments_per_pixel=(found[2].double() / pixels).float(),
+            weights_per_gaussian=None if weights is None else (weights.double() * 2.0**-32).float(),
+            **outputs,
+        )
 
     def read(self) -> int:
-        """Waits for the GPU; entries of the lists.
+        """Wait for the GPU; how many entries there are.
 
         Raises:
             EngineError: what the kernels could not draw.
@@ -414,28 +418,24 @@ class Drawing:
             )
         return entries
 
-    def _new_outputs(self) -> binding.Outputs:
-        """Makes the output tensors; their addresses."""
+    def _new_outputs(self) -> dict[str, Any]:
+        """What the kernels fill in, by its name in ``Drawn``; None for what nobody wants."""
         inputs, n = self._inputs, self._n
         size = (inputs.view.height, inputs.view.width)
-
-        def new(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.empty(shape, dtype=dtype, device=self._where)
-
-        def zeros() -> Tensor:
-            return torch.zeros(n, dtype=torch.int32, device=self._where)
-
-        self.image, self.invdepth, self.alpha = new(3, *size), new(1, *size), new(1, *size)
-        self.radii = new(n, dtype=torch.int32)
-        if self._channels:
-            self.features = new(self._channels, *size)
-        if inputs.counts:
-            self.fragments, self.fragments_per_gaussian = new(*size, dtype=torch.int32), zeros()
-        if inputs.scores:
-            self.winners, self.wins_per_gaussian = new(*size, dtype=torch.int32), zeros()
-        names = "image invdepth alpha radii features fragments fragments_per_gaussian"
-        names += " wins_per_gaussian winners"
-        return binding.Outputs(**{name: address(getattr(self, name)) for name in names.split()})
+        new = partial(torch.empty, device=self._where)
+        zeros = partial(torch.zeros, device=self._where, dtype=torch.int32)
+        counts, scores = inputs.counts, inputs.scores
+        return {
+            "image": new(3, *size),
+            "invdepth": new(1, *size),
+            "alpha": new(1, *size),
+            "radii": new(n, dtype=torch.int32),
+            "features": new(self._channels, *size) if self._channels else None,
+            "fragments": new(*size, dtype=torch.int32) if counts else None,
+            "fragments_per_gaussian": zeros(n) if counts else None,
+            "wins_per_gaussian": zeros(n) if scores else None,
+            "winners": new(*size, dtype=torch.int32) if scores else None,
+        }
 
     def _sort(
         self,
