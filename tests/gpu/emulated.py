@@ -63,7 +63,7 @@ class EmulatedDevice:
         if status:
             raise RuntimeError(library.emulated_message().decode())
 
-    def capturing(self) -> bool:
+    def capturing(self, where: torch.device) -> bool:
         return self.recording
 
     def _open(self, source: str, macros: dict[str, int]) -> ctypes.CDLL:

@@ -1,6 +1,7 @@
 """Runs kernels on a GPU: the only place that calls CUDA's driver.
 
-Streams and contexts are torch's: kernels go to torch's current stream of the tensors' device.
+Streams and contexts are torch's: kernels go to torch's current stream of the tensors' device, which
+need not be torch's current device, and does not become it.
 """
 
 from __future__ import annotations
@@ -71,29 +72,33 @@ class Driver:
             EngineError: it does not compile, load or start.
         """
         index = torch.cuda.current_device() if where.index is None else where.index
-        self._enter(index)
-        function = self._function(index, source, macros, kernel)
-        stream = torch.cuda.current_stream(index).cuda_stream
-        parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
-        self._call(
-            "cuLaunchKernel",
-            *(function, blocks, 1, 1, THREADS, 1, 1, 0, stream),
-            *(ctypes.addressof(parameters), 0),
-        )
+        self._call("cuCtxPushCurrent", self._context(index))
+        try:
+            function = self._function(index, source, macros, kernel)
+            stream = torch.cuda.current_stream(index).cuda_stream
+            parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
+            self._call(
+                "cuLaunchKernel",
+                *(function, blocks, 1, 1, THREADS, 1, 1, 0, stream),
+                *(ctypes.addressof(parameters), 0),
+            )
+        finally:
+            self._call("cuCtxPopCurrent")
 
-    def capturing(self) -> bool:
-        """Whether the current stream records a graph."""
-        return bool(torch.cuda.is_current_stream_capturing())
+    def capturing(self, where: torch.device) -> bool:
+        """Whether the device's current stream records a graph."""
+        with torch.cuda.device(where):
+            return bool(torch.cuda.is_current_stream_capturing())
 
-    def _enter(self, index: int) -> None:
-        """Makes torch's context current in this thread, which may never have met it."""
+    def _context(self, index: int) -> Any:
+        """Torch's own, which this thread may never have met."""
         with self._lock:
             if index not in self._contexts:
                 torch.cuda.init()  # type: ignore[no-untyped-call]
                 self._call("cuInit", 0)
                 device = self._call("cuDeviceGet", index)
                 self._contexts[index] = self._call("cuDevicePrimaryCtxRetain", device)
-        self._call("cuCtxSetCurrent", self._contexts[index])
+            return self._contexts[index]
 
     def _function(self, index: int, source: str, macros: dict[str, int], kernel: str) -> Any:
         module_key = (index, source, *sorted(macros.items()))

@@ -194,8 +194,8 @@ class Device(Protocol):
         Asynchronous, on the current stream; ``arguments`` is copied before this returns.
         """
 
-    def capturing(self) -> bool:
-        """Whether the current stream records a graph, so that nothing can be read back."""
+    def capturing(self, where: torch.device) -> bool:
+        """Whether a device's current stream records a graph, so that nothing can be read back."""
 
 
 class _Arena:
@@ -235,6 +235,24 @@ def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in tensors.items() if tensor is not None}
 
 
+def refuse(entries: int, spread: float) -> None:
+    """Raise EngineError when the kernels cannot draw so many entries, or offsets so far."""
+    if entries > ENTRIES_MAX:
+        raise EngineError(
+            "engine 'cuda'",
+            f"{entries} entries in the tiles' lists",
+            f"at most {ENTRIES_MAX}",
+            "Draw fewer Gaussians or a smaller image.",
+        )
+    if not spread <= OFFSET_MAX:
+        raise EngineError(
+            "engine 'cuda'",
+            f"sample_offsets up to {spread}",
+            f"at most {OFFSET_MAX:g} pixels",
+            "Check the offsets.",
+        )
+
+
 class Drawn(NamedTuple):
     """The outputs of a forward pass, as in ``RasterOutputs``; the first five are differentiable."""
 
@@ -258,6 +276,7 @@ class Drawing:
     a way back from there would be a cycle through C++, which no collector finds.
 
     Attributes:
+        where: the device that it runs on.
         evaluated: lanes spent on (Gaussian, pixel) pairs; NaN until it is read.
     """
 
@@ -265,9 +284,9 @@ class Drawing:
 
     def __init__(self, device: Device, inputs: RasterInputs, thresholds: Tensor | None) -> None:
         self._device, self._inputs, self._n = device, inputs, len(inputs.splats)
-        self._where = inputs.splats.device
+        self.where = inputs.splats.device
         view = inputs.view
-        self._arrays = native_arrays(inputs, thresholds, self._where)
+        self._arrays = native_arrays(inputs, thresholds, self.where)
         offsets = self._arrays.get("sample_offsets")
         self._spread = None if offsets is None else offsets.abs().amax()
         self._across, self._down = -(-view.width // TILE), -(-view.height // TILE)
@@ -285,7 +304,7 @@ class Drawing:
             deterministic: give each entry a slot, for backward to add up in order.
             packed: keep less of each Gaussian, where no gradients are wanted.
         """
-        inputs, n, where = self._inputs, self._n, self._where
+        inputs, n, where = self._inputs, self._n, self.where
         height, width = inputs.view.height, inputs.view.width
         tiles, pixels = self._across * self._down, width * height
         passes = max(1, _blocks((tiles - 1).bit_length(), 8))
@@ -402,28 +421,21 @@ class Drawing:
             EngineError: what the kernels could not draw.
         """
         _, entries, _, self.evaluated = map(int, self._found.tolist())
-        if entries > ENTRIES_MAX:
-            raise EngineError(
-                "engine 'cuda'",
-                f"{entries} entries in the tiles' lists",
-                f"at most {ENTRIES_MAX}",
-                "Draw fewer Gaussians or a smaller image.",
-            )
-        if self._spread is not None and not float(self._spread) <= OFFSET_MAX:
-            raise EngineError(
-                "engine 'cuda'",
-                f"sample_offsets up to {float(self._spread)}",
-                f"at most {OFFSET_MAX:g} pixels",
-                "Check the offsets.",
-            )
+        refuse(entries, 0.0 if self._spread is None else float(self._spread))
         return entries
+
+    def shortage(self, capacity: int) -> Tensor:
+        """(2,) float64 on the device: entries when they found no room, else 0; what they spread."""
+        entries = self._found[1]
+        spread = torch.zeros_like(entries) if self._spread is None else self._spread
+        return torch.stack([entries.where(entries > capacity, 0).double(), spread.double()])
 
     def _new_outputs(self) -> dict[str, Any]:
         """What the kernels fill in, by its name in ``Drawn``; None for what nobody wants."""
         inputs, n = self._inputs, self._n
         size = (inputs.view.height, inputs.view.width)
-        new = partial(torch.empty, device=self._where)
-        zeros = partial(torch.zeros, device=self._where, dtype=torch.int32)
+        new = partial(torch.empty, device=self.where)
+        zeros = partial(torch.zeros, device=self.where, dtype=torch.int32)
         counts, scores = inputs.counts, inputs.scores
         return {
             "image": new(3, *size),
@@ -465,9 +477,7 @@ class Drawing:
         arguments: ctypes.Structure,
     ) -> None:
         if blocks:
-            self._device.launch(
-                self._where, source, {**MACROS, **macros}, kernel, blocks, arguments
-            )
+            self._device.launch(self.where, source, {**MACROS, **macros}, kernel, blocks, arguments)
 
     # ---- backward ------------------------------------------------------------------------------
 
@@ -482,7 +492,7 @@ class Drawing:
     ) -> dict[str, Tensor]:
         """Run the backward pass for gradients by the outputs; gradients by the inputs, by name."""
         assert self._frame is not None
-        inputs, frame, n, where = self._inputs, self._frame, self._n, self._where
+        inputs, frame, n, where = self._inputs, self._frame, self._n, self.where
         upstream = {
             "image": by_image,
             "invdepth": by_invdepth,
