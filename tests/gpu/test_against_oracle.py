@@ -274,3 +274,24 @@ def test_changes_in_place_are_noticed(engine: CudaEngine) -> None:
         leaves["opacities"].mul_(0.5)
     with pytest.raises(RuntimeError, match="inplace"):
         loss.backward()
+
+
+@pytest.mark.parametrize("poison", [torch.nan, torch.inf])
+def test_a_poisoned_pixel_reaches_those_alone_that_draw_there(
+    engine: CudaEngine, poison: float
+) -> None:
+    inputs = scenes.random_scene(6, 200, 50, 37, features=2)
+
+    def rows(at_pixel: float, elsewhere: float, found) -> torch.Tensor:
+        """Of Gaussians with such a gradient, when the picture's gradients are these."""
+        made, leaves = scenes.leaves(inputs)
+        leaves["thresholds"] = tau = scenes.random_thresholds(6, 200).requires_grad_()
+        out = engine.rasterize(made, tau)
+        upstream = torch.full((3, 37, 50), elsewhere)
+        upstream[:, 20, 30] = at_pixel
+        torch.autograd.backward([out.image, out.features], [upstream, upstream[:2]])
+        grads = (leaf.grad.reshape(200, -1) for k, leaf in leaves.items() if k != "background")
+        return found(torch.cat(list(grads), dim=1)).any(1)
+
+    assert 0 < (draw_there := rows(1.0, 0.0, lambda grads: grads != 0)).sum() < 50
+    assert torch.equal(rows(poison, 0.3, lambda grads: ~grads.isfinite()), draw_there)
