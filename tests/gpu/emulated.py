@@ -31,15 +31,16 @@ class EmulatedDevice:
     Args:
         compiler: a C++17 compiler for ELF systems.
         folder: where builds go.
-        seed: of the order in which threads and blocks run.
+        flags: further ones of the compiler.
 
     Attributes:
         launched: kernels with their macros, in order.
         opened: what was built, by source and macros.
+        seed: of the order in which threads and blocks run.
     """
 
-    def __init__(self, compiler: str, folder: Path, seed: int = 1) -> None:
-        self.compiler, self._folder, self.seed = compiler, folder, seed
+    def __init__(self, compiler: str, folder: Path, flags: tuple[str, ...] = ()) -> None:
+        self.compiler, self._folder, self._flags, self.seed = compiler, folder, flags, 1
         self.launched: list[tuple[str, dict[str, int]]] = []
         self.opened: dict[tuple[str, tuple[tuple[str, int], ...]], ctypes.CDLL] = {}
 
@@ -72,7 +73,7 @@ class EmulatedDevice:
             path = self._folder / f"{source}{len(self.opened)}.so"
             defined = [f"-D{name}={value}" for name, value in macros.items()]
             kernels = ("-x", "c++", "-include", str(HERE / "emulation.h"), self.source(source))
-            self._build(path, "-shared", *defined, self._machine, *kernels)
+            self._build(path, "-shared", *self._flags, *defined, self._machine, *kernels)
             library = ctypes.CDLL(str(path))
             library.emulated_message.restype = ctypes.c_char_p
             self.opened[key] = library

@@ -70,6 +70,20 @@ inline uint32_t match(int line, uint32_t mask, uint32_t v) {
   return bits;
 }
 
+// A result as it is; or with -DEMULATED_ROUGH off by up to so many units in the last place, always
+// the same, as a GPU's special unit gives it.
+inline float rounded(float v, int units) {
+#ifdef EMULATED_ROUGH
+  const uint32_t bits = static_cast<uint32_t>(as_word(v)), low = (1u << 23) - 1;
+  if ((bits & low) < 8 || (bits & low) > low - 8 || !isfinite(v)) return v;
+  const int by = static_cast<int>((bits * 2654435761u >> 16) % (2 * units + 1)) - units;
+  return from_word<float>(bits + static_cast<uint32_t>(by));
+#else
+  static_cast<void>(units);
+  return v;
+#endif
+}
+
 // Makes a kernel known by its name.
 struct Register {
   Register(const char* name, void (*run)(const void*));

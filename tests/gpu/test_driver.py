@@ -33,7 +33,8 @@ import torch
 from cuda.bindings import driver as cu
 from native.test_invariants import assert_identical, everything
 
-from fragprune_plugins.engines import create_engine, proof
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.cuda import self_check
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.cuda.driver import Driver
 from fragprune_plugins.testing import scenes
@@ -61,7 +62,7 @@ inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
 """
 
 BOTH_KINDS_OF_CODE = """
-proof.doubt = lambda: None
+self_check.why_not = lambda device: None
 assert create_engine("auto", "cuda").name == "cuda"
 assert_identical(expected, everything(CudaEngine(deterministic=True), inputs, thresholds))
 os.environ["FAKE_REFUSES"] = "machine code"

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import ctypes
 import threading
+from pathlib import Path
 from typing import Any, Final
 
 import torch
 
 from fragprune_plugins.engines.cuda import kernels
-from fragprune_plugins.errors import EngineError
+from fragprune_plugins.errors import EngineError, KernelError
 
 THREADS: Final = 256
 """Of every block of every kernel (native/cuda/frame.h)."""
@@ -28,6 +29,28 @@ def missing() -> str | None:
     if not torch.cuda.is_available():
         return "torch sees no CUDA device"
     return None
+
+
+def remedy() -> str:
+    """What to do when something is missing."""
+    cuda = torch.version.cuda
+    if cuda is None:
+        return "Install torch for CUDA."
+    return (
+        f"Install fragprune-plugins[cuda{cuda.split('.')[0]}], for torch is for CUDA {cuda}; "
+        "see fragprune doctor."
+    )
+
+
+def version() -> str:
+    """The driver's: the newest CUDA that it knows, and on Linux its own."""
+    from cuda.bindings import driver
+
+    _, newest = driver.cuDriverGetVersion()
+    try:
+        return f"{newest}; {Path('/proc/driver/nvidia/version').read_text()}"
+    except OSError:
+        return str(newest)
 
 
 class Driver:
@@ -46,8 +69,7 @@ class Driver:
                 "engine 'cuda'",
                 why,
                 "a CUDA device, and NVRTC (through cuda-bindings) or nvcc",
-                "Install fragprune-plugins[cuda12] or [cuda13], as your torch has it "
-                "(torch.version.cuda), or use the engine 'reference'.",
+                f"{remedy()} Or use the engine 'reference'.",
             )
         from cuda.bindings import driver
 
@@ -69,7 +91,8 @@ class Driver:
         """Run a kernel on the current stream of a device; see ``engines.frames.Device``.
 
         Raises:
-            EngineError: it does not compile, load or start.
+            KernelError: it does not compile or load.
+            EngineError: it does not start, or one before it failed.
         """
         index = torch.cuda.current_device() if where.index is None else where.index
         self._call("cuCtxPushCurrent", self._context(index))
@@ -132,7 +155,7 @@ class Driver:
             why = "; ".join(failures)
         except kernels.Unavailable as error:
             why = str(error)
-        raise EngineError(
+        raise KernelError(
             f"kernels of {source}.cu",
             why,
             f"code for compute capability {major}.{minor}",

@@ -222,6 +222,41 @@ def _blocks(count: int, per_block: int = THREADS) -> int:
     return -(-count // per_block)
 
 
+def launch(
+    device: Device,
+    where: torch.device,
+    source: str,
+    macros: dict[str, int],
+    kernel: str,
+    blocks: int,
+    arguments: ctypes.Structure,
+) -> None:
+    """Run a kernel, if there is work for it."""
+    if blocks:
+        device.launch(where, source, {**MACROS, **macros}, kernel, blocks, arguments)
+
+
+def launch_sort(
+    device: Device,
+    where: torch.device,
+    macros: dict[str, int],
+    arguments: Sort,
+    keys: list[int],
+    values: list[int],
+    passes: int,
+) -> None:
+    """Sort by 8 bits a pass, to and fro between two pairs of arrays."""
+    blocks = _blocks(arguments.capacity, SORT_KEYS)
+    for k in range(passes):
+        arguments.keys, arguments.sorted_keys = keys[k % 2], keys[1 - k % 2]
+        arguments.values, arguments.sorted_values = values[k % 2], values[1 - k % 2]
+        launch(device, where, "scene", macros, "fp_sort", blocks, arguments)
+        arguments.shift += 8
+        arguments.histogram += 4 * DIGITS
+        arguments.words += 4 * DIGITS * blocks
+        arguments.ticket += 4
+
+
 def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
     """The tensors of a rasterization that gradients can be wanted of, but for thresholds."""
     splats = inputs.splats
@@ -392,10 +427,11 @@ class Drawing:
         )
         self._launch("scene", scene, "fp_project", _blocks(n), frame)
         ids = [scratch["depth_ids"], scratch["ids_2"]]
-        self._sort(scene, by_depth, [scratch["depth_keys"], scratch["keys_2"]], ids, PASSES)
+        depths = [scratch["depth_keys"], scratch["keys_2"]]
+        launch_sort(self._device, self.where, scene, by_depth, depths, ids, PASSES)
         self._launch("scene", scene, "fp_emit", _blocks(n), frame)
         if n:
-            self._sort(scene, by_tile, keys, values, passes)
+            launch_sort(self._device, self.where, scene, by_tile, keys, values, passes)
             frame.entry_keys, frame.entry_values = keys[passes % 2], values[passes % 2]
             self._launch("scene", scene, "fp_ranges", _blocks(capacity), frame)
         macros = blend_macros(
@@ -449,25 +485,6 @@ class Drawing:
             "winners": new(*size, dtype=torch.int32) if scores else None,
         }
 
-    def _sort(
-        self,
-        scene: dict[str, int],
-        arguments: Sort,
-        keys: list[int],
-        values: list[int],
-        passes: int,
-    ) -> None:
-        """Sorts by 8 bits a pass, to and fro between two pairs of arrays."""
-        blocks = _blocks(arguments.capacity, SORT_KEYS)
-        for k in range(passes):
-            arguments.keys, arguments.sorted_keys = keys[k % 2], keys[1 - k % 2]
-            arguments.values, arguments.sorted_values = values[k % 2], values[1 - k % 2]
-            self._launch("scene", scene, "fp_sort", blocks, arguments)
-            arguments.shift += 8
-            arguments.histogram += 4 * DIGITS
-            arguments.words += 4 * DIGITS * blocks
-            arguments.ticket += 4
-
     def _launch(
         self,
         source: str,
@@ -476,8 +493,7 @@ class Drawing:
         blocks: int,
         arguments: ctypes.Structure,
     ) -> None:
-        if blocks:
-            self._device.launch(self.where, source, {**MACROS, **macros}, kernel, blocks, arguments)
+        launch(self._device, self.where, source, macros, kernel, blocks, arguments)
 
     # ---- backward ------------------------------------------------------------------------------
 
@@ -562,5 +578,5 @@ class KernelBlade:
         self._launch("fp_unslice", Slicing(given=given, sliced=by, to=to))
 
     def _launch(self, kernel: str, arguments: Slicing) -> None:
-        if blocks := _blocks(arguments.given.count):
-            self.device.launch(self.where, "slice", MACROS, kernel, blocks, arguments)
+        blocks = _blocks(arguments.given.count)
+        launch(self.device, self.where, "slice", {}, kernel, blocks, arguments)
