@@ -421,7 +421,7 @@ FP_KERNEL(fp_unblend, Undraw, kResident) {
     const int count = meet_those(room.staged, furthest - first, met);
     int next = 0;
     for (bool more = count > 0 || frame.owners; more;) {
-      int filled = 0;  // Gaussians in the bucket: met[0] and so on, which have been read by then
+      int filled = 0, its = 0;  // Gaussians in the bucket; the one that this lane will be a part of
       float* slot = room.parts[warp][0] + lane;
       while (filled < kBucket && next < count) {
         const int j = met[next++];
@@ -436,11 +436,10 @@ FP_KERNEL(fp_unblend, Undraw, kResident) {
 #pragma unroll
         for (int k = 0; k < kParts; k++) slot[32 * k] = parts[k];
         slot += Room::kPitch;
-        if (lane == 0) met[filled] = static_cast<uint8_t>(j);
+        if (lane / kLanes == filled) its = j;
         filled++;
       }
       __syncwarp();
-      const int its = met[lane / kLanes];
       float v[kPadded];
       if (filled > 0) {
         gather(frame, room, its, v);
