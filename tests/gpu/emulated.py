@@ -37,10 +37,12 @@ class EmulatedDevice:
         launched: kernels with their macros, in order.
         opened: what was built, by source and macros.
         seed: of the order in which threads and blocks run.
+        resident: blocks that run at a time, 1 to 3.
     """
 
     def __init__(self, compiler: str, folder: Path, flags: tuple[str, ...] = ()) -> None:
-        self.compiler, self._folder, self._flags, self.seed = compiler, folder, flags, 1
+        self.compiler, self._folder, self._flags = compiler, folder, flags
+        self.seed, self.resident = 1, 3
         self.launched: list[tuple[str, dict[str, int]]] = []
         self.opened: dict[tuple[str, tuple[tuple[str, int], ...]], ctypes.CDLL] = {}
 
@@ -59,7 +61,7 @@ class EmulatedDevice:
         self.launched.append((kernel, macros))
         library = self._open(source, macros)
         status = library.emulated_launch(
-            kernel.encode(), blocks, 256, ctypes.byref(arguments), self.seed
+            kernel.encode(), blocks, 256, ctypes.byref(arguments), self.seed, self.resident
         )
         if status:
             raise RuntimeError(library.emulated_message().decode())

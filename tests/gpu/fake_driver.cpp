@@ -33,10 +33,10 @@ int run(const std::string& name, unsigned blocks, unsigned threads, void* argume
     if (entry.path().extension() != ".so") continue;
     void* library = dlopen(entry.path().c_str(), RTLD_NOW | RTLD_LOCAL);
     using Knows = int (*)(const char*);
-    using Launch = int (*)(const char*, unsigned, unsigned, const void*, unsigned);
+    using Launch = int (*)(const char*, unsigned, unsigned, const void*, unsigned, int);
     if (!reinterpret_cast<Knows>(dlsym(library, "emulated_knows"))(name.c_str())) continue;
     return reinterpret_cast<Launch>(dlsym(library, "emulated_launch"))(name.c_str(), blocks,
-                                                                       threads, arguments, 1);
+                                                                       threads, arguments, 1, 3);
   }
   return 1;
 }

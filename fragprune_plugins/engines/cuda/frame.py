@@ -22,6 +22,8 @@ from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import Splats
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from torch import Tensor
 
     from fragprune_plugins.types import RasterInputs
@@ -198,15 +200,21 @@ class Device(Protocol):
         """Whether a device's current stream records a graph, so that nothing can be read back."""
 
 
-class _Arena:
-    """Named arrays in one tensor, each at a multiple of 256 bytes."""
+class Arena:
+    """Named arrays in one tensor, each at a multiple of 256 bytes.
 
-    def __init__(self, where: torch.device, **sizes: int) -> None:
+    Args:
+        where: the device.
+        fill: torch.empty or torch.zeros.
+        sizes: bytes, by name.
+    """
+
+    def __init__(self, where: torch.device, fill: Callable[..., Tensor], **sizes: int) -> None:
         places, total = {}, 0
         for name, size in sizes.items():
             places[name] = total
             total += -(-size // 256) * 256
-        self.memory = torch.empty(total + 255, dtype=torch.uint8, device=where)
+        self.memory = fill(total + 255, dtype=torch.uint8, device=where)
         first = -self.memory.data_ptr() % 256
         self._at = {name: first + place for name, place in places.items()}
 
@@ -346,8 +354,9 @@ class Drawing:
         keep, slots = bool(wanted), bool(wanted) and deterministic
         packed = packed and not keep
         scene = {"FP_PACKED": int(packed)}
-        cleared = _Arena(
+        cleared = Arena(
             where,
+            torch.zeros,
             counters=COUNTERS,
             project_words=8 * _blocks(n),
             emit_words=8 * _blocks(n),
@@ -357,15 +366,16 @@ class Drawing:
             tile_sort=4 * passes * DIGITS * _blocks(capacity, SORT_KEYS),
             ranges=8 * tiles,
         )
-        cleared.memory.zero_()
-        scratch = _Arena(
+        scratch = Arena(
             where,
+            torch.empty,
             rects=8 * n,
             **dict.fromkeys(("depth_keys", "depth_ids", "keys_2", "ids_2"), 4 * n),
             **dict.fromkeys(("entry_keys", "entry_keys_2", "entry_values_2"), 4 * capacity),
         )
-        kept = _Arena(
+        kept = Arena(
             where,
+            torch.empty,
             brushes=4 * (PACKED_BRUSH if packed else BRUSH) * n,
             tiles=4 * n,
             first_slot=4 * n * slots,
