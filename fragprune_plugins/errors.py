@@ -96,6 +96,10 @@ class EngineError(FragpruneError):
     code = "engine"
 
 
+class KernelError(EngineError):
+    """Kernels that cannot be compiled for, or loaded into, a GPU."""
+
+
 class InputError(FragpruneError):
     """Tensors of the wrong shape, dtype or device."""
 

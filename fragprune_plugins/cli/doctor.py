@@ -13,6 +13,8 @@ from fragprune_plugins.errors import EngineError, UsageError
 
 _PACKAGES = ("fragprune-plugins", "torch", "numpy", "pluggy", "wrapt", "plyfile", "scikit-image")
 
+_AGREES = {"agrees": True, "fails": False, "could not run": None}
+
 
 @click.command("doctor", cls=Command)
 @click.option(
@@ -23,8 +25,9 @@ _PACKAGES = ("fragprune-plugins", "torch", "numpy", "pluggy", "wrapt", "plyfile"
 def command(build_cuda: str | None) -> Report:
     """Report versions, engines, the native build and plugins; paste it into a bug report.
 
-    Where there is a GPU, the cuda engine draws a small scene, and what the reference engine makes
-    of it is compared. Exit code 1 when something is wrong that has a remedy.
+    Where there is a GPU, the cuda engine is checked there: what it draws and learns is compared
+    with what the other engines make of the same. Exit code 1 when something is wrong that has a
+    remedy.
 
     \b
     Examples:
@@ -41,9 +44,11 @@ def command(build_cuda: str | None) -> Report:
 
     packages = {name: _version(name) for name in _PACKAGES}
     native = binding.describe()
+    # First of all: a GPU may be one process's alone.
+    verdict = self_check.check_in_subprocess("cuda") if driver.missing() is None else None
     gpu = driver.describe()
-    doubt = self_check.attempt() if gpu["available"] else None
-    gpu["agrees"] = doubt is None if gpu["available"] else None
+    gpu["agrees"] = None if verdict is None else _AGREES[verdict.outcome]
+    gpu["check"] = None if verdict is None else str(verdict)
     plugins = load_plugins()
     data: dict[str, Any] = {
         "python": platform.python_version(),
@@ -77,11 +82,9 @@ def command(build_cuda: str | None) -> Report:
             "The cpu engine is missing: rasterization on the CPU uses the slow reference engine. "
             "Install a C++17 compiler and install fragprune-plugins again."
         )
-    if gpu["agrees"] is False:
+    if verdict is not None and verdict.outcome != "agrees":
         wrong = True
-        lines.append(
-            f"The cuda engine fails here: {doubt}. --engine auto does without it; please report it."
-        )
+        lines.append(f"{verdict}. Until then --engine auto does without it. {verdict.remedy}")
     return Report(data, "\n".join(lines), exit_code=1 if wrong else 0)
 
 

@@ -63,12 +63,10 @@ def device_for(wanted: str = "auto", engine: str = "auto") -> torch.device:
     if wanted == "auto":
         if not seen or engine == "cpu":
             return torch.device("cpu")
-        if engine == "cuda" or _fastest("cuda") == "cuda":
+        why_not = None if engine == "cuda" else _why_not_cuda("cuda")
+        if why_not is None:
             return torch.device("cuda")
-        log.warning(
-            "working on the CPU: the cuda engine cannot be used on this GPU; "
-            "fragprune doctor says why"
-        )
+        log.warning("working on the CPU: %s. %s", *why_not)
         return torch.device("cpu")
     device = torch.device(wanted)
     if device.type == "cuda" and (device.index or 0) >= seen:
@@ -91,11 +89,16 @@ def device_for(wanted: str = "auto", engine: str = "auto") -> torch.device:
 def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     """Our own engine by name; "auto" takes the fastest that runs on the device.
 
+    On a GPU that is the cuda engine, once it has proved itself there (``engines.cuda.self_check``);
+    until then the reference engine draws small scenes, with a warning, and refuses large ones.
+
     Raises:
         EngineError: an unknown name, or an engine that cannot run here.
     """
     if name == "auto":
-        name = _fastest(str(device))
+        name, why_not = _fastest(str(device))
+        if why_not is not None:
+            return _fallback(*why_not)
     if name == "cpu":
         from fragprune_plugins.engines.cpu.engine import CpuEngine
 
@@ -111,21 +114,35 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
 
 
-def _fastest(device: str) -> str:
+def _fastest(device: str) -> tuple[str, tuple[str, str] | None]:
+    """The engine's name; where it stands in for the cuda engine, why, and what to do."""
     if device.startswith("cuda"):
-        from fragprune_plugins.engines.cuda import driver
-
-        return "cuda" if driver.missing() is None and _proven() else "reference"
+        why_not = _why_not_cuda(device)
+        return ("reference" if why_not else "cuda"), why_not
     from fragprune_plugins.engines.cpu import binding
 
-    return "cpu" if device.startswith("cpu") and binding.available() else "reference"
+    return ("cpu" if device.startswith("cpu") and binding.available() else "reference"), None
 
 
-def _proven() -> bool:
-    """Whether the cuda engine has drawn here what the reference engine draws."""
+def _why_not_cuda(device: str) -> tuple[str, str] | None:
+    """Why the cuda engine is not to be used on a GPU, and what to do; None when it is."""
+    from fragprune_plugins.engines.cuda import driver
+
+    reason = driver.missing()
+    if reason is not None:
+        return f"the cuda engine cannot run: {reason}", driver.remedy()
     from fragprune_plugins.engines.cuda import self_check
 
-    return self_check.doubt() is None
+    verdict = self_check.why_not(device)
+    return (str(verdict), verdict.remedy) if verdict else None
+
+
+@cache
+def _fallback(why: str, remedy: str) -> Engine:
+    """One for each reason, which is told once."""
+    from fragprune_plugins.engines.reference import Fallback
+
+    return Fallback(why, remedy)
 
 
 _slicer = cache(create_engine)
@@ -154,6 +171,6 @@ def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = 
     if isinstance(engine, Slicer):
         return engine.slice(splats, moment)
     if not isinstance(engine, str) or engine == "auto":
-        engine = _fastest(str(splats.device))
+        engine, _ = _fastest(str(splats.device))
     slicer: Slicer = _slicer(engine)  # type: ignore[assignment]
     return slicer.slice(splats, moment)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import logging
+from typing import TYPE_CHECKING, Final
 
 from fragprune_plugins.engines.slicing import check_harmonics
+from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import (
     Footprints,
     Moment,
@@ -28,6 +30,8 @@ from reference_renderer import Footprints as Projected
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+log = logging.getLogger("fragprune")
 
 
 class ReferenceEngine:
@@ -59,6 +63,40 @@ class ReferenceEngine:
         check_harmonics(splats, moment)
         given = SpacetimeGaussians(**vars(splats))
         return Sliced(**vars(slice_gaussians(given, **vars(moment))))
+
+
+FALLBACK_LIMIT: Final = 10**9
+"""Gaussians x pixels of the largest frame that the oracle draws unasked, in a second or some."""
+
+
+class Fallback(ReferenceEngine):
+    """The oracle where the engine that is meant cannot run: for small scenes alone.
+
+    Args:
+        why: the engine that is meant cannot run.
+        remedy: the next thing to do.
+    """
+
+    def __init__(self, why: str, remedy: str) -> None:
+        self._why, self._remedy = why, remedy
+        log.warning("drawing with the slow reference engine: %s. %s", why, remedy)
+
+    def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
+        """Draw the splats; see ``ReferenceEngine``.
+
+        Raises:
+            EngineError: there are too many for it.
+        """
+        n, width, height = len(inputs.splats), inputs.view.width, inputs.view.height
+        if n * width * height > FALLBACK_LIMIT:
+            raise EngineError(
+                "engine 'auto'",
+                f"{n} Gaussians at {width}x{height}, and {self._why}",
+                f"at most {FALLBACK_LIMIT:.0e} Gaussians x pixels for the reference engine: a run "
+                "would take days",
+                f"{self._remedy} Or draw on the CPU: --device cpu. --engine reference insists.",
+            )
+        return super().rasterize(inputs, thresholds)
 
 
 def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:

@@ -22,8 +22,8 @@ def gpus(monkeypatch):
     def pretend(count: int, usable: bool = True) -> None:
         monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
         monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
-        best = "cuda" if usable else "reference"
-        monkeypatch.setattr(engines, "_fastest", lambda device: best)
+        why_not = None if usable else ("the cuda engine cannot be used on this GPU", "Do this.")
+        monkeypatch.setattr(engines, "_why_not_cuda", lambda device: why_not)
 
     return pretend
 
@@ -51,7 +51,8 @@ def test_rule(gpus, count, usable, wanted, engine, device):
 def test_a_gpu_that_is_not_used_is_spoken_of(gpus, caplog):
     gpus(1, usable=False)
     engines.device_for("auto")
-    assert "working on the CPU: the cuda engine cannot be used on this GPU" in caplog.text
+    said = "working on the CPU: the cuda engine cannot be used on this GPU. Do this."
+    assert said in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -31,15 +31,18 @@ class EmulatedDevice:
     Args:
         compiler: a C++17 compiler for ELF systems.
         folder: where builds go.
-        seed: of the order in which threads and blocks run.
+        flags: further ones of the compiler.
 
     Attributes:
         launched: kernels with their macros, in order.
         opened: what was built, by source and macros.
+        seed: of the order in which threads and blocks run.
+        resident: blocks that run at a time, 1 to 3.
     """
 
-    def __init__(self, compiler: str, folder: Path, seed: int = 1) -> None:
-        self.compiler, self._folder, self.seed = compiler, folder, seed
+    def __init__(self, compiler: str, folder: Path, flags: tuple[str, ...] = ()) -> None:
+        self.compiler, self._folder, self._flags = compiler, folder, flags
+        self.seed, self.resident = 1, 3
         self.launched: list[tuple[str, dict[str, int]]] = []
         self.opened: dict[tuple[str, tuple[tuple[str, int], ...]], ctypes.CDLL] = {}
 
@@ -58,12 +61,12 @@ class EmulatedDevice:
         self.launched.append((kernel, macros))
         library = self._open(source, macros)
         status = library.emulated_launch(
-            kernel.encode(), blocks, 256, ctypes.byref(arguments), self.seed
+            kernel.encode(), blocks, 256, ctypes.byref(arguments), self.seed, self.resident
         )
         if status:
             raise RuntimeError(library.emulated_message().decode())
 
-    def capturing(self) -> bool:
+    def capturing(self, where: torch.device) -> bool:
         return self.recording
 
     def _open(self, source: str, macros: dict[str, int]) -> ctypes.CDLL:
@@ -72,7 +75,7 @@ class EmulatedDevice:
             path = self._folder / f"{source}{len(self.opened)}.so"
             defined = [f"-D{name}={value}" for name, value in macros.items()]
             kernels = ("-x", "c++", "-include", str(HERE / "emulation.h"), self.source(source))
-            self._build(path, "-shared", *defined, self._machine, *kernels)
+            self._build(path, "-shared", *self._flags, *defined, self._machine, *kernels)
             library = ctypes.CDLL(str(path))
             library.emulated_message.restype = ctypes.c_char_p
             self.opened[key] = library

@@ -2,6 +2,7 @@
 #include "emulation.h"
 
 #include <setjmp.h>
+#include <sys/mman.h>
 #include <ucontext.h>
 
 #include <algorithm>
@@ -17,19 +18,42 @@ extern char __stop_emulated_shared[] __attribute__((weak));
 
 Index threadIdx, blockIdx;
 
+// ThreadSanitizer's own, where it is loaded.
+#define WEAK extern "C" __attribute__((weak))
+WEAK void* __tsan_get_current_fiber();
+WEAK void* __tsan_create_fiber(unsigned);
+WEAK void __tsan_destroy_fiber(void*);
+WEAK void __tsan_switch_to_fiber(void*, unsigned);
+WEAK void __tsan_acquire(void*);
+WEAK void __tsan_release(void*);
+// What it is told of volatile accesses: nothing, they are atomic.
+#define SILENT(size)                                  \
+  extern "C" void __tsan_volatile_read##size(void*) {} \
+  extern "C" void __tsan_volatile_write##size(void*) {}
+SILENT(1) SILENT(2) SILENT(4) SILENT(8) SILENT(16)
+
 namespace emulated {
 
-constexpr int kResident = 3;     // blocks that run at a time
+constexpr int kMostResident = 3;  // blocks that run at a time
 constexpr int kPatience = 4000;  // turns in which nobody does anything but wait
 
 enum class Wait { kNothing, kPause, kBlock, kWarp, kGone };
 
+// What happened before a release of it happened before its acquisition, by threads.
+struct Order {
+  char at[2];  // as atomics have addresses; a barrier uses them in turns
+  void acquire(int turn = 0) { if (__tsan_acquire) __tsan_acquire(at + turn); }
+  void release(int turn = 0) { if (__tsan_release) __tsan_release(at + turn); }
+};
+
 struct Fiber {
+  void* tsan = nullptr;
   ucontext_t start;
   jmp_buf here;
   std::vector<char> stack;
   bool started = false;
   Wait wait = Wait::kNothing;
+  int barriers = 0, fences = 0;  // that it has met
   int line = 0;        // of the operation that it waits at
   uint64_t given = 0;  // to the operation
 };
@@ -40,11 +64,14 @@ struct Block {
   std::vector<char> shared;
   uint64_t warp_given[32][32];  // to the operation that was completed last
   bool block_all = false;       // what the last barrier found
+  Order barrier, warps[32];
 };
 
 struct Machine {
   std::mt19937 random{1};
   jmp_buf scheduler;
+  void* tsan = __tsan_get_current_fiber ? __tsan_get_current_fiber() : nullptr;
+  Order from_scheduler, to_scheduler;
   Block* block = nullptr;
   int thread = 0;
   void (*body)(const void*) = nullptr;
@@ -58,19 +85,30 @@ Machine& machine() {
 
 [[noreturn]] void fail(const std::string& what) { throw std::runtime_error(what); }
 
+constexpr unsigned kNoOrder = 1;  // of switching
+
+[[noreturn]] void leave() {
+  Machine& m = machine();
+  if (m.tsan) __tsan_switch_to_fiber(m.tsan, kNoOrder);
+  _longjmp(m.scheduler, 1);
+}
+
 // Gives way to the other threads until the scheduler comes back.
 void wait(Wait kind, int line, uint64_t given) {
   Machine& m = machine();
   Fiber& fiber = m.fiber();
   fiber.wait = kind, fiber.line = line, fiber.given = given;
-  if (_setjmp(fiber.here) == 0) _longjmp(m.scheduler, 1);
+  if (_setjmp(fiber.here) == 0) leave();
+  m.from_scheduler.acquire();
 }
 
 void enter() {
   Machine& m = machine();
+  m.from_scheduler.acquire();
   m.body(m.arguments);
+  m.to_scheduler.release();
   m.fiber().wait = Wait::kGone;
-  _longjmp(m.scheduler, 1);
+  leave();
 }
 
 void resume(int thread) {
@@ -80,6 +118,8 @@ void resume(int thread) {
   Fiber& fiber = m.fiber();
   fiber.wait = Wait::kNothing;
   if (_setjmp(m.scheduler) != 0) return;
+  if (m.tsan && !fiber.tsan) fiber.tsan = __tsan_create_fiber(0);
+  if (m.tsan) __tsan_switch_to_fiber(fiber.tsan, kNoOrder);
   if (fiber.started) _longjmp(fiber.here, 1);
   fiber.started = true;
   fiber.stack.resize(1 << 16);
@@ -145,8 +185,37 @@ bool finished(const Block& block) {
   return true;
 }
 
-void run_grid(unsigned blocks, int threads, void (*body)(const void*),
-                     const void* arguments) {
+// Copies, unseen by sanitizers, who would take it for the kernel's doing.
+void copy(char* to, const char* from, size_t size) {
+  for (; size >= sizeof(uint64_t); size -= sizeof(uint64_t)) {
+    uint64_t word;
+    __builtin_memcpy(&word, from, sizeof word);
+    *reinterpret_cast<volatile uint64_t*>(to) = word;
+    from += sizeof word, to += sizeof word;
+  }
+  for (; size > 0; size--) *reinterpret_cast<volatile char*>(to++) = *from++;
+}
+
+// Puts a block's shared memory where kernels look for it. All blocks have it at one address: the
+// sanitizer is made to forget what others did there, which mapping memory anew does.
+void put_shared(const Block& block, char* at, size_t size) {
+  if (machine().tsan && size > 0) {
+    const uintptr_t page = 4096, first = reinterpret_cast<uintptr_t>(at) & ~(page - 1);
+    const size_t all = (reinterpret_cast<uintptr_t>(at) + size - first + page - 1) & ~(page - 1);
+    char* pages = reinterpret_cast<char*>(first);
+    std::vector<char> kept(all);
+    copy(kept.data(), pages, all);
+    if (mmap(pages, all, PROT_READ | PROT_WRITE, MAP_FIXED | MAP_PRIVATE | MAP_ANONYMOUS, -1, 0) !=
+        pages)
+      fail("shared memory cannot be mapped anew");
+    copy(pages, kept.data(), all);
+  }
+  copy(at, block.shared.data(), size);
+  machine().from_scheduler.release();
+}
+
+void run_grid(unsigned blocks, int threads, int most_resident, void (*body)(const void*),
+              const void* arguments) {
   Machine& m = machine();
   m.body = body, m.arguments = arguments;
   const size_t shared = static_cast<size_t>(__stop_emulated_shared - __start_emulated_shared);
@@ -155,32 +224,37 @@ void run_grid(unsigned blocks, int threads, void (*body)(const void*),
   for (unsigned i = blocks; i > 1; i--) std::swap(queue[i - 1], queue[m.random() % i]);
   std::vector<int> order(threads);
   for (int i = 0; i < threads; i++) order[i] = i;
-  static Block rooms[kResident];  // their stacks are used again
+  static Block rooms[kMostResident];  // their stacks are used again
   std::vector<Block*> resident;
+  Block* there = nullptr;  // whose shared memory is
   const auto begin = [&](Block& block) {
     block.index = queue.back();
     queue.pop_back();
     block.fibers.resize(threads);
     for (Fiber& fiber : block.fibers) fiber.started = false, fiber.wait = Wait::kNothing;
     block.shared.assign(shared, static_cast<char>(0xff));
+    if (there == &block) there = nullptr;
   };
-  for (Block& room : rooms) {
-    if (queue.empty()) break;
-    begin(room);
-    resident.push_back(&room);
+  for (int r = 0; r < most_resident && !queue.empty(); r++) {
+    begin(rooms[r]);
+    resident.push_back(&rooms[r]);
   }
+  m.from_scheduler.release();
   for (int idle = 0; !resident.empty();) {
     const size_t which = m.random() % resident.size();
     Block& block = *resident[which];
+    if (there != &block) {
+      if (there) copy(there->shared.data(), __start_emulated_shared, shared);
+      put_shared(block, __start_emulated_shared, shared);
+      there = &block;
+    }
     m.block = &block;
     blockIdx = {block.index, 0, 0};
-    memcpy(__start_emulated_shared, block.shared.data(), shared);
     for (bool more = true; more && m.random() % 64;) {  // now and then, and when it waits, leave it
       more = turn(block, order);
       idle = more ? 0 : idle + 1;
       if (idle > kPatience) fail("threads wait for each other forever");
     }
-    memcpy(block.shared.data(), __start_emulated_shared, shared);
     if (!finished(block)) continue;
     idle = 0;
     if (queue.empty())
@@ -188,17 +262,29 @@ void run_grid(unsigned blocks, int threads, void (*body)(const void*),
     else
       begin(block);
   }
+  m.to_scheduler.acquire();
+  for (Block& room : rooms)  // as many as the sanitizer can have
+    for (Fiber& fiber : room.fibers)
+      if (fiber.tsan) __tsan_destroy_fiber(fiber.tsan), fiber.tsan = nullptr;
 }
 
-
-const uint64_t* exchange(int line, uint32_t mask, uint64_t given) {
+const uint64_t* exchange(int line, uint32_t mask, uint64_t given, bool fence) {
+  Machine& m = machine();
+  Order& order = m.block->warps[threadIdx.x / 32];
+  const int turn = m.fiber().fences & 1;
+  if (fence) order.release(turn), m.fiber().fences++;
   // line 0 is nobody's: a partial warp meets nobody
   wait(Wait::kWarp, mask == 0xffffffffu ? line : 0, given);
-  return machine().block->warp_given[threadIdx.x / 32];
+  if (fence) order.acquire(turn);
+  return m.block->warp_given[threadIdx.x / 32];
 }
 bool barrier(int line, bool v) {
+  Machine& m = machine();
+  const int turn = m.fiber().barriers++ & 1;
+  m.block->barrier.release(turn);
   wait(Wait::kBlock, line, v);
-  return machine().block->block_all;
+  m.block->barrier.acquire(turn);
+  return m.block->block_all;
 }
 void pause() { wait(Wait::kPause, 0, 0); }
 
@@ -220,12 +306,12 @@ std::string& message() {
 
 // Runs a grid of blocks; 0, or 1 with a message.
 EXPORT int emulated_launch(const char* name, unsigned blocks, unsigned threads,
-                           const void* arguments, unsigned seed) {
+                           const void* arguments, unsigned seed, int resident) {
   try {
     const auto found = emulated::kernels().find(name);
     if (found == emulated::kernels().end()) emulated::fail("no such kernel");
     emulated::machine().random.seed(seed);
-    emulated::run_grid(blocks, static_cast<int>(threads), found->second, arguments);
+    emulated::run_grid(blocks, static_cast<int>(threads), resident, found->second, arguments);
     return 0;
   } catch (const std::exception& e) {
     emulated::message() = std::string(name) + ": " + e.what();

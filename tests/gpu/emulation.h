@@ -4,6 +4,10 @@
 // random order; shared memory is filled with NaN before each block. What works in one order only,
 // or reads what nobody wrote, shows.
 //
+// Under ThreadSanitizer it knows what a GPU promises, and no more: fibers are threads, barriers and
+// __syncwarp order what lies before and after them; shuffles, votes and atomics order nothing. So it
+// reports what happens to work here and need not there.
+//
 // Stops with a message when threads wait for each other forever, when the lanes of a warp meet at
 // different operations, or when a thread has left while others wait for it.
 #pragma once
@@ -11,6 +15,8 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+
+#include <type_traits>
 
 #define FP_EMULATED
 #define __device__
@@ -46,8 +52,8 @@ inline T from_word(uint64_t word) {
   return v;
 }
 
-// What each lane of this warp gave to the operation in `line`.
-const uint64_t* exchange(int line, uint32_t mask, uint64_t given);
+// What each lane of this warp gave to the operation in `line`, which may be a fence, too.
+const uint64_t* exchange(int line, uint32_t mask, uint64_t given, bool fence = false);
 bool barrier(int line, bool v);  // whether all threads of the block gave true
 void pause();
 inline int lane() { return static_cast<int>(threadIdx.x) & 31; }
@@ -70,6 +76,20 @@ inline uint32_t match(int line, uint32_t mask, uint32_t v) {
   return bits;
 }
 
+// A result as it is; or with -DEMULATED_ROUGH off by up to so many units in the last place, always
+// the same, as a GPU's special unit gives it.
+inline float rounded(float v, int units) {
+#ifdef EMULATED_ROUGH
+  const uint32_t bits = static_cast<uint32_t>(as_word(v)), low = (1u << 23) - 1;
+  if ((bits & low) < 8 || (bits & low) > low - 8 || !isfinite(v)) return v;
+  const int by = static_cast<int>((bits * 2654435761u >> 16) % (2 * units + 1)) - units;
+  return from_word<float>(bits + static_cast<uint32_t>(by));
+#else
+  static_cast<void>(units);
+  return v;
+#endif
+}
+
 // Makes a kernel known by its name.
 struct Register {
   Register(const char* name, void (*run)(const void*));
@@ -84,7 +104,7 @@ struct Register {
 #define __ballot_sync(mask, v) emulated::ballot(__LINE__, mask, v)
 #define __any_sync(mask, v) (emulated::ballot(__LINE__, mask, v) != 0)
 #define __match_any_sync(mask, v) emulated::match(__LINE__, mask, v)
-#define __syncwarp() emulated::exchange(__LINE__, 0xffffffffu, 0)
+#define __syncwarp() emulated::exchange(__LINE__, 0xffffffffu, 0, true)
 #define __syncthreads() emulated::barrier(__LINE__, true)
 #define __syncthreads_and(v) emulated::barrier(__LINE__, v)
 #define FP_PAUSE() emulated::pause()
@@ -99,15 +119,19 @@ inline uint32_t __float_as_uint(float v) { return emulated::from_word<uint32_t>(
 
 template <class T, class U>
 inline T atomicAdd(T* at, U v) {
-  const T before = *at;
-  *at = before + static_cast<T>(v);
-  return before;
+  if constexpr (std::is_integral<T>::value) {
+    return __atomic_fetch_add(at, static_cast<T>(v), __ATOMIC_RELAXED);
+  } else {
+    T before, after;
+    __atomic_load(at, &before, __ATOMIC_RELAXED);
+    do after = before + static_cast<T>(v);
+    while (!__atomic_compare_exchange(at, &before, &after, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
+    return before;
+  }
 }
 template <class T, class U>
 inline T atomicExch(T* at, U v) {
-  const T before = *at;
-  *at = static_cast<T>(v);
-  return before;
+  return __atomic_exchange_n(at, static_cast<T>(v), __ATOMIC_RELAXED);
 }
 
 #define FP_KERNEL(name, Arguments, blocks)                                      \

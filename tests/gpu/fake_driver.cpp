@@ -8,13 +8,24 @@
 
 #include <filesystem>
 #include <string>
+#include <vector>
 
 #define EXPORT extern "C" __attribute__((visibility("default")))
 
 namespace {
 constexpr int kInvalidValue = 1, kInvalidContext = 201, kInvalidImage = 200, kNotFound = 500;
-int context;
-thread_local void* current = nullptr;
+int contexts[2];  // of two devices
+thread_local std::vector<void*> stack;  // of contexts; the last is current
+void* current() { return stack.empty() ? nullptr : stack.back(); }
+
+struct Module {
+  void* context;
+  const char* kind;
+};
+struct Function {
+  Module* module;
+  std::string name;
+};
 
 // The library that has a kernel: the one whose launch knows its name.
 int run(const std::string& name, unsigned blocks, unsigned threads, void* arguments) {
@@ -22,10 +33,10 @@ int run(const std::string& name, unsigned blocks, unsigned threads, void* argume
     if (entry.path().extension() != ".so") continue;
     void* library = dlopen(entry.path().c_str(), RTLD_NOW | RTLD_LOCAL);
     using Knows = int (*)(const char*);
-    using Launch = int (*)(const char*, unsigned, unsigned, const void*, unsigned);
+    using Launch = int (*)(const char*, unsigned, unsigned, const void*, unsigned, int);
     if (!reinterpret_cast<Knows>(dlsym(library, "emulated_knows"))(name.c_str())) continue;
     return reinterpret_cast<Launch>(dlsym(library, "emulated_launch"))(name.c_str(), blocks,
-                                                                       threads, arguments, 1);
+                                                                       threads, arguments, 1, 3);
   }
   return 1;
 }
@@ -34,28 +45,40 @@ int run(const std::string& name, unsigned blocks, unsigned threads, void* argume
 EXPORT int cuInit(unsigned) { return 0; }
 EXPORT int cuDriverGetVersion(int* version) { return *version = 13050, 0; }
 EXPORT int cuDeviceGet(int* device, int ordinal) { return *device = ordinal, 0; }
-EXPORT int cuDevicePrimaryCtxRetain(void** to, int) { return *to = &context, 0; }
-EXPORT int cuCtxSetCurrent(void* to) { return current = to, 0; }
+EXPORT int cuDevicePrimaryCtxRetain(void** to, int device) {
+  return *to = &contexts[device], 0;
+}
+EXPORT int cuCtxGetCurrent(void** to) { return *to = current(), 0; }
+EXPORT int cuCtxSetCurrent(void* to) {
+  if (!stack.empty()) stack.pop_back();
+  return stack.push_back(to), 0;
+}
+EXPORT int cuCtxPushCurrent(void* to) { return stack.push_back(to), 0; }
+EXPORT int cuCtxPopCurrent(void** to) {
+  if (stack.empty()) return kInvalidContext;
+  return *to = stack.back(), stack.pop_back(), 0;
+}
 
 EXPORT int cuModuleLoadData(void** module, const void* image) {
-  if (current != &context) return kInvalidContext;
+  if (!current()) return kInvalidContext;
   const char* refused = getenv("FAKE_REFUSES");  // machine code, as an old driver does new one
   const bool elf = memcmp(image, "\177ELF", 4) == 0;
   if (!elf && !strstr(static_cast<const char*>(image), ".version")) return kInvalidImage;
   if (elf && refused) return kInvalidImage;
-  return *module = strdup(elf ? "machine code" : "PTX"), 0;
+  return *module = new Module{current(), elf ? "machine code" : "PTX"}, 0;
 }
 EXPORT int cuModuleGetFunction(void** function, void* module, const char* name) {
   if (strncmp(name, "fp_", 3)) return kNotFound;
-  fprintf(stderr, "%s from %s\n", name, static_cast<char*>(module));
-  return *function = strdup(name), 0;
+  fprintf(stderr, "%s from %s\n", name, static_cast<Module*>(module)->kind);
+  return *function = new Function{static_cast<Module*>(module), name}, 0;
 }
 EXPORT int cuLaunchKernel(void* function, unsigned x, unsigned y, unsigned z, unsigned threads,
                           unsigned ty, unsigned tz, unsigned shared, void* stream, void** arguments,
                           void** extra) {
-  if (current != &context) return kInvalidContext;
+  const Function& kernel = *static_cast<Function*>(function);
+  if (current() != kernel.module->context) return kInvalidContext;
   if (!x || y * z * ty * tz != 1 || shared || stream || extra) return kInvalidValue;
-  return run(static_cast<char*>(function), x, threads, arguments[0]) ? kInvalidValue : 0;
+  return run(kernel.name, x, threads, arguments[0]) ? kInvalidValue : 0;
 }
 
 EXPORT int cuGetProcAddress_v2(const char* name, void** to, int, uint64_t, int* found) {

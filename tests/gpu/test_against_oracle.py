@@ -22,7 +22,7 @@ from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.testing import scenes
-from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 KINDS = {
     "plain": {},
@@ -180,21 +180,58 @@ def test_packed_pictures_are_off_by_no_more_than_half_precision(
     everything(CudaEngine(device, packed=True), inputs, thresholds)  # gradients take the whole
 
 
+SCENE = scenes.random_scene(0)
+
+
+@pytest.fixture
+def captured(engine: CudaEngine, device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch):
+    """Draws into a graph, where there was room for so many entries."""
+
+    def draw(capacity: int, inputs: RasterInputs = SCENE) -> RasterOutputs:
+        engine._capacity = capacity
+        monkeypatch.setattr(device, "recording", True)
+        return engine.rasterize(inputs, None)
+
+    return draw
+
+
 def test_captured_frames_read_nothing_back_until_they_are_checked(
-    engine: CudaEngine, device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
+    engine: CudaEngine, captured
 ) -> None:
-    inputs = scenes.random_scene(0)
-    expected = engine.rasterize(inputs, None)
-    monkeypatch.setattr(device, "recording", True)
-    found = engine.rasterize(inputs, None)
+    expected = engine.rasterize(SCENE, None)
+    found = captured(512)
     assert torch.equal(found.image, expected.image)
     assert math.isnan(found.evaluated_per_pixel)
     engine.check()
-    engine._capacity = 7
-    engine.rasterize(inputs, None)
+
+
+def test_a_captured_frame_that_found_no_room_is_reported_once(engine: CudaEngine, captured) -> None:
+    engine.rasterize(SCENE, None)
+    captured(512)
+    captured(7)
+    captured(512)  # its replay comes later, and does not hide the other's
     with pytest.raises(EngineError, match="Capture the graph again"):
         engine.check()
     assert engine._capacity > 60
+    engine.check()
+
+
+def test_captured_offsets_beyond_all_bounds_are_reported_once(engine: CudaEngine, captured) -> None:
+    offsets = torch.zeros(28, 40, 2)
+    inputs = replace(SCENE, sample_offsets=offsets)
+    engine.rasterize(inputs, None)
+    offsets[3, 4, 1] = torch.nan
+    captured(512, inputs)
+    offsets.zero_()
+    captured(512, inputs)
+    with pytest.raises(EngineError, match="sample_offsets"):
+        engine.check()
+    engine.check()
+
+
+def test_capturing_comes_after_a_first_frame(engine: CudaEngine, captured) -> None:
+    with pytest.raises(EngineError, match="Draw the scene once"):
+        captured(512)
 
 
 def test_more_entries_than_can_be_counted_are_refused(
@@ -237,3 +274,24 @@ def test_changes_in_place_are_noticed(engine: CudaEngine) -> None:
         leaves["opacities"].mul_(0.5)
     with pytest.raises(RuntimeError, match="inplace"):
         loss.backward()
+
+
+@pytest.mark.parametrize("poison", [torch.nan, torch.inf])
+def test_a_poisoned_pixel_reaches_those_alone_that_draw_there(
+    engine: CudaEngine, poison: float
+) -> None:
+    inputs = scenes.random_scene(6, 200, 50, 37, features=2)
+
+    def rows(at_pixel: float, elsewhere: float, found) -> torch.Tensor:
+        """Of Gaussians with such a gradient, when the picture's gradients are these."""
+        made, leaves = scenes.leaves(inputs)
+        leaves["thresholds"] = tau = scenes.random_thresholds(6, 200).requires_grad_()
+        out = engine.rasterize(made, tau)
+        upstream = torch.full((3, 37, 50), elsewhere)
+        upstream[:, 20, 30] = at_pixel
+        torch.autograd.backward([out.image, out.features], [upstream, upstream[:2]])
+        grads = (leaf.grad.reshape(200, -1) for k, leaf in leaves.items() if k != "background")
+        return found(torch.cat(list(grads), dim=1)).any(1)
+
+    assert 0 < (draw_there := rows(1.0, 0.0, lambda grads: grads != 0)).sum() < 50
+    assert torch.equal(rows(poison, 0.3, lambda grads: ~grads.isfinite()), draw_there)

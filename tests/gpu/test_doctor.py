@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from fragprune_plugins import engines
 from fragprune_plugins.cli import cli
 from fragprune_plugins.engines.cuda import driver, kernels, self_check
+from fragprune_plugins.engines.cuda.self_check import Verdict
 from fragprune_plugins.errors import EngineError
 
 
@@ -67,10 +68,23 @@ def test_it_says_why_there_is_no_engine_for_gpus(monkeypatch: pytest.MonkeyPatch
     assert engines.create_engine("auto", "cuda").name == "reference"
 
 
-def test_a_gpu_that_fails_the_comparison_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = {"available": True, "reason": None}
-    monkeypatch.setattr(driver, "describe", lambda: dict(there))
-    for doubt, status in ((None, 0), ("no picture within 300 s", 1)):
-        monkeypatch.setattr(self_check, "attempt", lambda doubt=doubt: doubt)
-        code, said = invoke()
-        assert (code, said["gpu"]["agrees"]) == (status, doubt is None)
+@pytest.mark.parametrize(
+    ("verdict", "status", "agrees", "said"),
+    [
+        (Verdict("agrees"), 0, True, None),
+        (Verdict("fails", "no end within 300 s"), 1, False, "report it"),
+        (Verdict("could not run", "the device is busy"), 1, None, "compute mode is exclusive"),
+    ],
+    ids=lambda value: getattr(value, "outcome", ""),
+)
+def test_a_gpu_is_checked_each_time_and_what_failed_told_from_what_could_not_run(
+    monkeypatch: pytest.MonkeyPatch, verdict: Verdict, status: int, agrees: bool | None, said: str
+) -> None:
+    monkeypatch.setattr(driver, "missing", lambda: None)
+    monkeypatch.setattr(driver, "describe", lambda: {"available": True, "reason": None})
+    monkeypatch.setattr(self_check, "check_in_subprocess", lambda device: verdict)
+    code, report = invoke()
+    assert (code, report["gpu"]["agrees"]) == (status, agrees)
+    assert verdict.reason in report["gpu"]["check"]
+    text = CliRunner().invoke(cli, ["doctor"]).output
+    assert said is None or said in text

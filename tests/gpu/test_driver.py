@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,12 +23,14 @@ from fragprune_plugins.testing import scenes
 
 __all__ = ["nvrtc"]
 
-SCRIPT = """
+BEGIN = """
 import os
 import sys
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import torch
+from cuda.bindings import driver as cu
 from native.test_invariants import assert_identical, everything
 
 from fragprune_plugins.engines import create_engine
@@ -36,6 +39,16 @@ from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.cuda.driver import Driver
 from fragprune_plugins.testing import scenes
 
+asked = []
+
+
+@contextmanager
+def device(where):
+    asked.append(where)
+    yield
+
+
+torch.cuda.device = device
 torch.cuda.is_available = lambda: True
 torch.cuda.init = lambda: None
 torch.cuda.current_device = lambda: 0
@@ -43,46 +56,92 @@ torch.cuda.current_stream = lambda index: SimpleNamespace(cuda_stream=0)
 torch.cuda.get_device_capability = lambda index: (9, 0)
 torch.cuda.is_current_stream_capturing = lambda: False
 Driver.kind = "cpu"
-self_check.doubt = lambda: None
-assert create_engine("auto", "cuda").name == "cuda"
 
 expected = torch.load(sys.argv[1])
 inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
+"""
+
+BOTH_KINDS_OF_CODE = """
+self_check.why_not = lambda device: None
+assert create_engine("auto", "cuda").name == "cuda"
 assert_identical(expected, everything(CudaEngine(deterministic=True), inputs, thresholds))
 os.environ["FAKE_REFUSES"] = "machine code"
 assert_identical(expected, everything(CudaEngine(deterministic=True), inputs, thresholds))
 """
 
+ANOTHER_GPU = """
+class Second(Driver):  # tensors are the CPU's, whichever GPU draws them
+    def launch(self, where, *kernel):
+        super().launch(torch.device("cuda", 1), *kernel)
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs dlopen and ELF")
-def test_the_driver_is_asked_for_what_the_emulation_does(
-    device: EmulatedDevice, nvrtc: kernels.Nvrtc, kept: Path, tmp_path: Path
-) -> None:
-    here, builds = Path(__file__).parent, tmp_path / "builds"
+
+def current():
+    status, context = cu.cuCtxGetCurrent()
+    return int(context)
+
+
+cu.cuInit(0)
+torchs = cu.cuDevicePrimaryCtxRetain(0)[1]
+cu.cuCtxSetCurrent(torchs)
+assert_identical(expected, everything(CudaEngine(Second(), deterministic=True), inputs, thresholds))
+assert current() == int(torchs) != int(cu.cuDevicePrimaryCtxRetain(1)[1])
+assert cu.cuCtxPopCurrent()[0] == 0
+assert int(cu.cuCtxPopCurrent()[0]) != 0  # and nothing else was left on the stack
+asked.clear()
+Driver().capturing(torch.device("cuda", 1))
+assert asked == [torch.device("cuda", 1)]
+"""
+
+
+@pytest.fixture(scope="module")
+def script(
+    device: EmulatedDevice, nvrtc: kernels.Nvrtc, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], str]:
+    """Runs a script where libcuda is the stand-in; what it says."""
+    if not sys.platform.startswith("linux"):
+        pytest.skip("needs dlopen and ELF")
+    here, folder = Path(__file__).parent, tmp_path_factory.mktemp("driver")
+    builds = folder / "builds"
     builds.mkdir()
     alone = EmulatedDevice(device.compiler, builds)
     engine = CudaEngine(alone, deterministic=True)
     inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
-    torch.save(everything(engine, inputs, thresholds), tmp_path / "expected")
-    # Compiled here, found there: NVRTC itself looks for a driver, and must not meet this one.
-    for source, macros in alone.opened:
-        for target in ("sm_90", "compute_90"):
-            kernels.image_of(source, dict(macros), target, nvrtc)
-    fake = tmp_path / "libcuda.so.1"
+    torch.save(everything(engine, inputs, thresholds), folder / "expected")
+    fake = folder / "libcuda.so.1"
     command = [device.compiler, "-std=c++17", "-fPIC", "-shared", "-o", str(fake)]
     subprocess.run([*command, str(here / "fake_driver.cpp"), "-ldl"], check=True)
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(tmp_path / "expected")],
-        capture_output=True,
-        text=True,
-        env={
-            **os.environ,
-            "PYTHONPATH": str(here.parent),
-            "LD_LIBRARY_PATH": str(tmp_path),
-            "FAKE_KERNELS": str(builds),
-            kernels.ENVIRONMENT: "nvrtc",
-        },
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert "fp_blend from machine code" in done.stderr
-    assert "fp_chain from PTX" in done.stderr
+    environment = {
+        "PYTHONPATH": str(here.parent),
+        "LD_LIBRARY_PATH": str(folder),
+        "FAKE_KERNELS": str(builds),
+        kernels.ENVIRONMENT: "nvrtc",
+        kernels.CACHE: str(folder / "kept"),
+    }
+    # Compiled here, found there: NVRTC itself looks for a driver, and must not meet this one.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(kernels.CACHE, environment[kernels.CACHE])
+        for source, macros in alone.opened:
+            for target in ("sm_90", "compute_90"):
+                kernels.image_of(source, dict(macros), target, nvrtc)
+
+    def run(code: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", BEGIN + code, str(folder / "expected")],
+            capture_output=True,
+            text=True,
+            env={**os.environ, **environment},
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        return done.stderr
+
+    return run
+
+
+def test_the_driver_is_asked_for_what_the_emulation_does(script: Callable[[str], str]) -> None:
+    said = script(BOTH_KINDS_OF_CODE)
+    assert "fp_blend from machine code" in said
+    assert "fp_chain from PTX" in said
+
+
+def test_drawing_on_another_gpu_leaves_the_current_one(script: Callable[[str], str]) -> None:
+    script(ANOTHER_GPU)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 import time
 from pathlib import Path
 
+import filelock
 import pytest
 
 from fragprune_plugins.engines.cuda import kernels
@@ -69,6 +71,22 @@ def test_those_who_want_the_same_wait_for_the_first(kept: Path) -> None:
         thread.join()
     assert slow.count == 1
     assert sorted(had for _, had in found) == [False, True, True, True, True]
+
+
+@pytest.mark.parametrize(
+    "refusal", [NotImplementedError("no flock"), OSError(errno.ENOLCK, "no locks")], ids=type
+)
+def test_where_files_cannot_be_locked_they_are_kept_all_the_same(
+    kept: Path, monkeypatch: pytest.MonkeyPatch, refusal: Exception
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise refusal
+
+    monkeypatch.setattr(filelock.FileLock, "acquire", refuse)
+    slow = Slow()
+    first, had = kernels.image_of("blend", {}, "sm_90", slow)
+    assert not had
+    assert kernels.image_of("blend", {}, "sm_90", slow) == (first, True)
 
 
 def test_without_a_folder_nothing_is_kept(tmp_path: Path, monkeypatch) -> None:

@@ -1,18 +1,20 @@
 """Runs kernels on a GPU: the only place that calls CUDA's driver.
 
-Streams and contexts are torch's: kernels go to torch's current stream of the tensors' device.
+Streams and contexts are torch's: kernels go to torch's current stream of the tensors' device, which
+need not be torch's current device, and does not become it.
 """
 
 from __future__ import annotations
 
 import ctypes
 import threading
+from pathlib import Path
 from typing import Any, Final
 
 import torch
 
 from fragprune_plugins.engines.cuda import kernels
-from fragprune_plugins.errors import EngineError
+from fragprune_plugins.errors import EngineError, KernelError
 
 THREADS: Final = 256
 """Of every block of every kernel (native/cuda/frame.h)."""
@@ -27,6 +29,28 @@ def missing() -> str | None:
     if not torch.cuda.is_available():
         return "torch sees no CUDA device"
     return None
+
+
+def remedy() -> str:
+    """What to do when something is missing."""
+    cuda = torch.version.cuda
+    if cuda is None:
+        return "Install torch for CUDA."
+    return (
+        f"Install fragprune-plugins[cuda{cuda.split('.')[0]}], for torch is for CUDA {cuda}; "
+        "see fragprune doctor."
+    )
+
+
+def version() -> str:
+    """The driver's: the newest CUDA that it knows, and on Linux its own."""
+    from cuda.bindings import driver
+
+    _, newest = driver.cuDriverGetVersion()
+    try:
+        return f"{newest}; {Path('/proc/driver/nvidia/version').read_text()}"
+    except OSError:
+        return str(newest)
 
 
 class Driver:
@@ -45,8 +69,7 @@ class Driver:
                 "engine 'cuda'",
                 why,
                 "a CUDA device, and NVRTC (through cuda-bindings) or nvcc",
-                "Install fragprune-plugins[cuda12] or [cuda13], as your torch has it "
-                "(torch.version.cuda), or use the engine 'reference'.",
+                f"{remedy()} Or use the engine 'reference'.",
             )
         from cuda.bindings import driver
 
@@ -68,32 +91,37 @@ class Driver:
         """Run a kernel on the current stream of a device; see ``engines.frames.Device``.
 
         Raises:
-            EngineError: it does not compile, load or start.
+            KernelError: it does not compile or load.
+            EngineError: it does not start, or one before it failed.
         """
         index = torch.cuda.current_device() if where.index is None else where.index
-        self._enter(index)
-        function = self._function(index, source, macros, kernel)
-        stream = torch.cuda.current_stream(index).cuda_stream
-        parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
-        self._call(
-            "cuLaunchKernel",
-            *(function, blocks, 1, 1, THREADS, 1, 1, 0, stream),
-            *(ctypes.addressof(parameters), 0),
-        )
+        self._call("cuCtxPushCurrent", self._context(index))
+        try:
+            function = self._function(index, source, macros, kernel)
+            stream = torch.cuda.current_stream(index).cuda_stream
+            parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
+            self._call(
+                "cuLaunchKernel",
+                *(function, blocks, 1, 1, THREADS, 1, 1, 0, stream),
+                *(ctypes.addressof(parameters), 0),
+            )
+        finally:
+            self._call("cuCtxPopCurrent")
 
-    def capturing(self) -> bool:
-        """Whether the current stream records a graph."""
-        return bool(torch.cuda.is_current_stream_capturing())
+    def capturing(self, where: torch.device) -> bool:
+        """Whether the device's current stream records a graph."""
+        with torch.cuda.device(where):
+            return bool(torch.cuda.is_current_stream_capturing())
 
-    def _enter(self, index: int) -> None:
-        """Makes torch's context current in this thread, which may never have met it."""
+    def _context(self, index: int) -> Any:
+        """Torch's own, which this thread may never have met."""
         with self._lock:
             if index not in self._contexts:
                 torch.cuda.init()  # type: ignore[no-untyped-call]
                 self._call("cuInit", 0)
                 device = self._call("cuDeviceGet", index)
                 self._contexts[index] = self._call("cuDevicePrimaryCtxRetain", device)
-        self._call("cuCtxSetCurrent", self._contexts[index])
+            return self._contexts[index]
 
     def _function(self, index: int, source: str, macros: dict[str, int], kernel: str) -> Any:
         module_key = (index, source, *sorted(macros.items()))
@@ -127,7 +155,7 @@ class Driver:
             why = "; ".join(failures)
         except kernels.Unavailable as error:
             why = str(error)
-        raise EngineError(
+        raise KernelError(
             f"kernels of {source}.cu",
             why,
             f"code for compute capability {major}.{minor}",

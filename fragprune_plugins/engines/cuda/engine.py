@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from fragprune_plugins.engines.cuda.frame import Device, Drawing, KernelBlade, Wanted, learnable
+from fragprune_plugins.engines.cuda.frame import (
+    Device,
+    Drawing,
+    Drawn,
+    KernelBlade,
+    Wanted,
+    learnable,
+    refuse,
+)
 from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterOutputs
@@ -38,20 +46,13 @@ class _Rasterize(torch.autograd.Function):
         wanted = frozenset(
             n for n, needs in zip(names, ctx.needs_input_grad[3:], strict=True) if needs
         )
-        engine.draw(drawing, wanted)
-        ctx.mark_non_differentiable(drawing.radii)
+        drawn = engine.draw(drawing, wanted)
+        ctx.mark_non_differentiable(*(each for each in drawn[5:] if each is not None))
         ctx.set_materialize_grads(False)
         ctx.drawing, ctx.names, ctx.wanted = drawing, names, wanted
         # Saved for the sake of autograd's check against changes in place: the drawing reads these.
         ctx.save_for_backward(*tensors)
-        return (
-            drawing.image,
-            drawing.invdepth,
-            drawing.alpha,
-            drawing.features,
-            drawing.fragments_per_pixel,
-            drawing.radii,
-        )
+        return drawn
 
     @staticmethod
     @once_differentiable
@@ -98,7 +99,7 @@ class CudaEngine:
         self._device = device
         self._deterministic, self._packed = deterministic, packed
         self._capacity = _FIRST_CAPACITY
-        self._captured: list[tuple[Drawing, int]] = []
+        self._shortages: dict[torch.device, Tensor] = {}
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
@@ -113,22 +114,12 @@ class CudaEngine:
             **learnable(inputs),
             **({} if thresholds is None else {"thresholds": thresholds}),
         }
-        image, invdepth, alpha, features, per_pixel, radii = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        drawn = _Rasterize.apply(  # type: ignore[no-untyped-call]
             self, drawing, tuple(tensors), *tensors.values()
         )
         return RasterOutputs(
-            image=image,
-            radii=radii,
-            invdepth=invdepth,
-            alpha=alpha,
-            fragments_per_pixel=per_pixel,
             evaluated_per_pixel=drawing.evaluated / (inputs.view.width * inputs.view.height),
-            fragments=drawing.fragments,
-            fragments_per_gaussian=drawing.fragments_per_gaussian,
-            features=features,
-            weights_per_gaussian=drawing.weights_per_gaussian,
-            wins_per_gaussian=drawing.wins_per_gaussian,
-            winners=drawing.winners,
+            **Drawn(*drawn)._asdict(),
         )
 
     def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
@@ -150,32 +141,54 @@ class CudaEngine:
             )
         return where
 
-    def draw(self, drawing: Drawing, wanted: Wanted) -> None:
-        """The forward pass, again with more room when the lists did not fit."""
+    def draw(self, drawing: Drawing, wanted: Wanted) -> Drawn:
+        """The forward pass, again with more room when the lists did not fit.
+
+        Captured into a graph, a note of what its replays are short of goes with it. The graph owns
+        the frame's memory: of one that is replaced, nothing remains here.
+        """
         deterministic = self._deterministic
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
         how = {"deterministic": deterministic, "packed": self._packed}
-        entries = drawing.draw(self._capacity, wanted, **how)
-        if self._device.capturing():
-            self._captured.append((drawing, self._capacity))
-        elif entries > self._capacity:
+        worst = self._shortages.get(drawing.where)
+        if self._device.capturing(drawing.where):
+            if worst is None:
+                raise EngineError(
+                    "engine 'cuda'",
+                    "a graph that is captured before any frame",
+                    "kernels that have been loaded",
+                    "Draw the scene once before capturing.",
+                )
+            drawn = drawing.draw(self._capacity, wanted, **how)
+            torch.maximum(worst, drawing.shortage(self._capacity), out=worst)
+            return drawn
+        if worst is None:
+            nothing = torch.zeros(2, dtype=torch.float64, device=drawing.where)
+            self._shortages[drawing.where] = nothing
+        drawn = drawing.draw(self._capacity, wanted, **how)
+        if (entries := drawing.read()) > self._capacity:
             self._capacity = entries + entries // 4
-            drawing.draw(self._capacity, wanted, **how)
+            drawn = drawing.draw(self._capacity, wanted, **how)
+            drawing.read()
+        return drawn
 
     def check(self) -> None:
         """Look at the frames captured into graphs, after a replay; waits for the GPU.
 
         Raises:
-            EngineError: the last replay of one found no room for its lists: its picture is void.
+            EngineError: since the last look a replay was short of room for its lists, or its sample
+                offsets were too large: its picture is void.
         """
-        for drawing, capacity in self._captured:
-            entries = drawing.read()
-            if entries > capacity:
-                self._capacity = max(self._capacity, entries + entries // 4)
+        for worst in self._shortages.values():
+            entries, spread = worst.tolist()
+            worst.zero_()
+            refuse(int(entries), spread)
+            if entries:
+                self._capacity = max(self._capacity, int(entries * 1.25))
                 raise EngineError(
                     "engine 'cuda'",
-                    f"{entries} entries in a captured frame's lists",
-                    f"at most {capacity}, what there was room for",
+                    f"{int(entries)} entries in a captured frame's lists",
+                    "no more than there was room for",
                     "Capture the graph again: there is more room now.",
                 )

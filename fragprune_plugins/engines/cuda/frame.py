@@ -9,7 +9,8 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import torch
 
@@ -21,6 +22,8 @@ from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import Splats
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from torch import Tensor
 
     from fragprune_plugins.types import RasterInputs
@@ -193,19 +196,25 @@ class Device(Protocol):
         Asynchronous, on the current stream; ``arguments`` is copied before this returns.
         """
 
-    def capturing(self) -> bool:
-        """Whether the current stream records a graph, so that nothing can be read back."""
+    def capturing(self, where: torch.device) -> bool:
+        """Whether a device's current stream records a graph, so that nothing can be read back."""
 
 
-class _Arena:
-    """Named arrays in one tensor, each at a multiple of 256 bytes."""
+class Arena:
+    """Named arrays in one tensor, each at a multiple of 256 bytes.
 
-    def __init__(self, where: torch.device, **sizes: int) -> None:
+    Args:
+        where: the device.
+        fill: torch.empty or torch.zeros.
+        sizes: bytes, by name.
+    """
+
+    def __init__(self, where: torch.device, fill: Callable[..., Tensor], **sizes: int) -> None:
         places, total = {}, 0
         for name, size in sizes.items():
             places[name] = total
             total += -(-size // 256) * 256
-        self.memory = torch.empty(total + 255, dtype=torch.uint8, device=where)
+        self.memory = fill(total + 255, dtype=torch.uint8, device=where)
         first = -self.memory.data_ptr() % 256
         self._at = {name: first + place for name, place in places.items()}
 
@@ -221,6 +230,41 @@ def _blocks(count: int, per_block: int = THREADS) -> int:
     return -(-count // per_block)
 
 
+def launch(
+    device: Device,
+    where: torch.device,
+    source: str,
+    macros: dict[str, int],
+    kernel: str,
+    blocks: int,
+    arguments: ctypes.Structure,
+) -> None:
+    """Run a kernel, if there is work for it."""
+    if blocks:
+        device.launch(where, source, {**MACROS, **macros}, kernel, blocks, arguments)
+
+
+def launch_sort(
+    device: Device,
+    where: torch.device,
+    macros: dict[str, int],
+    arguments: Sort,
+    keys: list[int],
+    values: list[int],
+    passes: int,
+) -> None:
+    """Sort by 8 bits a pass, to and fro between two pairs of arrays."""
+    blocks = _blocks(arguments.capacity, SORT_KEYS)
+    for k in range(passes):
+        arguments.keys, arguments.sorted_keys = keys[k % 2], keys[1 - k % 2]
+        arguments.values, arguments.sorted_values = values[k % 2], values[1 - k % 2]
+        launch(device, where, "scene", macros, "fp_sort", blocks, arguments)
+        arguments.shift += 8
+        arguments.histogram += 4 * DIGITS
+        arguments.words += 4 * DIGITS * blocks
+        arguments.ticket += 4
+
+
 def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
     """The tensors of a rasterization that gradients can be wanted of, but for thresholds."""
     splats = inputs.splats
@@ -234,63 +278,85 @@ def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in tensors.items() if tensor is not None}
 
 
-class Drawing:
-    """One rasterization: a forward pass, what it leaves behind, a backward pass.
+def refuse(entries: int, spread: float) -> None:
+    """Raise EngineError when the kernels cannot draw so many entries, or offsets so far."""
+    if entries > ENTRIES_MAX:
+        raise EngineError(
+            "engine 'cuda'",
+            f"{entries} entries in the tiles' lists",
+            f"at most {ENTRIES_MAX}",
+            "Draw fewer Gaussians or a smaller image.",
+        )
+    if not spread <= OFFSET_MAX:
+        raise EngineError(
+            "engine 'cuda'",
+            f"sample_offsets up to {spread}",
+            f"at most {OFFSET_MAX:g} pixels",
+            "Check the offsets.",
+        )
 
-    Attributes:
-        image: and the other outputs, as in ``RasterOutputs``.
-        evaluated: lanes spent on (Gaussian, pixel) pairs; NaN until it is read.
-    """
+
+class Drawn(NamedTuple):
+    """The outputs of a forward pass, as in ``RasterOutputs``; the first five are differentiable."""
 
     image: Tensor
     invdepth: Tensor
     alpha: Tensor
-    radii: Tensor
+    features: Tensor | None
     fragments_per_pixel: Tensor
-    evaluated: float
-    features: Tensor | None = None
-    fragments: Tensor | None = None
-    fragments_per_gaussian: Tensor | None = None
-    weights_per_gaussian: Tensor | None = None
-    wins_per_gaussian: Tensor | None = None
-    winners: Tensor | None = None
+    radii: Tensor
+    fragments: Tensor | None
+    fragments_per_gaussian: Tensor | None
+    weights_per_gaussian: Tensor | None
+    wins_per_gaussian: Tensor | None
+    winners: Tensor | None
+
+
+class Drawing:
+    """One rasterization: a forward pass, what backward needs of it, a backward pass.
+
+    It does not hold its own outputs. Autograd's graph, which the outputs hold, holds the drawing:
+    a way back from there would be a cycle through C++, which no collector finds.
+
+    Attributes:
+        where: the device that it runs on.
+        evaluated: lanes spent on (Gaussian, pixel) pairs; NaN until it is read.
+    """
+
+    evaluated: float = math.nan
 
     def __init__(self, device: Device, inputs: RasterInputs, thresholds: Tensor | None) -> None:
         self._device, self._inputs, self._n = device, inputs, len(inputs.splats)
-        self._where = inputs.splats.device
+        self.where = inputs.splats.device
         view = inputs.view
-        self._arrays = native_arrays(inputs, thresholds, self._where)
+        self._arrays = native_arrays(inputs, thresholds, self.where)
         offsets = self._arrays.get("sample_offsets")
         self._spread = None if offsets is None else offsets.abs().amax()
         self._across, self._down = -(-view.width // TILE), -(-view.height // TILE)
         self._channels = 0 if inputs.splats.features is None else inputs.splats.features.shape[1]
+        self._frame: Frame | None = None
 
     # ---- forward -------------------------------------------------------------------------------
 
-    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool, packed: bool) -> int:
-        """Run the forward pass; void when it returns more than the capacity.
+    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool, packed: bool) -> Drawn:
+        """Launch the forward pass; void when there are more entries than the capacity.
 
         Args:
             capacity: entries of all tiles' lists that there shall be room for.
             wanted: gradients that will be wanted.
             deterministic: give each entry a slot, for backward to add up in order.
             packed: keep less of each Gaussian, where no gradients are wanted.
-
-        Returns:
-            How many entries there are.
-
-        Raises:
-            EngineError: more entries than can be counted.
         """
-        inputs, n, where = self._inputs, self._n, self._where
+        inputs, n, where = self._inputs, self._n, self.where
         height, width = inputs.view.height, inputs.view.width
         tiles, pixels = self._across * self._down, width * height
         passes = max(1, _blocks((tiles - 1).bit_length(), 8))
         keep, slots = bool(wanted), bool(wanted) and deterministic
         packed = packed and not keep
         scene = {"FP_PACKED": int(packed)}
-        cleared = _Arena(
+        cleared = Arena(
             where,
+            torch.zeros,
             counters=COUNTERS,
             project_words=8 * _blocks(n),
             emit_words=8 * _blocks(n),
@@ -300,15 +366,16 @@ class Drawing:
             tile_sort=4 * passes * DIGITS * _blocks(capacity, SORT_KEYS),
             ranges=8 * tiles,
         )
-        cleared.memory.zero_()
-        scratch = _Arena(
+        scratch = Arena(
             where,
+            torch.empty,
             rects=8 * n,
             **dict.fromkeys(("depth_keys", "depth_ids", "keys_2", "ids_2"), 4 * n),
             **dict.fromkeys(("entry_keys", "entry_keys_2", "entry_values_2"), 4 * capacity),
         )
-        kept = _Arena(
+        kept = Arena(
             where,
+            torch.empty,
             brushes=4 * (PACKED_BRUSH if packed else BRUSH) * n,
             tiles=4 * n,
             first_slot=4 * n * slots,
@@ -318,6 +385,7 @@ class Drawing:
             transmittance=4 * pixels * keep,
             stop=4 * pixels * keep,
         )
+        outputs = self._new_outputs()
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
         # The last pass of sorting entries shall end in `kept`.
         keys = [scratch["entry_keys"], scratch["entry_keys_2"]]
@@ -326,7 +394,7 @@ class Drawing:
             values.reverse()
         frame = Frame(
             inputs=native_inputs(inputs, self._arrays, widen="thresholds" in wanted),
-            outputs=self._new_outputs(),
+            outputs=binding.Outputs(**{name: address(each) for name, each in outputs.items()}),
             spread=address(self._spread),
             capacity=capacity,
             tiles_x=self._across,
@@ -369,10 +437,11 @@ class Drawing:
         )
         self._launch("scene", scene, "fp_project", _blocks(n), frame)
         ids = [scratch["depth_ids"], scratch["ids_2"]]
-        self._sort(scene, by_depth, [scratch["depth_keys"], scratch["keys_2"]], ids, PASSES)
+        depths = [scratch["depth_keys"], scratch["keys_2"]]
+        launch_sort(self._device, self.where, scene, by_depth, depths, ids, PASSES)
         self._launch("scene", scene, "fp_emit", _blocks(n), frame)
         if n:
-            self._sort(scene, by_tile, keys, values, passes)
+            launch_sort(self._device, self.where, scene, by_tile, keys, values, passes)
             frame.entry_keys, frame.entry_values = keys[passes % 2], values[passes % 2]
             self._launch("scene", scene, "fp_ranges", _blocks(capacity), frame)
         macros = blend_macros(
@@ -380,81 +449,51 @@ class Drawing:
         )
         self._launch("blend", macros, "fp_blend", tiles, frame)
         found = cleared.tensor("counters", 4, torch.int64)
-        self.fragments_per_pixel = (found[2].double() / pixels).float()
-        if weights is not None:
-            self.weights_per_gaussian = (weights.double() * 2.0**-32).float()
-        self._frame = frame if keep else None
+        if keep:
+            frame.outputs = binding.Outputs()  # backward does without
+            self._frame = frame
         self._memory = (cleared, kept)
         self._found = found
-        if self._device.capturing():
-            self.evaluated = math.nan
-            return 0
-        return self.read()
+        return Drawn(
+            fragments_per_pixel=(found[2].double() / pixels).float(),
+            weights_per_gaussian=None if weights is None else (weights.double() * 2.0**-32).float(),
+            **outputs,
+        )
 
     def read(self) -> int:
-        """Waits for the GPU; entries of the lists.
+        """Wait for the GPU; how many entries there are.
 
         Raises:
             EngineError: what the kernels could not draw.
         """
         _, entries, _, self.evaluated = map(int, self._found.tolist())
-        if entries > ENTRIES_MAX:
-            raise EngineError(
-                "engine 'cuda'",
-                f"{entries} entries in the tiles' lists",
-                f"at most {ENTRIES_MAX}",
-                "Draw fewer Gaussians or a smaller image.",
-            )
-        if self._spread is not None and not float(self._spread) <= OFFSET_MAX:
-            raise EngineError(
-                "engine 'cuda'",
-                f"sample_offsets up to {float(self._spread)}",
-                f"at most {OFFSET_MAX:g} pixels",
-                "Check the offsets.",
-            )
+        refuse(entries, 0.0 if self._spread is None else float(self._spread))
         return entries
 
-    def _new_outputs(self) -> binding.Outputs:
-        """Makes the output tensors; their addresses."""
+    def shortage(self, capacity: int) -> Tensor:
+        """(2,) float64 on the device: entries when they found no room, else 0; what they spread."""
+        entries = self._found[1]
+        spread = torch.zeros_like(entries) if self._spread is None else self._spread
+        return torch.stack([entries.where(entries > capacity, 0).double(), spread.double()])
+
+    def _new_outputs(self) -> dict[str, Any]:
+        """What the kernels fill in, by its name in ``Drawn``; None for what nobody wants."""
         inputs, n = self._inputs, self._n
         size = (inputs.view.height, inputs.view.width)
-
-        def new(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.empty(shape, dtype=dtype, device=self._where)
-
-        def zeros() -> Tensor:
-            return torch.zeros(n, dtype=torch.int32, device=self._where)
-
-        self.image, self.invdepth, self.alpha = new(3, *size), new(1, *size), new(1, *size)
-        self.radii = new(n, dtype=torch.int32)
-        if self._channels:
-            self.features = new(self._channels, *size)
-        if inputs.counts:
-            self.fragments, self.fragments_per_gaussian = new(*size, dtype=torch.int32), zeros()
-        if inputs.scores:
-            self.winners, self.wins_per_gaussian = new(*size, dtype=torch.int32), zeros()
-        names = "image invdepth alpha radii features fragments fragments_per_gaussian"
-        names += " wins_per_gaussian winners"
-        return binding.Outputs(**{name: address(getattr(self, name)) for name in names.split()})
-
-    def _sort(
-        self,
-        scene: dict[str, int],
-        arguments: Sort,
-        keys: list[int],
-        values: list[int],
-        passes: int,
-    ) -> None:
-        """Sorts by 8 bits a pass, to and fro between two pairs of arrays."""
-        blocks = _blocks(arguments.capacity, SORT_KEYS)
-        for k in range(passes):
-            arguments.keys, arguments.sorted_keys = keys[k % 2], keys[1 - k % 2]
-            arguments.values, arguments.sorted_values = values[k % 2], values[1 - k % 2]
-            self._launch("scene", scene, "fp_sort", blocks, arguments)
-            arguments.shift += 8
-            arguments.histogram += 4 * DIGITS
-            arguments.words += 4 * DIGITS * blocks
-            arguments.ticket += 4
+        new = partial(torch.empty, device=self.where)
+        zeros = partial(torch.zeros, device=self.where, dtype=torch.int32)
+        counts, scores = inputs.counts, inputs.scores
+        return {
+            "image": new(3, *size),
+            "invdepth": new(1, *size),
+            "alpha": new(1, *size),
+            "radii": new(n, dtype=torch.int32),
+            "features": new(self._channels, *size) if self._channels else None,
+            "fragments": new(*size, dtype=torch.int32) if counts else None,
+            "fragments_per_gaussian": zeros(n) if counts else None,
+            "wins_per_gaussian": zeros(n) if scores else None,
+            "winners": new(*size, dtype=torch.int32) if scores else None,
+        }
 
     def _launch(
         self,
@@ -464,10 +503,7 @@ class Drawing:
         blocks: int,
         arguments: ctypes.Structure,
     ) -> None:
-        if blocks:
-            self._device.launch(
-                self._where, source, {**MACROS, **macros}, kernel, blocks, arguments
-            )
+        launch(self._device, self.where, source, macros, kernel, blocks, arguments)
 
     # ---- backward ------------------------------------------------------------------------------
 
@@ -482,7 +518,7 @@ class Drawing:
     ) -> dict[str, Tensor]:
         """Run the backward pass for gradients by the outputs; gradients by the inputs, by name."""
         assert self._frame is not None
-        inputs, frame, n, where = self._inputs, self._frame, self._n, self._where
+        inputs, frame, n, where = self._inputs, self._frame, self._n, self.where
         upstream = {
             "image": by_image,
             "invdepth": by_invdepth,
@@ -552,5 +588,5 @@ class KernelBlade:
         self._launch("fp_unslice", Slicing(given=given, sliced=by, to=to))
 
     def _launch(self, kernel: str, arguments: Slicing) -> None:
-        if blocks := _blocks(arguments.given.count):
-            self.device.launch(self.where, "slice", MACROS, kernel, blocks, arguments)
+        blocks = _blocks(arguments.given.count)
+        launch(self.device, self.where, "slice", {}, kernel, blocks, arguments)

@@ -12,7 +12,8 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -314,19 +315,30 @@ def image_of(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return by.compile(source, macros, target), False
+    path = folder / f"{_name_of(by, source, macros, target)}.bin"
+    with _one_at_a_time(path):
+        kept = _read(path)
+        if kept is not None:
+            return kept, True
+        image = by.compile(source, macros, target)
+        with suppress(OSError):  # read-only, or full
+            _write(path, image)
+        return image, False
+
+
+@contextmanager
+def _one_at_a_time(path: Path) -> Iterator[None]:
+    """Waits for those who write the file, where files can be locked.
+
+    Elsewhere two may write the same, one after the other; neither reads a part of it.
+    """
     from filelock import FileLock, Timeout
 
-    path = folder / f"{_name_of(by, source, macros, target)}.bin"
-    try:
-        with FileLock(f"{path}.lock", timeout=300):
-            kept = _read(path)
-            if kept is not None:
-                return kept, True
-            image = by.compile(source, macros, target)
-            _write(path, image)
-            return image, False
-    except (OSError, Timeout):  # read-only, or held by a process that hangs
-        return by.compile(source, macros, target), False
+    with ExitStack() as held:
+        # read-only; held by a process that hangs; file systems without locks
+        with suppress(OSError, Timeout, NotImplementedError):
+            held.enter_context(FileLock(f"{path}.lock", timeout=300))
+        yield
 
 
 def _read(path: Path) -> Image | None:

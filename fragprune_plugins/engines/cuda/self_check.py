@@ -1,113 +1,150 @@
-"""Whether the cuda engine may be trusted on this machine: once, it is held against the oracle.
+"""Whether the cuda engine may be trusted on a GPU: there, it is compared with what needs none.
 
 In a process of its own: a kernel that reads where it must not takes its process's GPU with it, and
-one that waits forever does not return. What held is remembered beside the compiled kernels.
+one that waits forever does not return. What was found is remembered beside the compiled kernels.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import subprocess
 import sys
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Final, Literal
 
 import torch
 
-from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.cuda import kernels
-from fragprune_plugins.testing import scenes
-from fragprune_plugins.types import Moment, SpacetimeSplats
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from fragprune_plugins.engines.cuda import driver, kernels
+from fragprune_plugins.engines.cuda.comparison import compare
+from fragprune_plugins.errors import KernelError
 
 log = logging.getLogger("fragprune")
 
 PATIENCE: Final = 300
-"""Seconds for compiling and a few small frames."""
+"""Seconds that a check may take; mostly for compiling, once."""
 
-_DISAGREES: Final = 3  # exit code
+_BEGUN: Final = "begun"
+"""Said once there is a context and memory: what goes wrong later is the kernels' doing."""
+
+_FAILS, _COULD_NOT_RUN = 3, 4  # exit codes
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a check found.
+
+    Attributes:
+        outcome: "fails" when the engine draws something else, crashes or never returns; "could not
+            run" when the GPU had no room, no time or no kernels for the check.
+        reason: for people.
+    """
+
+    outcome: Literal["agrees", "fails", "could not run"]
+    reason: str = ""
+
+    def __str__(self) -> str:
+        if self.outcome == "fails":
+            return f"the cuda engine fails on this GPU: {self.reason}"
+        if self.outcome == "could not run":
+            return f"the cuda engine could not be checked on this GPU: {self.reason}"
+        return "the cuda engine draws what it should on this GPU"
+
+    @property
+    def remedy(self) -> str:
+        """The next thing to do."""
+        if self.outcome == "fails":
+            return "Please report it, with fragprune doctor --json."
+        return (
+            "Free some of the GPU's memory; where its compute mode is exclusive, run fragprune "
+            "doctor once while nothing else uses it. --engine cuda goes without the check."
+        )
+
+
+def why_not(device: torch.device | str) -> Verdict | None:
+    """Why not to draw with the cuda engine on a GPU; None when it has proved itself there."""
+    verdict = _remembered(device) or _checked(str(device))
+    return None if verdict.outcome == "agrees" else verdict
 
 
 @cache
-def doubt() -> str | None:
-    """Why not to draw with the cuda engine here; None when it has proved itself, now or before."""
-    marker = kernels.cache_folder() / f"proof-{_circumstances()}"
-    if marker.exists():
-        return None
-    log.info("holding the cuda engine against the reference engine, once on this machine")
-    why = attempt()
-    if why is not None:
-        log.warning("not drawing with the cuda engine: %s; see fragprune doctor", why)
-        return why
-    try:
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.touch()
-    except OSError:  # read-only: the next process proves it again
-        log.debug("cannot remember it in %s", marker.parent)
-    return None
+def _checked(device: str) -> Verdict:
+    """A check, once in this process."""
+    log.info("checking the cuda engine on %s, once on this machine", device)
+    return check_in_subprocess(device)
 
 
-def attempt() -> str | None:
-    """Draw and learn in another process; why that does not prove the cuda engine, or None."""
-    command = [sys.executable, "-m", "fragprune_plugins.engines.cuda.self_check"]
+def check_in_subprocess(device: torch.device | str) -> Verdict:
+    """Compare in another process, and remember what was found; but not that nothing was."""
+    verdict = _run(device)
+    if verdict.outcome != "could not run":
+        with suppress(OSError):  # read-only: the next process checks again
+            marker = _marker(device)
+            marker.parent.mkdir(parents=True, exist_ok=True)
+            marker.write_text(json.dumps(asdict(verdict)))
+    return verdict
+
+
+def _run(device: torch.device | str) -> Verdict:
+    command = [sys.executable, "-m", "fragprune_plugins.engines.cuda.self_check", str(device)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-    except subprocess.TimeoutExpired:
-        return f"no picture within {PATIENCE} s"
+    except subprocess.TimeoutExpired as late:
+        begun = _BEGUN in str(late.stdout)
+        return Verdict("fails" if begun else "could not run", f"no end within {PATIENCE} s")
     if done.returncode == 0:
+        return Verdict("agrees")
+    if done.returncode in (_FAILS, _COULD_NOT_RUN):
+        begun, reason = done.returncode == _FAILS, done.stderr.strip().splitlines()[-1]
+    else:
+        begun, reason = _BEGUN in done.stdout, f"it ended with exit code {done.returncode}"
+    return Verdict("fails" if begun else "could not run", reason)
+
+
+def _remembered(device: torch.device | str) -> Verdict | None:
+    try:
+        return Verdict(**json.loads(_marker(device).read_text()))
+    except (OSError, ValueError, TypeError):
         return None
-    if done.returncode == _DISAGREES:
-        return "it draws something else than the reference engine"
-    said = done.stderr.strip().splitlines()
-    return said[-1] if said else f"exit code {done.returncode}"
 
 
-def agrees(device: str = "cuda") -> bool:
-    """Whether both engines draw the same pictures, and learn the same from them."""
-    pairs = zip(_drawn("cuda", device), _drawn("reference", device), strict=True)
-    # a fragment at a cut may fall to one or the other: half a per cent of the sum, not of each
-    return all(bool((a - b).abs().sum() <= 5e-3 * b.abs().sum() + 1e-6) for a, b in pairs)
+def _marker(device: torch.device | str) -> Path:
+    return kernels.cache_folder() / f"self-check-{_circumstances(str(device))}.json"
 
 
-def _drawn(name: str, device: str) -> list[Tensor]:
-    """An engine's picture, slice and gradients."""
-    engine: Any = create_engine(name, device)
-    made, leaves = scenes.leaves(scenes.random_scene(0, 200, 70, 50, device=device))
-    thresholds = scenes.random_thresholds(0, 200, device=device).requires_grad_()
-    image = engine.rasterize(made, thresholds).image
-    splats: Any = made.splats
-    moment = Moment(timestamp=0.4, campos=made.view.campos, sh_degree_t=0)
-    cut = engine.slice(
-        SpacetimeSplats(
-            means=splats.means,
-            opacities=splats.opacities,
-            times=torch.linspace(0, 1, 200, device=device),
-            scales=splats.scales,
-            scales_t=torch.full((200,), 0.3, device=device),
-            rotations=splats.rotations,
-            rotations_r=splats.rotations.roll(1, dims=0),
-            sh=splats.sh,
-            sh_degree=splats.sh_degree,
-        ),
-        moment,
-    )
-    drawn = [image, cut.means, cut.cov3d, cut.opacities, cut.colors]
-    torch.autograd.backward([each.square().mean() for each in drawn])
-    gradients = [leaf.grad for leaf in (*leaves.values(), thresholds) if leaf.grad is not None]
-    return [each.detach() for each in drawn] + gradients
-
-
-def _circumstances() -> str:
-    """Names everything that a proof holds for."""
+@cache
+def _circumstances(device: str) -> str:
+    """Names everything that a verdict holds for: GPUs of one kind share it."""
     compiler = kernels.compiler()
-    gpu = torch.cuda.get_device_properties(torch.cuda.current_device())
-    what = (compiler.name, compiler.version, torch.__version__, torch.version.cuda, str(gpu))
+    gpu = torch.cuda.get_device_properties(device)
+    what = (
+        *(compiler.name, compiler.version, torch.__version__, torch.version.cuda),
+        *(driver.version(), gpu.name, gpu.major, gpu.minor, gpu.multi_processor_count),
+    )
     digest = hashlib.sha256(kernels.digest_of_sources() + repr(what).encode())
     return digest.hexdigest()[:24]
 
 
+def main(device: str) -> int:
+    """The check's own process."""
+    where, begun = torch.device(device), False
+    try:
+        torch.zeros(1, device=where)
+        gpu = driver.Driver()
+        begun = True
+        print(_BEGUN, flush=True)
+        found = compare(gpu, where)
+    except Exception as why:
+        short = isinstance(why, (KernelError, MemoryError, torch.cuda.OutOfMemoryError))
+        print(f"{type(why).__name__}: {why}".splitlines()[0], file=sys.stderr)
+        return _FAILS if begun and not short else _COULD_NOT_RUN
+    print("; ".join(found), file=sys.stderr)
+    return _FAILS if found else 0
+
+
 if __name__ == "__main__":
-    sys.exit(0 if agrees() else _DISAGREES)
+    sys.exit(main(sys.argv[1]))

@@ -46,8 +46,8 @@ FP_HD inline float fma(float a, float b, float c) { return fmaf(a, b, c); }
 FP_HD inline float fnma(float a, float b, float c) { return fmaf(-a, b, c); }
 
 #ifdef FP_EMULATED
-FP_HD inline float exp2(float a) { return exp2f(a); }
-FP_HD inline float reciprocal(float a) { return 1.f / a; }
+FP_HD inline float exp2(float a) { return emulated::rounded(exp2f(a), 2); }
+FP_HD inline float reciprocal(float a) { return emulated::rounded(1.f / a, 1); }
 FP_HD inline uint16_t to_half(float a) {
   const _Float16 half = static_cast<_Float16>(a);
   uint16_t bits;

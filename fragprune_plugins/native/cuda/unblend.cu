@@ -207,11 +207,17 @@ __device__ inline void gather(const Frame& f, const Room& room, int j, float (&v
 #endif
     if constexpr (kParts > kWeightAt) {
       const Four weight = part(kWeightAt);
+      // where it draws alone: what a pixel asks for may be NaN
+      const auto tint = [&](int to, const Four& by) {
 #pragma unroll
-      for (int k = 0; k < 3 * FP_COLOUR; k++) weigh(kColourAt + k, weight, pixel(k));
-      if constexpr (FP_DEPTH) weigh(kDepthAt, weight, pixel(kInvDepthOf));
+        for (int k = 0; k < 4; k++)
+          if (weight.at[k] != 0.f) v[to] = fma(weight.at[k], by.at[k], v[to]);
+      };
 #pragma unroll
-      for (int k = 0; k < FP_FEATURES; k++) weigh(kFeaturesAt + k, weight, pixel(kFeaturesOf + k));
+      for (int k = 0; k < 3 * FP_COLOUR; k++) tint(kColourAt + k, pixel(k));
+      if constexpr (FP_DEPTH) tint(kDepthAt, pixel(kInvDepthOf));
+#pragma unroll
+      for (int k = 0; k < FP_FEATURES; k++) tint(kFeaturesAt + k, pixel(kFeaturesOf + k));
     }
   }
 #if FP_GEOMETRY && !FP_OFFSETS  // the lane's pixels lie in one row: their v is one
@@ -415,7 +421,7 @@ FP_KERNEL(fp_unblend, Undraw, kResident) {
     const int count = meet_those(room.staged, furthest - first, met);
     int next = 0;
     for (bool more = count > 0 || frame.owners; more;) {
-      int filled = 0;  // Gaussians in the bucket: met[0] and so on, which have been read by then
+      int filled = 0, its = 0;  // Gaussians in the bucket; the one that this lane will be a part of
       float* slot = room.parts[warp][0] + lane;
       while (filled < kBucket && next < count) {
         const int j = met[next++];
@@ -430,10 +436,10 @@ FP_KERNEL(fp_unblend, Undraw, kResident) {
 #pragma unroll
         for (int k = 0; k < kParts; k++) slot[32 * k] = parts[k];
         slot += Room::kPitch;
-        met[filled++] = static_cast<uint8_t>(j);
+        if (lane / kLanes == filled) its = j;
+        filled++;
       }
       __syncwarp();
-      const int its = met[lane / kLanes];
       float v[kPadded];
       if (filled > 0) {
         gather(frame, room, its, v);

@@ -1,0 +1,300 @@
+"""The cuda engine against what needs no GPU: frames of a size at which blocks of threads meet.
+
+Large frames are held against the cpu engine's, small ones and slices against the oracle's, sorting
+against torch's. Frames are repeated, and must stay the same and hold no memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.arrays import address
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.engines.cuda.frame import (
+    DIGITS,
+    PASSES,
+    SORT_KEYS,
+    THREADS,
+    Device,
+    Sort,
+    launch_sort,
+)
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.types import Moment, RasterInputs, SpacetimeSplats, Splats, View
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.engines import Engine
+
+
+@dataclass(frozen=True)
+class Workload:
+    """How much is drawn.
+
+    Attributes:
+        keys: to sort.
+        gaussians: of the large frame; tiles' lists are longer than a block's 256 threads.
+        size: of the large frame, pixels.
+        wide_gaussians: of the wide frame.
+        wide_size: of the wide frame, pixels; more tiles than two passes of sorting tell apart.
+        steps: how often the large frame is drawn and differentiated.
+    """
+
+    keys: int = 3_000_000
+    gaussians: int = 300_000
+    size: tuple[int, int] = (1237, 822)
+    wide_gaussians: int = 20_000
+    wide_size: tuple[int, int] = (4112, 4112)
+    steps: int = 50
+
+
+def compare(gpu: Device, where: torch.device, workload: Workload | None = None) -> list[str]:
+    """What the cuda engine does otherwise than it should; nothing when all is well.
+
+    Without the cpu engine, large frames are compared with themselves alone.
+
+    Args:
+        gpu: what runs the kernels.
+        where: the device that tensors are to live on.
+        workload: how much to draw.
+    """
+    workload = Workload() if workload is None else workload
+    return [
+        *_sorting(gpu, where, workload.keys),
+        *_small_frame(gpu, where),
+        *_slices(gpu, where),
+        *_large_frame(gpu, where, workload),
+        *_wide_frame(gpu, where, workload),
+    ]
+
+
+def _sorting(gpu: Device, where: torch.device, count: int) -> Iterator[str]:
+    """Of keys that are nearly all different, and of keys of few kinds: equal ones keep order."""
+    for bits in (31, 9):
+        generator = torch.Generator().manual_seed(bits)
+        keys = torch.randint((1 << bits) - 1, (count,), generator=generator, dtype=torch.int32)
+        digits = [(keys >> 8 * k & DIGITS - 1).bincount(minlength=DIGITS) for k in range(PASSES)]
+        histogram = torch.cat(digits).int().to(where)
+        words = torch.zeros(PASSES * -(-count // SORT_KEYS) * DIGITS, dtype=torch.int32)
+        words, tickets = words.to(where), torch.zeros(PASSES, dtype=torch.int32, device=where)
+        total = torch.tensor([count], device=where)
+        arguments = Sort(
+            count=address(total),
+            capacity=count,
+            histogram=address(histogram),
+            words=address(words),
+            ticket=address(tickets),
+        )
+        sorted_keys = keys.to(where, copy=True)
+        order = torch.arange(count, dtype=torch.int32, device=where)
+        others = torch.empty_like(sorted_keys), torch.empty_like(order)
+        keys_at, values_at = (
+            [one.data_ptr(), other.data_ptr()]
+            for one, other in zip((sorted_keys, order), others, strict=True)
+        )
+        launch_sort(gpu, where, {"FP_PACKED": 0}, arguments, keys_at, values_at, PASSES)
+        expected = keys.sort(stable=True)
+        wrong = (sorted_keys.cpu() != expected.values) | (order.cpu() != expected.indices)
+        if wrong.any():
+            yield f"sorting: {int(wrong.sum())} of {count} are not where torch.sort has them"
+
+
+def _small_frame(gpu: Device, where: torch.device) -> Iterator[str]:
+    inputs, thresholds = scene(200, (70, 50), 3.0)
+    wide = on(inputs, "cpu", torch.float64)
+    expected = drawn_and_learned(ReferenceEngine(), wide, thresholds)
+    found = drawn_and_learned(CudaEngine(gpu), on(inputs, where), thresholds)
+    yield from differences("small frame", found, expected)
+
+
+def _slices(gpu: Device, where: torch.device) -> Iterator[str]:
+    found = _sliced(CudaEngine(gpu), where, torch.float32)
+    for name, right in _sliced(ReferenceEngine(), torch.device("cpu"), torch.float64).items():
+        away, largest = (found[name] - right).abs().max(), right.abs().max()
+        if not away <= 1e-3 * largest:
+            yield f"slice, {name}: off by {away:.2g}, the largest is {largest:.2g}"
+
+
+def _large_frame(gpu: Device, where: torch.device, workload: Workload) -> Iterator[str]:
+    inputs, thresholds = scene(workload.gaussians, workload.size, 1.5)
+    there = on(inputs, where)
+    fast, ordered = (CudaEngine(gpu, deterministic=way) for way in (False, True))
+    in_order = drawn_and_learned(ordered, there, thresholds)
+    again = drawn_and_learned(ordered, there, thresholds)
+    for name, each in in_order.items():
+        if not torch.equal(each, again[name]):
+            yield f"large frame, deterministic: {name} is another in another run"
+    held = []
+    for _ in range(workload.steps):
+        found = drawn_and_learned(fast, there, thresholds)
+        held.append(bytes_held(where))
+        if not torch.equal(found["picture"], in_order["picture"]):
+            yield "large frame: picture is another in another run"
+            break
+    if held[-1] - held[0] > 1024 * len(held):
+        yield f"large frame: {held[-1] - held[0]} bytes more are held after {len(held)} steps"
+    if binding.available():
+        expected = drawn_and_learned(create_engine("cpu"), inputs, thresholds)
+        yield from differences("large frame, deterministic", in_order, expected)
+        yield from differences("large frame", found, expected)
+
+
+def _wide_frame(gpu: Device, where: torch.device, workload: Workload) -> Iterator[str]:
+    if not binding.available():
+        return
+    inputs, thresholds = scene(workload.wide_gaussians, workload.wide_size, 5.0)
+    with torch.no_grad():
+        found = CudaEngine(gpu).rasterize(on(inputs, where), thresholds.to(where)).image.cpu()
+        expected = create_engine("cpu").rasterize(inputs, thresholds).image
+    yield from differences("wide frame", {"picture": found}, {"picture": expected})
+
+
+def bytes_held(where: torch.device) -> int:
+    """By tensors on a GPU."""
+    return torch.cuda.memory_allocated(where)
+
+
+# ---- what counts as a difference ---------------------------------------------------------------
+
+
+def differences(what: str, found: dict[str, Tensor], expected: dict[str, Tensor]) -> Iterator[str]:
+    """Names all that is off in what was ``drawn_and_learned``.
+
+    A fragment that lies on a cut may fall to one engine and not to the other: rarely, anywhere, and
+    by any amount. So a few pixels may be off, and a few rows; but not many of those that one warp
+    draws, or that one block of threads differentiates.
+    """
+    for name, right in expected.items():
+        away = (found[name] - right).abs()
+        if name == "picture":
+            off = ~(away.amax(0) <= 4e-5)
+            filled = torch.nn.functional.pad(off, (0, -off.shape[1] % 8, 0, -off.shape[0] % 4))
+            together, most = filled.unfold(0, 4, 4).unfold(1, 8, 8).sum((2, 3)), 4
+        else:
+            size = right.reshape(len(right), -1).abs().amax(1)
+            usual = size[size > 0].median() if size.any() else size.sum()
+            off = ~(away.reshape(len(right), -1).amax(1) <= 1e-3 * size + 1e-4 * usual)
+            filled = torch.nn.functional.pad(off, (0, -len(off) % THREADS))
+            together, most = filled.reshape(-1, THREADS).sum(1), THREADS // 8
+        if off.double().mean() > 1 / 200 or together.max() > most:
+            yield (
+                f"{what}, {name}: {int(off.sum())} of {off.numel()} are off, {int(together.max())} "
+                f"of them side by side, by up to {away.max():.2g}"
+            )
+
+
+# ---- what is drawn -----------------------------------------------------------------------------
+
+
+def scene(count: int, size: tuple[int, int], extent: float) -> tuple[RasterInputs, Tensor]:
+    """Gaussians all over a picture, and thresholds (N,); the same each time, float32 on the CPU.
+
+    Of each thousand, one at least is a giant, half as wide as the picture: all threads of a warp
+    write its tiles, in several rounds where the picture has more than 32 rows of them. Some lie off
+    the picture or behind the camera.
+
+    Args:
+        count: N.
+        size: width and height, pixels.
+        extent: median of the standard deviations, pixels.
+    """
+    generator = torch.Generator().manual_seed(count)
+    width, height = size
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator) * (high - low) + low
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    index = torch.arange(count)
+    depths = uniform(1.5, 12.0, count).where(index % 50 != 49, -2.0)
+    tangents = uniform(-0.55, 0.55, count, 2) * torch.tensor([1.0, height / width])
+    pixels = extent * torch.exp(0.6 * normal(count, 3))
+    pixels[::1000] = width / 12
+    splats = Splats(
+        means=torch.cat([tangents * depths[:, None], depths[:, None]], 1),
+        opacities=uniform(0.02, 0.7, count),
+        scales=pixels * depths.abs()[:, None] / width,
+        rotations=torch.nn.functional.normalize(normal(count, 4)),
+        sh=0.2 * normal(count, 16, 3),
+        sh_degree=3,
+    )
+    view = View.pinhole(
+        torch.eye(3),
+        torch.zeros(3),
+        width=width,
+        height=height,
+        fx=width,
+        fy=width,
+        background=torch.tensor([0.1, 0.2, 0.3]),
+    )
+    return RasterInputs(view, splats), 10 ** uniform(-4.0, -0.3, count)
+
+
+def on(
+    inputs: RasterInputs, where: torch.device | str, dtype: torch.dtype = torch.float32
+) -> RasterInputs:
+    """The same inputs on a device."""
+
+    def moved(value: View | Any) -> dict[str, Any]:
+        tensors = {k: t for k, t in vars(value).items() if isinstance(t, torch.Tensor)}
+        return {name: tensor.to(where, dtype) for name, tensor in tensors.items()}
+
+    return replace(
+        inputs,
+        view=replace(inputs.view, **moved(inputs.view)),
+        splats=replace(inputs.splats, **moved(inputs.splats)),
+    )
+
+
+def drawn_and_learned(
+    engine: Engine, inputs: RasterInputs, thresholds: Tensor
+) -> dict[str, Tensor]:
+    """The picture (3, H, W), and gradients of all that training moves, by name; on the CPU."""
+    given = {name: getattr(inputs.splats, name) for name in _LEARNED}
+    given |= {"thresholds": thresholds, "background": inputs.view.background}
+    given["hook"] = given["means"].new_zeros(len(thresholds), 3)
+    like = given["means"]
+    leaves = {k: t.detach().to(like, copy=True).requires_grad_() for k, t in given.items()}
+    made = replace(
+        inputs,
+        view=replace(inputs.view, background=leaves["background"]),
+        splats=replace(inputs.splats, **{name: leaves[name] for name in _LEARNED}),
+        means2d_hook=leaves["hook"],
+    )
+    out = engine.rasterize(made, leaves["thresholds"])
+    asked = torch.rand(out.image.shape, generator=torch.Generator().manual_seed(0)) - 0.3
+    pressure = torch.tensor(1e3).to(out.fragments_per_pixel)
+    torch.autograd.backward([out.image, out.fragments_per_pixel], [asked.to(out.image), pressure])
+    gradients = {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
+    return {name: each.detach().cpu() for name, each in {"picture": out.image, **gradients}.items()}
+
+
+_LEARNED = ("means", "opacities", "scales", "rotations", "sh")
+
+
+def _sliced(engine: Any, where: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Gaussians in space and time, cut at a moment, and their gradients; float64 on the CPU."""
+    count = 3000
+    splats = scene(count, (70, 50), 3.0)[0].splats
+    given = {name: getattr(splats, name) for name in _LEARNED}
+    given["times"] = torch.linspace(0, 1, count)
+    given["scales_t"] = torch.full((count,), 0.3)
+    given["rotations_r"] = given["rotations"].roll(1, dims=0)
+    leaves: dict[str, Any] = {
+        k: t.to(where, dtype, copy=True).requires_grad_() for k, t in given.items()
+    }
+    moment = Moment(timestamp=0.4, campos=torch.zeros(3, dtype=dtype, device=where))
+    cut = engine.slice(SpacetimeSplats(**leaves, sh_degree=3), moment)
+    named = {name: getattr(cut, name) for name in ("means", "cov3d", "opacities", "colors")}
+    torch.autograd.backward([each.sum() for each in named.values()])
+    named |= {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
+    return {name: each.detach().cpu().double() for name, each in named.items()}

@@ -1,0 +1,190 @@
+"""What the cuda engine is held against on a GPU: the whole of it, with the emulation as the GPU."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import torch
+from gpu.emulated import EmulatedDevice
+from gpu.holding import Holding
+
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cuda import comparison, frame
+from fragprune_plugins.engines.cuda import engine as cuda
+from fragprune_plugins.engines.cuda.comparison import Workload, compare
+
+CPU = torch.device("cpu")
+SMALL = Workload(
+    keys=9000,
+    gaussians=1500,
+    size=(90, 50),
+    wide_gaussians=150,
+    wide_size=(330, 290),
+    steps=3,
+)
+
+
+@dataclass
+class Watched:
+    """The emulation, and somebody who looks at, or tampers with, what its kernels did.
+
+    Attributes:
+        device: the emulation.
+        after: called after each launch, with the kernel's name and arguments.
+        launched: how often each kernel was.
+    """
+
+    device: EmulatedDevice
+    after: Callable[[str, ctypes.Structure], None]
+    launched: dict[str, int] = field(default_factory=dict)
+    kind = "cpu"
+
+    def launch(self, where, source, macros, kernel, blocks, arguments) -> None:
+        self.device.launch(where, source, macros, kernel, blocks, arguments)
+        self.launched[kernel] = self.launched.get(kernel, 0) + 1
+        self.after(kernel, arguments)
+
+    def capturing(self, where: torch.device) -> bool:
+        return False
+
+
+def array(address: int, count: int, kind: type = ctypes.c_float) -> ctypes.Array:
+    """Memory that a kernel was handed."""
+    return (kind * count).from_address(address)
+
+
+@pytest.fixture(autouse=True)
+def memory(monkeypatch: pytest.MonkeyPatch):
+    with Holding() as holding:
+        monkeypatch.setattr(comparison, "bytes_held", lambda where: holding.held)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _little_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda, "_FIRST_CAPACITY", 1 << 13)  # the emulation is slow
+
+
+def test_a_sound_engine_agrees(device: EmulatedDevice) -> None:
+    assert compare(device, CPU, SMALL) == []
+
+
+RUNS = itertools.count()
+
+
+def test_the_rounding_of_a_gpus_special_units_is_no_fault(
+    device: EmulatedDevice, tmp_path: Path
+) -> None:
+    assert (
+        compare(EmulatedDevice(device.compiler, tmp_path, ("-DEMULATED_ROUGH",)), CPU, SMALL) == []
+    )
+
+
+def no_stable_sort(kernel: str, arguments: ctypes.Structure) -> None:
+    if kernel == "fp_sort" and arguments.capacity == SMALL.keys:
+        order = array(arguments.sorted_values, SMALL.keys, ctypes.c_uint32)
+        order[5000], order[5001] = order[5001], order[5000]
+
+
+def a_faint_error_in_a_sub_tile(kernel: str, arguments: ctypes.Structure) -> None:
+    if kernel == "fp_blend":
+        width = arguments.inputs.width
+        pixels = array(arguments.outputs.image, width * arguments.inputs.height)
+        for y in range(32, 36):
+            for x in range(16, 24):
+                pixels[y * width + x] += 1e-4
+
+
+def a_block_of_rows_without_gradients(kernel: str, arguments: ctypes.Structure) -> None:
+    if kernel == "fp_chain" and arguments.frame.inputs.count > 512:
+        ctypes.memset(arguments.to.opacities + 4 * 256, 0, 4 * 256)
+
+
+def another_picture_each_time(kernel: str, arguments: ctypes.Structure) -> None:
+    if kernel == "fp_blend":
+        array(arguments.outputs.image, 1)[0] += 1e-6 * next(RUNS)
+
+
+def other_gradients_each_time(kernel: str, arguments: ctypes.Structure) -> None:
+    if kernel == "fp_chain":
+        array(arguments.to.means, 1)[0] *= 1 + 1e-6 * next(RUNS)
+
+
+def a_wrong_slice(kernel: str, arguments: ctypes.Structure) -> None:
+    if kernel == "fp_slice":
+        array(arguments.sliced.opacities, 3000)[2999] = 2.0
+
+
+def nothing_in_the_widest_rows_of_tiles(kernel: str, arguments: ctypes.Structure) -> None:
+    if kernel == "fp_blend" and arguments.inputs.width == SMALL.wide_size[0]:
+        ctypes.memset(arguments.outputs.image + 4 * 330 * 288, 0, 4 * 330 * 2)
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        (no_stable_sort, "of 9000 are not where torch.sort has them"),
+        (a_faint_error_in_a_sub_tile, "large frame, picture: 32 of 4500 are off, 32 of them"),
+        (a_block_of_rows_without_gradients, "large frame, gradient of opacities: 2"),
+        (another_picture_each_time, "large frame: picture is another in another run"),
+        (other_gradients_each_time, "deterministic: gradient of means is another in another run"),
+        (a_wrong_slice, "slice, opacities: off by"),
+        (nothing_in_the_widest_rows_of_tiles, "wide frame, picture: 660 of"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_a_fault_is_found(device: EmulatedDevice, fault, said: str) -> None:
+    assert said in "; ".join(compare(Watched(device, fault), CPU, SMALL))
+
+
+def test_memory_that_frames_leave_behind_is_found(device: EmulatedDevice, monkeypatch) -> None:
+    left = []
+
+    class Leaking(frame.Drawing):
+        def draw(self, *given, **how) -> frame.Drawn:
+            drawn = super().draw(*given, **how)
+            left.append(drawn.alpha)
+            return drawn
+
+    monkeypatch.setattr(cuda, "Drawing", Leaking)
+    (found,) = compare(device, CPU, SMALL)
+    assert "bytes more are held after 3 steps" in found
+
+
+def test_without_the_cpu_engine_large_frames_are_compared_with_themselves(
+    device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(binding, "available", lambda: False)
+    assert compare(device, CPU, SMALL) == []
+    found = compare(Watched(device, another_picture_each_time), CPU, SMALL)
+    assert "large frame: picture is another in another run" in found
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_at_full_size_blocks_meet_and_a_sound_engine_agrees(device: EmulatedDevice) -> None:
+    work = Workload(steps=1)
+    lists, giants, passes = [], [], set()
+
+    def look(kernel: str, arguments: ctypes.Structure) -> None:
+        if kernel == "fp_emit":
+            tiles = array(arguments.tiles, arguments.inputs.count, ctypes.c_uint32)
+            giants.append(int(torch.frombuffer(tiles, dtype=torch.int32).max()))
+        if kernel == "fp_ranges":
+            count = 2 * arguments.tiles_x * arguments.tiles_y
+            ranges = torch.frombuffer(
+                array(arguments.ranges, count, ctypes.c_uint32), dtype=torch.int32
+            )
+            lists.append(int(ranges.reshape(-1, 2).diff(dim=1).max()))
+            passes.add(arguments.tile_passes)
+
+    assert compare(Watched(device, look), CPU, work) == []
+    assert max(lists) > 256
+    assert max(giants) > 32 * 16  # more than a round of rows
+    assert passes == {1, 2, 3}
+    assert work.gaussians >= 300_000
