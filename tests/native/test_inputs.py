@@ -12,7 +12,7 @@ import torch
 from footprints import footprints_of
 
 from fragprune_plugins.engines.arrays import address
-from fragprune_plugins.engines.cpu import CpuEngine, binding
+from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs
 from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError
