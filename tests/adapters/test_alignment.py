@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from miniature import expect_ancestors, joint, label
+from miniatures.vanilla_3dgs import expect_ancestors, joint, label
 
 from fragprune_plugins.errors import AlignmentError
 

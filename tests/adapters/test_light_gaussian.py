@@ -9,11 +9,11 @@ from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
-import light_gaussian_host
 import numpy as np
 import pytest
 import torch
-from miniature import HOST, TINY, expect_ancestors, joint, label, running, tensors
+from miniatures import light_gaussian
+from miniatures.vanilla_3dgs import HOST, TINY, expect_ancestors, joint, label, running, tensors
 from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
@@ -32,7 +32,7 @@ COUNT = 16
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    return light_gaussian_host.make(tmp_path_factory.mktemp("light"))
+    return light_gaussian.make(tmp_path_factory.mktemp("light"))
 
 
 def of(mini, **options):
@@ -66,7 +66,7 @@ RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
     ],
 )
 def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, code):
-    path = light_gaussian_host.make(tmp_path) / file
+    path = light_gaussian.make(tmp_path) / file
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
     match = LightGaussian().match(HostRepo(tmp_path))
@@ -75,7 +75,7 @@ def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, cod
 
 @pytest.mark.parametrize("script", ["train_densify_prune", "prune_finetune", "distill_train"])
 def test_a_missing_script_is_named(tmp_path, script):
-    (light_gaussian_host.make(tmp_path) / f"{script}.py").unlink()
+    (light_gaussian.make(tmp_path) / f"{script}.py").unlink()
     (error,) = [f for f in LightGaussian().match(HostRepo(tmp_path)).findings if f.level == "error"]
     assert (error.code, error.found) == ("other-host", f"no {script}.py")
 
@@ -146,8 +146,8 @@ def test_pruning_counts_what_is_left_after_truncation(mini, monkeypatch):
         pipe = SimpleNamespace(debug=False, compute_cov3D_python=False, convert_SHs_python=False)
         count = import_module("gaussian_renderer").count_render
         scene = SimpleNamespace(getTrainCameras=lambda: [camera, host.camera(side=0.3)])
-        monkeypatch.setattr(light_gaussian_host, "count_render", count, raising=False)
-        prune_list = light_gaussian_host.prune_list
+        monkeypatch.setattr(light_gaussian, "count_render", count, raising=False)
+        prune_list = light_gaussian.prune_list
         with torch.no_grad():
             counts, _ = prune_list(model, scene, pipe, torch.zeros(3))
             with host.paused():

@@ -7,10 +7,10 @@ import sys
 from dataclasses import replace
 from importlib import import_module
 
-import mcmc_host
 import pytest
 import torch
-from miniature import (
+from miniatures import mcmc
+from miniatures.vanilla_3dgs import (
     HOST,
     TINY,
     expect_ancestors,
@@ -36,7 +36,7 @@ COUNT = 24
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    return mcmc_host.make(tmp_path_factory.mktemp("mcmc"))
+    return mcmc.make(tmp_path_factory.mktemp("mcmc"))
 
 
 def of(mini, **options):
@@ -78,7 +78,7 @@ MODEL = "scene/gaussian_model.py"
     ],
 )
 def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, code):
-    path = mcmc_host.make(tmp_path) / file
+    path = mcmc.make(tmp_path) / file
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
     match = MCMC().match(HostRepo(tmp_path))

@@ -10,8 +10,8 @@ from importlib import import_module
 
 import pytest
 import torch
-from mini_splatting_host import MiniSplattingHost
-from miniature import HOST, joint, label
+from miniatures.mini_splatting import MiniSplattingHost
+from miniatures.vanilla_3dgs import HOST, joint, label
 
 from fragprune_mini_splatting import MiniSplatting
 from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError

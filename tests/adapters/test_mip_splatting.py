@@ -5,12 +5,12 @@ from __future__ import annotations
 import shutil
 import sys
 
-import mip_splatting_host
 import numpy as np
 import pytest
 import torch
-from miniature import HOST, TINY, joint, label, running
-from mip_splatting_host import MipHost
+from miniatures import mip_splatting
+from miniatures.mip_splatting import MipHost
+from miniatures.vanilla_3dgs import HOST, TINY, joint, label, running
 from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
@@ -33,7 +33,7 @@ COUNT = 16
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    return mip_splatting_host.make(tmp_path_factory.mktemp("mip"))
+    return mip_splatting.make(tmp_path_factory.mktemp("mip"))
 
 
 def of(mini, **options):
@@ -75,7 +75,7 @@ RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
 def test_a_changed_host_and_a_descendant_are_refused_by_what_is_otherwise(
     tmp_path, file, old, new, found
 ):
-    path = mip_splatting_host.make(tmp_path) / file
+    path = mip_splatting.make(tmp_path) / file
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
     errors = [f.found for f in MipSplatting().match(HostRepo(tmp_path)).findings]

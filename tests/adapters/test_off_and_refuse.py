@@ -6,7 +6,7 @@ import sys
 from importlib import import_module
 
 import pytest
-from miniature import HOST, imported, running
+from miniatures.vanilla_3dgs import HOST, imported, running
 
 from fragprune_plugins.errors import LateImportError, SeamError, SessionError
 from fragprune_plugins.hosts.seams import Role, Seam

@@ -8,9 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from baseline_hosts import LPHost, SpeedyHost
-from miniature import TINY, joint
-from skeleton import skeleton
+from miniatures.lp_3dgs import LPHost
+from miniatures.skeletons import skeleton
+from miniatures.speedy_splat import SpeedyHost
+from miniatures.vanilla_3dgs import TINY, joint
 
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_lp_3dgs import LP3DGS

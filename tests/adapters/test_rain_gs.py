@@ -9,10 +9,10 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-import rain_gs_host
 import torch
-from miniature import HOST, TINY, expect_ancestors, identity, joint, label, running
-from rain_gs_host import RainHost
+from miniatures import rain_gs
+from miniatures.rain_gs import RainHost
+from miniatures.vanilla_3dgs import HOST, TINY, expect_ancestors, identity, joint, label, running
 
 from fragprune_plugins.cli.run import _measure, _photographs
 from fragprune_plugins.engines import rasterize
@@ -32,7 +32,7 @@ COUNT = 16
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    return rain_gs_host.make(tmp_path_factory.mktemp("rain"))
+    return rain_gs.make(tmp_path_factory.mktemp("rain"))
 
 
 def of(mini, **options):
@@ -61,7 +61,7 @@ def test_each_host_has_its_adapter_and_no_other(mini):
     ],
 )
 def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, found):
-    path = rain_gs_host.make(tmp_path) / file
+    path = rain_gs.make(tmp_path) / file
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
     errors = [f.found for f in RainGS().match(HostRepo(tmp_path)).findings]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from miniature import joint
+from miniatures.vanilla_3dgs import joint
 
 from fragprune_plugins.storage import sidecar
 

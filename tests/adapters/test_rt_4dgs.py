@@ -7,7 +7,7 @@ from importlib import import_module
 
 import pytest
 import torch
-from rt_4dgs_host import PythonHost, RigidHost, RT4DGSHost
+from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
 
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
 from fragprune_plugins.hosts.source import HostRepo

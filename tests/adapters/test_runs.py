@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from miniature import HOST, TINY, running
+from miniatures.vanilla_3dgs import HOST, TINY, running
 
 from fragprune_plugins.errors import Interrupted, UsageError
 from fragprune_plugins.hosts.source import HostRepo

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from cli.commands import run, run_json
-from skeleton import STATES, skeleton
+from miniatures.skeletons import STATES, skeleton
 
 from fragprune_plugins import demo
 from fragprune_plugins.hosts.seams import Role, Seam

@@ -7,9 +7,9 @@ import re
 import time
 from pathlib import Path
 
-import broken_adapters as broken
 import pytest
-from miniature import HOST
+from conformance import broken_adapters as broken
+from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, invariants

@@ -12,7 +12,6 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing import host as kit
 from fragprune_plugins.testing.host import MINIATURE as HOST
 from fragprune_plugins.testing.host import Running, imported
-from fragprune_plugins.testing.rewriting import rewrite
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 __all__ = [
@@ -24,7 +23,6 @@ __all__ = [
     "imported",
     "joint",
     "label",
-    "rewrite",
     "running",
     "tensors",
 ]

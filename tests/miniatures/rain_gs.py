@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from miniature import rewrite
 
 from fragprune_plugins.testing.host import Host, densify_and_prune
+from fragprune_plugins.testing.rewriting import rewrite
 
 PACKAGE = "submodules/diff_gaussian_rasterization"
 

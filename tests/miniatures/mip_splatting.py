@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from miniature import rewrite
 from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.testing.host import Host
+from fragprune_plugins.testing.rewriting import rewrite
 
 
 class Added:

@@ -8,11 +8,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import torch
-from miniature import rewrite
 
 from fragprune_plugins import demo
 from fragprune_plugins.testing import Chance, Host
 from fragprune_plugins.testing.host import prune
+from fragprune_plugins.testing.rewriting import rewrite
 
 args = SimpleNamespace()  # the host's training loop reads its own script's global of this name
 
@@ -21,7 +21,6 @@ RELOCATION_MODULE = '''"""The rasterizer package's relocation, with its table ma
 import math
 
 import torch
-from miniature import rewrite
 from diff_gaussian_rasterization import compute_relocation
 
 N_max = 51
