@@ -1,4 +1,8 @@
-"""The kit's pytest plugin: a table of adapters and invariants at the end, and as a file."""
+"""The kit's pytest plugin: a table of adapters and invariants at the end, and as a file.
+
+Loaded by who asks for it: ``pytest_plugins = ["fragprune_plugins.testing.plugin"]`` in the topmost
+``conftest.py``, or ``pytest -p fragprune_plugins.testing.plugin``.
+"""
 
 from __future__ import annotations
 

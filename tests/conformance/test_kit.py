@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -126,6 +128,18 @@ def test_the_table_has_adapters_down_and_invariants_across():
         ["one", "miniature", "ok", "FAILED"],
         ["another", "checkout", "skipped", "-"],
     ]
+
+
+@pytest.mark.parametrize("options", [(), ("-p", "fragprune_plugins.testing.plugin")], ids=str)
+def test_only_who_asks_for_the_kits_plugin_loads_it(tmp_path, options):
+    (tmp_path / "test_anything.py").write_text(
+        "import sys\n\n\n"
+        "def test_anything():\n"
+        f"    assert any(name.startswith('fragprune') for name in sys.modules) == {bool(options)}\n"
+    )
+    command = [sys.executable, "-m", "pytest", *options, "-c", os.devnull, str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout
 
 
 def test_every_adapter_has_a_miniature_or_is_known_to_have_none():
