@@ -14,11 +14,11 @@ import math
 import shutil
 import sys
 from argparse import ArgumentParser
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -78,9 +78,17 @@ class Host:
     """How to drive one host; override what it has otherwise than vanilla 3DGS of 2023.
 
     ``write`` makes a miniature of it, for where no checkout is at hand; everything else must work
-    on a real checkout too.
+    on a real checkout too. A host that is an installed package is driven as it is installed.
     """
 
+    package: str = ""
+    """Import name of the installed package that is the host; no miniature is written then."""
+    variant: str = ""
+    """What tells this way of driving a host from others, in the report."""
+    lacks: Mapping[str, str] = MappingProxyType({})
+    """Promises that cannot be asked of the host, by name ("checkpoint"), and why not."""
+    draws_alone: bool = True
+    """Without a session the host can draw here, through our stand-ins for compiled packages."""
     opacity: frozenset[str] = frozenset({"opacity"})
     """Parameters that ``--train opacity`` moves; all others stand still."""
     colour: frozenset[str] = frozenset({"f_dc", "f_rest"})
@@ -195,6 +203,14 @@ class Host:
     def parameters(self, model: Any) -> dict[str, Tensor]:
         """Every trained tensor by the name of its param group."""
         return {group["name"]: group["params"][0] for group in model.optimizer.param_groups}
+
+    def bands(self, model: Any) -> int:
+        """How many SH bands above the constant one are drawn."""
+        return int(model.active_sh_degree)
+
+    def use_bands(self, model: Any, count: int) -> None:
+        """Draw so many of those that the model has."""
+        model.active_sh_degree = min(count, model.max_sh_degree)
 
     # -- rows ------------------------------------------------------------------------------------
 
@@ -334,8 +350,13 @@ class Running:
 
 
 @contextlib.contextmanager
-def imported(path: Path) -> Iterator[None]:
-    """A host's folder first on the path; its modules are forgotten afterwards."""
+def imported(path: Path, packages: Sequence[str] = ()) -> Iterator[None]:
+    """A host's folder first on the path; its modules are forgotten afterwards.
+
+    Args:
+        path: the folder.
+        packages: the host's own in it, where it is the folder of all that is installed.
+    """
     known = set(sys.modules)
     sys.path.insert(0, str(path))
     try:
@@ -344,7 +365,8 @@ def imported(path: Path) -> Iterator[None]:
         sys.path.remove(str(path))
         for name in sys.modules.keys() - known:
             file = getattr(sys.modules[name], "__file__", None) or ""
-            if Path(file).is_relative_to(path):
+            own = not packages or name.split(".")[0] in packages
+            if own and Path(file).is_relative_to(path):
                 del sys.modules[name]
 
 
@@ -374,14 +396,32 @@ def running(
     for index, plugin in enumerate(plugins or ()):
         loaded.manager.register(plugin, f"test-{index}")
     settings, driver = settings or Settings(iterations=20), driver or Host()
-    session = Session(adapter, HostRepo(path), loaded, settings, **({"drop_in": True} | options))
-    with imported(path), cpu_only():
+    repo = HostRepo(path, driver.package)
+    session = Session(adapter, repo, loaded, settings, **({"drop_in": True} | options))
+    with imported(path, packages_of(adapter, driver)), cpu_only():
         if active:
             session.activate()
         try:
             yield Running(session, driver, driver.arguments())
         finally:
             session.deactivate()
+
+
+def packages_of(adapter: HostAdapter, driver: Host) -> tuple[str, ...]:
+    """The installed packages that are the host; none where it is a folder of its own."""
+    return adapter.installed if driver.package else ()
+
+
+@contextlib.contextmanager
+def alone(*, driver: Host, **options: Any) -> Iterator[Running]:
+    """The host by itself, nothing wrapped; our stand-ins are its compiled packages.
+
+    One that cannot draw so on this machine has a session that follows no model, and only draws.
+    """
+    with running(driver=driver, active=not driver.draws_alone, learn=False, **options) as host:
+        if driver.draws_alone:
+            host.session.install_stand_ins()
+        yield host
 
 
 def joint(settings: Settings | None = None, **options: Any) -> Any:

@@ -57,7 +57,7 @@ def host_run(scene, out, wrapped):
             if wrapped:
                 session.activate()
             else:
-                session._install_stand_ins()
+                session.install_stand_ins()
             runpy.run_path(script, run_name="__main__")
         finally:
             session.deactivate()

@@ -20,7 +20,7 @@ MODEL, RENDERER = "scene/gaussian_model.py", "gaussian_renderer/__init__.py"
 
 @pytest.fixture
 def host(tmp_path):
-    return mutations.copy_source(MINIATURE, tmp_path).root
+    return mutations.copy_source(HostRepo(MINIATURE), tmp_path).root
 
 
 def of(report, name="vanilla-3dgs"):

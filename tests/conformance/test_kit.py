@@ -31,7 +31,7 @@ def case(adapter, **options):
         (invariants.neutral_is_the_host, broken.TakesRandomNumbers, "differ from the host's own"),
         (invariants.alignment, broken.MixesUpParents, "descends from"),
         (invariants.monotone, broken.LeavesATrace, "not close"),
-        (invariants.round_trip, broken.LosesTheCheckpoint, "of a restored model differ"),
+        (invariants.checkpoint, broken.LosesTheCheckpoint, "of a restored model differ"),
         (invariants.freeze, broken.TrainsTooMuch, "moved ['opacity', 'scaling']"),
         (invariants.refuse, broken.FitsEverything, "still taken for the host"),
         (invariants.same_picture, broken.DrawsOtherwiseEachTime, "other fragments drawn"),
