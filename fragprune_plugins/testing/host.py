@@ -38,6 +38,9 @@ from fragprune_plugins.types import View
 MINIATURE = Path(demo.__file__).with_name("host")
 """The demo's training repository: vanilla 3DGS of 2023 by its interface, small."""
 
+FAINT = -9.0
+"""The opacity's logit in rows that an action makes too faint to keep, before it calls the host."""
+
 
 @dataclass(frozen=True)
 class Chance:
@@ -303,7 +306,7 @@ def densify_and_prune(model: Any, arguments: Any, chance: Chance, *more: Any) ->
     model.xyz_gradient_accum = chance.uniform(n, 1)
     model.denom = chance.rows(n, 0.8)[:, None].float()
     with torch.no_grad():
-        model._opacity[chance.rows(n, chance.share / 2)] = -9.0
+        model._opacity[chance.rows(n, chance.share / 2)] = FAINT
     model.max_radii2D = 40 * chance.uniform(n)
     largest = 20 if chance.heads else None
     radii = [torch.ones(n)] if _takes_radii(model.densify_and_prune) else []
@@ -459,7 +462,8 @@ def label(host: Running, model: Any) -> None:
 def expect_ancestors(host: Running, model: Any) -> None:
     """Every row has the threshold of the row it descends from, and its moments or none.
 
-    The marks are the shadow model: the host itself copies them from parents to children.
+    The marks are the shadow model: the host itself copies them from parents to children. Of the
+    descendants of one row at most one has its moments.
 
     Raises:
         AssertionError: with the first row that has another's threshold.
@@ -481,3 +485,6 @@ def expect_ancestors(host: Running, model: Any) -> None:
             f"{expected[row]:g} and moments {own[row]:g} or 0; it has {state['logits'][row]:g} "
             f"and {moments[row]:g}"
         )
+    held = moments[moments != 0]
+    if len(held.unique()) != len(held):
+        raise AssertionError(f"two rows have the moments of one: {sorted(held.tolist())}")

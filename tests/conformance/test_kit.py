@@ -13,6 +13,7 @@ import pytest
 from conformance import broken_adapters as broken
 from miniatures.vanilla_3dgs import HOST
 
+from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
@@ -121,12 +122,13 @@ def test_the_table_has_adapters_down_and_invariants_across():
             ("one", "miniature", "freeze", "passed"),
             ("one", "miniature", "alignment", "failed"),
             ("another", "checkout", "freeze", "skipped"),
+            ("another", "checkout", "alignment", "n/a"),
         ]
     ]
     assert [line.split() for line in table(results)] == [
         ["adapter", "host", "freeze", "alignment"],
         ["one", "miniature", "ok", "FAILED"],
-        ["another", "checkout", "skipped", "-"],
+        ["another", "checkout", "skipped", "n/a"],
     ]
 
 
@@ -142,8 +144,27 @@ def test_only_who_asks_for_the_kits_plugin_loads_it(tmp_path, options):
     assert done.returncode == 0, done.stdout
 
 
-def test_every_adapter_has_a_miniature_or_is_known_to_have_none():
+def test_every_adapter_is_driven():
     tested = Path(__file__).parent.glob("test_*.py")
-    said = {name for file in tested for name in re.findall(r'adapter = "(.+)"', file.read_text())}
-    installed = {adapter.name for adapter in load_plugins().adapters}
-    assert installed - said == {"compact-3dgs", "gaussian-splatting", "gsplat"}
+    driven = re.compile(r'^    adapter = "(.+)"$', re.MULTILINE)
+    said = {name for file in tested for name in driven.findall(file.read_text())}
+    assert said == {adapter.name for adapter in load_plugins().adapters}
+
+
+class Unsaved(Host):
+    lacks = {"model file": "nobody keeps it"}  # noqa: RUF012
+
+
+@pytest.mark.parametrize("check", [invariants.model_file, invariants.checkpoint])
+def test_a_promise_that_a_host_cannot_be_asked_needs_a_reason(check):
+    class Seamless(Vanilla3DGS):
+        seams = tuple(seam for seam in Vanilla3DGS.seams if seam.role in (Role.ATTACH, Role.STEP))
+
+    unsaid = invariants.Case(Seamless(), Host(), HOST)
+    with pytest.raises(AssertionError, match=r"no seam for (SAVE|CAPTURE and RESTORE)"):
+        check(unsaid)
+
+
+def test_a_reason_is_given_where_a_promise_cannot_be_asked():
+    with pytest.raises(NotApplicable, match="nobody keeps it"):
+        fresh(invariants.model_file, invariants.Case(Vanilla3DGS(), Unsaved(), HOST))

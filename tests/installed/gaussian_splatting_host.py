@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from fragprune_plugins.testing import Chance, Host
-from fragprune_plugins.testing.host import Action
+from fragprune_plugins.testing.host import FAINT, Action
 
 NEVER = 10**9  # iterations: densifiers, resets and lifts wait for the kit's actions
 DENSIFIER = {
@@ -145,7 +145,7 @@ def pruning(model: Any, chance: Chance) -> Iterator[None]:
     pruner = link(chain, "OpacityPruner")
     pruner.max_radii2D = 25 * chance.uniform(count)
     with torch.no_grad():
-        model._opacity[chance.rows(count, chance.share / 2)] = -9.0
+        model._opacity[chance.rows(count, chance.share / 2)] = FAINT
     with at_once(pruner, prune_from_iter=0, prune_interval=1):
         yield
 
@@ -185,7 +185,7 @@ def relocate(model: Any, arguments: Any, chance: Chance, *, faint: bool, more: i
     count = len(model.get_xyz)
     if faint:
         with torch.no_grad():
-            model._opacity[chance.rows(count)] = -9.0
+            model._opacity[chance.rows(count)] = FAINT
     relocater = link(link(model.trainer, "DensificationTrainer").densifier, "Relocater")
     due = {"densify_from_iter": 0, "densify_interval": 1}
     with at_once(relocater, cap_max=count + int(more * chance.share), **due):

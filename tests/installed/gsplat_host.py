@@ -14,7 +14,7 @@ from fragprune_gsplat import GROUPS
 from fragprune_plugins.injection.session import active_session
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_plugins.testing import Chance, Host
-from fragprune_plugins.testing.host import Action
+from fragprune_plugins.testing.host import FAINT, Action
 
 KEYS = tuple(GROUPS)
 
@@ -86,8 +86,8 @@ class GsplatHost(Host):
         return SimpleNamespace(view=view, original_image=torch.from_numpy(pixels))
 
     def render(self, camera: Any, model: Any, background: torch.Tensor) -> dict[str, Any]:
-        colors, _, _ = draw(model, backgrounds=background[None], **camera.view)
-        return {"render": colors[0].permute(2, 0, 1)}
+        colors, _, info = draw(model, backgrounds=background[None], **camera.view)
+        return {"render": colors[0].permute(2, 0, 1), "radii": info["radii"]}
 
     def step(self, model: Any, camera: Any, iteration: int, background: torch.Tensor) -> float:
         image = self.render(camera, model, background)["render"]
@@ -102,7 +102,7 @@ class GsplatHost(Host):
             optimizer.zero_grad(set_to_none=True)
 
     def parameters(self, model: Any) -> dict[str, torch.Tensor]:
-        return {name: model[name] for name in KEYS}
+        return dict(model.items())
 
     def bands(self, model: Any) -> int:
         return math.isqrt(1 + model["shN"].shape[1]) - 1
@@ -197,7 +197,7 @@ def _fade(model: Any, chance: Chance) -> None:
     faint = chance.rows(len(model["means"]), chance.share / 2)
     faint[0] = False
     with torch.no_grad():
-        model["opacities"][faint] = -9.0
+        model["opacities"][faint] = FAINT
 
 
 def reset_opacity(model: Any, arguments: Any, chance: Chance) -> None:

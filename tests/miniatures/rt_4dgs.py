@@ -487,6 +487,7 @@ def change(path: Path, changes: list[tuple[str, str]], *gone: str) -> Path:
 class RT4DGSHost(Host):
     """Space and time; no PLY, several views a step, and a gradient that the loop reads."""
 
+    lacks = {"model file": "it has no PLY: its checkpoints are its models"}  # noqa: RUF012
     rot_4d = True
     python = False
 
@@ -547,6 +548,7 @@ class RT4DGSHost(Host):
 class RigidHost(RT4DGSHost):
     """Without 4D rotation: the host's backward pass gives time and its scale zeros."""
 
+    variant = "without 4D rotation"
     rot_4d = False
 
     def parameters(self, model):
@@ -557,6 +559,7 @@ class RigidHost(RT4DGSHost):
 class PythonHost(RT4DGSHost):
     """Slicing in Python, and leaving out who is not there."""
 
+    variant = "sliced in Python"
     python = True
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable
 from importlib import import_module
@@ -118,6 +119,23 @@ def _pure(seam: Seam, active: bool) -> Any:
     return value
 
 
+def _wrapped_names(case: Case) -> list[str]:
+    """Where the host's modules hold a wrapped function by name, wherever they imported it from."""
+    inside = f"{case.repo.root}{os.sep}"
+    modules = [
+        module
+        for module in list(sys.modules.values())
+        if str(getattr(module, "__file__", "")).startswith(inside)
+        and (not case.packages or module.__name__.split(".")[0] in case.packages)
+    ]
+    return [
+        f"{module.__name__}.{name}"
+        for module in modules
+        for name, value in vars(module).items()
+        if isinstance(value, wrapt.FunctionWrapper)
+    ]
+
+
 def nothing_stays(case: Case) -> str:
     """After a session with learned thresholds the host draws, and computes, as it would alone."""
     names = list(case.adapter.dialect(case.repo).modules(_never_drawn))
@@ -138,6 +156,8 @@ def nothing_stays(case: Case) -> str:
         require(not findings, f"something could not be restored: {findings}")
         kept = [str(seam) for seam, original in originals.items() if _found(seam) is not original]
         require(not kept, f"not the host's own after the session: {kept}")
+        held = _wrapped_names(case)
+        require(not held, f"ours by name after the session: {held}")
         require(not host.deactivate(), "deactivating twice is not harmless")
         left = [name for name in names if name in sys.modules]
         require(not left, f"stand-ins left in sys.modules: {left}")
