@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from miniatures import runs
 from miniatures.compact_3dgs import CompactHost
 from miniatures.lp_3dgs import LPHost
+from miniatures.runs import edit, frozen_differences, written
 from miniatures.speedy_splat import SpeedyHost
-from miniatures.vanilla_3dgs import TINY, joint, running
+from miniatures.vanilla_3dgs import joint, running
 from plyfile import PlyData
 
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_lp_3dgs import LP3DGS
-from fragprune_plugins.errors import EngineError, UnknownHostError, UsageError
-from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.errors import EngineError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_speedy_splat import SpeedySplat
@@ -31,39 +31,24 @@ OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=6, threshold_lr=
 
 @pytest.fixture(scope="module")
 def speedy(tmp_path_factory):
-    root = tmp_path_factory.mktemp("speedy")
-    SpeedyHost().write(root)
-    return root
+    return written(SpeedyHost, tmp_path_factory.mktemp("speedy"))
 
 
 @pytest.fixture(scope="module")
 def lp(tmp_path_factory):
-    root = tmp_path_factory.mktemp("lp")
-    LPHost().write(root)
-    return root
+    return written(LPHost, tmp_path_factory.mktemp("lp"))
 
 
-def command(root, scene, out, iterations, *more):
-    words = [root / "train.py", "-s", scene, "-m", out, "--iterations", iterations, *TINY, *more]
-    return [str(word) for word in words]
+def command(root, *more):
+    return runs.command(root / "train.py", *more)
 
 
 def expect_fine_tuned(summary):
-    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
-    for name in ("xyz", "f_dc", "f_rest", "scaling", "rotation"):
-        assert torch.equal(getattr(before, name), getattr(after, name))
+    assert frozen_differences(summary.model_before, summary.model_after) == []
     store, _ = sidecar.load(summary.model_after)
-    assert len(store) == len(after.xyz)
+    assert len(store) == summary.gaussians
     assert not store.neutral
     assert summary.fragments_after < summary.fragments_before
-
-
-def test_each_is_told_from_the_others(speedy, lp, tmp_path):
-    adapters = load_plugins().adapters
-    assert choose(HostRepo(speedy), adapters).name == "speedy-splat"
-    assert choose(HostRepo(lp), adapters).name == "lp-3dgs"
-    with pytest.raises(UnknownHostError, match="kernel_times"):
-        choose(HostRepo(speedy), adapters, "vanilla-3dgs")
 
 
 # -- Speedy-Splat --------------------------------------------------------------------------------
@@ -159,15 +144,11 @@ def test_the_model_with_a_mask_is_refused_before_stage_one(lp, photographs, tmp_
 
 @pytest.fixture(scope="module")
 def compact(tmp_path_factory):
-    root = tmp_path_factory.mktemp("compact")
-    CompactHost().write(root)
-    return root
+    return written(CompactHost, tmp_path_factory.mktemp("compact"))
 
 
 def test_compact_is_known_by_its_codebooks_and_hash_grid(tmp_path):
-    CompactHost().write(tmp_path)
-    model = tmp_path / "scene" / "gaussian_model.py"
-    model.write_text(model.read_text().replace("recolor", "colours"))
+    edit(written(CompactHost, tmp_path) / "scene/gaussian_model.py", "recolor", "colours")
     findings = Compact3DGS().match(HostRepo(tmp_path)).findings
     assert "no recolor" in str(findings[0])
 

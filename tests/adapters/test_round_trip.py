@@ -14,22 +14,6 @@ def trained(host, count=20):
     return model
 
 
-def test_the_hosts_files_are_what_the_host_alone_writes(tmp_path):
-    with joint() as host:
-        model = trained(host)
-        model.save_ply(str(tmp_path / "ours.ply"))
-        capture = model.capture()
-        host.deactivate()
-        model.save_ply(str(tmp_path / "host.ply"))
-        alone = model.capture()
-    assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "host.ply").read_bytes()
-    assert len(capture) == len(alone) == 12
-    extra = {key for part in capture if isinstance(part, dict) for key in part}
-    assert extra - {key for part in alone if isinstance(part, dict) for key in part} == {
-        "fragprune"
-    }
-
-
 def test_a_neutral_model_saved_over_a_pruned_one_takes_the_old_sidecar_away(tmp_path):
     path = tmp_path / "point_cloud.ply"
     with joint() as host:

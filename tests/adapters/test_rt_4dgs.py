@@ -173,19 +173,6 @@ def test_rows_that_are_not_those_of_the_moment_are_refused_with_both_counts(mini
         assert f"the {there} of {COUNT}" in caught.value.expected
 
 
-def test_thresholds_leave_radii_alone(mini):
-    with joint(**of(mini)) as host:
-        model, camera = spread_out(host.model(COUNT)), host.camera()
-        store = host.store(model)
-        found = []
-        for tau in (None, 0.7):
-            if tau:
-                store.logits.data.fill_(float(torch.logit(torch.tensor(tau))))
-            with torch.no_grad():
-                found.append(host.render(camera, model)["radii"])
-        assert torch.equal(*found)
-
-
 # -- runs ------------------------------------------------------------------------------------------
 
 YAML = """

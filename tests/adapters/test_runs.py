@@ -13,7 +13,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from miniatures.vanilla_3dgs import HOST, TINY, running
+from miniatures import runs
+from miniatures.runs import OPTIONS, frozen_differences
+from miniatures.vanilla_3dgs import HOST, running
 
 from fragprune_plugins.errors import Interrupted, UsageError
 from fragprune_plugins.hosts.source import HostRepo
@@ -29,8 +31,7 @@ from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
 def command(scene, out, iterations, *more):
-    arguments = ["-s", str(scene), "-m", str(out), "--iterations", str(iterations), *TINY]
-    return [str(HOST / "train.py"), *arguments, *map(str, more)]
+    return runs.command(HOST / "train.py", scene, out, iterations, *more)
 
 
 class Never(Schedule):
@@ -114,9 +115,6 @@ def with_plugin(monkeypatch, plugin):
     monkeypatch.setattr(launch, "load_plugins", load)
 
 
-OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
-
-
 @pytest.fixture
 def trained(photographs, tmp_path):
     """A finished stage 1 of ten iterations."""
@@ -165,8 +163,7 @@ def test_train_then_finetune_then_render(photographs, tmp_path):
     summary = run(command(photographs, out, 12), OPTIONS)
     assert (summary.iterations, summary.adapter, summary.stage) == (8, "vanilla-3dgs", "auto")
     before, after = read_ply(summary.model_before), read_ply(summary.model_after)
-    for name in ("xyz", "f_dc", "f_rest", "scaling", "rotation"):
-        assert torch.equal(getattr(before, name), getattr(after, name))
+    assert frozen_differences(summary.model_before, summary.model_after) == []
     assert not torch.equal(before.opacity, after.opacity)
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == summary.gaussians == len(after.xyz)

@@ -327,9 +327,3 @@ class MipHost(Host):
             "split": densifying("densify_and_split", 1e-6),
             "densify and prune": both,
         }
-
-
-def make(root: Path) -> Path:
-    """Write the host into a folder; returns it."""
-    MipHost().write(root)
-    return root

@@ -228,9 +228,3 @@ class RainHost(Host):
                 del model.densify_and_prune
 
         return {**super().actions(), "far split": far, "densify and prune": both}
-
-
-def make(root: Path) -> Path:
-    """Write the host into a folder; returns it."""
-    RainHost().write(root)
-    return root

@@ -10,7 +10,6 @@ from torch import Tensor
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import Chance, Running, joint
 from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, open_all, require
-from fragprune_plugins.types import RasterOutputs
 
 
 def monotone(case: Case) -> str:
@@ -43,7 +42,7 @@ def monotone(case: Case) -> str:
 
 def _counted(
     host: Running, fixed: FixedThresholds, model: Any, camera: Any, tau: Tensor
-) -> tuple[RasterOutputs, Tensor]:
+) -> tuple[Any, Tensor]:
     """Draw through the host with thresholds, then the same once more, counting; and its radii."""
     fixed.values = tau
     package = host.render(camera, model)
