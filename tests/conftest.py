@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+pytest_plugins = ["fragprune_plugins.testing.plugin"]
+
 settings.register_profile(
     "fragprune",
     deadline=None,  # a first call may build or import something

@@ -7,12 +7,13 @@ PLY: our own readers refuse it, and the host's own draws it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from fragprune_plugins.errors import NotComparedError, UsageError
-from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
+from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo, RowTrace
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter
 from fragprune_plugins.hosts.seams import Role, Seam
@@ -49,7 +50,7 @@ class Compact3DGS(GraphdecoAdapter):
         Seam(Role.SAVE, MODEL, "GaussianModel.save_npz", ("path",)),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_npz_pp", ("path",)),
         Seam(Role.STILL, MODEL, "GaussianModel.mask_prune"),
-        Seam(Role.STILL, MODEL, "GaussianModel.sort_morton"),
+        Seam(Role.REARRANGE, MODEL, "GaussianModel.sort_morton"),
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
@@ -119,6 +120,28 @@ class Compact3DGS(GraphdecoAdapter):
         return torch.equal(tensors["rotation"], model._rotation[parents]) and torch.equal(
             tensors["opacity"], model._opacity[parents]
         )
+
+    @contextmanager
+    def tracing(
+        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
+    ) -> Iterator[RowTrace]:
+        """Row numbers ride along as a second column of the opacities, which sorting only moves.
+
+        The bits of an integer, not its value: every row number is exact.
+        """
+        import torch
+
+        opacity, trace = model._opacity.detach(), RowTrace()
+        numbers = torch.arange(len(opacity), dtype=torch.int32, device=opacity.device)
+        rider = numbers.view(torch.float32)[:, None]
+        model._opacity = torch.nn.Parameter(torch.cat([opacity, rider], dim=1))
+        try:
+            yield trace
+        finally:
+            opacity, rider = (part.contiguous() for part in model._opacity.detach().split(1, 1))
+            model._opacity = torch.nn.Parameter(opacity)
+        trace.origins = rider[:, 0].view(torch.int32).long()
+        trace.fresh = torch.zeros_like(trace.origins, dtype=torch.bool)
 
     def file_at(self, method: str, path: Path) -> Path:
         """The host leaves endings out; it loads the most compressed file there is."""

@@ -23,7 +23,7 @@ from fragprune_plugins.errors import (
 )
 from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo, RowTrace
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -103,6 +103,8 @@ class GaussianSplatting(GraphdecoAdapter):
     )
     installed = (PACKAGE, MCMC, REDUCED)
     package = RASTERIZER
+    renderer = MODEL
+    contracts = (Contract(frozenset({"antialiasing"}), 3, "GaussianModel.render"),)
     seams = (
         Seam(Role.ATTACH, f"{TRAINER}.base", "BaseTrainer.__init__", ("model",)),
         Seam(Role.STEP, f"{TRAINER}.abc", "AbstractTrainer.update_learning_rate"),
@@ -136,7 +138,8 @@ class GaussianSplatting(GraphdecoAdapter):
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """The package itself, not a checkout of something that bears its name."""
         if repo.package in self.installed:
-            return [Finding("info", "revision", repo.package, repo.commit)]
+            revision = Finding("info", "revision", repo.package, repo.commit)
+            return [revision, *super().fingerprint(repo)]
         return [
             Finding(
                 "error",

@@ -70,7 +70,10 @@ def support(adapters: Sequence[HostAdapter]) -> str:
         limits += [f"* `{adapter.name}`: {limit}" for limit in info.limits]
     table = "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
     return _SUPPORT.substitute(
-        table=table, engines=", ".join(f"`{name}`" for name in ENGINES), limits="\n".join(limits)
+        table=table,
+        engines=", ".join(f"`{name}`" for name in ENGINES),
+        installed=" and ".join(f"`{a.name}`" for a in adapters if a.installed),
+        limits="\n".join(limits),
     )
 
 
@@ -94,7 +97,9 @@ _SUPPORT = Template("""# What is supported
 
 Scripts that do not train (render, evaluate) run under `fragprune run` as well, with the thresholds
 that lie beside their models. Every adapter draws with every engine: $engines. `fragprune check DIR`
-says which adapter fits a checkout, and where it does not.
+says which adapter fits a checkout, and where it does not. Ours pass the
+[conformance kit](conformance.md): $installed on the installed packages, the others on miniatures of
+their hosts.
 
 $table
 

@@ -6,7 +6,7 @@ import ast
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, lru_cache
 from importlib.metadata import packages_distributions, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +23,36 @@ def _definition(scope: ast.AST | None, name: str) -> ast.AST | None:
     body: Sequence[ast.stmt] = getattr(scope, "body", ())
     kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     return next((child for child in body if isinstance(child, kinds) and child.name == name), None)
+
+
+@lru_cache(maxsize=256)
+def _parsed(text: str) -> ast.Module | None:
+    """A syntax tree, which nobody changes; None of what is no Python."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a host's invalid escapes are its own affair
+            return ast.parse(text)
+    except SyntaxError:
+        return None
+
+
+@lru_cache(maxsize=256)
+def _identifiers(tree: ast.Module) -> dict[str, int]:
+    """Every name that a tree uses, defines, takes or reaches by a dot, and its first line."""
+    lines: dict[str, int] = {}
+    for node in ast.walk(tree):
+        for kind in ("id", "attr", "name", "arg"):
+            name = getattr(node, kind, None)
+            if isinstance(name, str):
+                lines.setdefault(name, getattr(node, "lineno", 0))
+    return lines
+
+
+@cache
+def _distributions(package: str) -> str:
+    """What has installed an import name, with versions; reads the metadata of all that is there."""
+    names = packages_distributions().get(package, ())
+    return ", ".join(f"{name} {version(name)}" for name in sorted(set(names)))
 
 
 class HostRepo:
@@ -56,16 +86,8 @@ class HostRepo:
         """The module's syntax tree, or None when it is absent or not Python."""
         if module not in self._trees:
             path = self.path(module)
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # a host's invalid escapes are its own affair
-                    self._trees[module] = (
-                        ast.parse(path.read_text(encoding="utf-8", errors="replace"))
-                        if path
-                        else None
-                    )
-            except SyntaxError:
-                self._trees[module] = None
+            text = path.read_text(encoding="utf-8", errors="replace") if path else None
+            self._trees[module] = None if text is None else _parsed(text)
         return self._trees[module]
 
     def function(self, module: str, attribute: str) -> Function | None:
@@ -117,15 +139,9 @@ class HostRepo:
         seen: dict[str, str] = {}
         for module in modules:
             tree = self.tree(module)
-            for node in ast.walk(tree) if tree else ():
-                name = (
-                    getattr(node, "id", None)
-                    or getattr(node, "attr", None)
-                    or getattr(node, "name", None)
-                    or getattr(node, "arg", None)
-                )
-                if name in wanted:
-                    seen.setdefault(str(name), f"{module}:{getattr(node, 'lineno', 0)}")
+            lines = _identifiers(tree) if tree else {}
+            for name in (each for each in lines if each in wanted):
+                seen.setdefault(name, f"{module}:{lines[name]}")
         return seen
 
     def imports(self, package: str) -> bool:
@@ -148,8 +164,7 @@ class HostRepo:
         An installed package has its distributions and their versions instead.
         """
         if self.package:
-            names = packages_distributions().get(self.package, ())
-            return ", ".join(f"{name} {version(name)}" for name in sorted(set(names)))
+            return _distributions(self.package)
         git = self.root / ".git"
         try:
             head = (git / "HEAD").read_text().strip()

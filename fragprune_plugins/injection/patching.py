@@ -79,7 +79,8 @@ class PatchLedger:
             module, seam, handle = self._wrapped.pop()
             try:
                 wrapt.unwrap_object(module, seam.attribute, handle)
-                _rebind(seam.attribute, handle, module)
+                if "." not in seam.attribute:  # a method is held by its class alone
+                    _rebind(seam.attribute, handle, module)
             except (wrapt.WrapperNotOutermostError, wrapt.WrapperNotFoundError) as error:
                 findings.append(
                     Finding(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import sys
 import weakref
 from collections.abc import Iterator
@@ -133,7 +134,7 @@ class Session:
             raise SessionError("activate()", "a session is active", "none", "Deactivate it first.")
         self._ledger = PatchLedger(self.repo.root)
         try:
-            self._install_stand_ins()
+            self.install_stand_ins()
             for seam in self.adapter.seams_for(self.repo):
                 self._ledger.wrap(seam, partial(self._enter, seam))
             self._refuse_leftovers()
@@ -239,7 +240,14 @@ class Session:
 
     # -- stand-ins -------------------------------------------------------------------------------
 
-    def _install_stand_ins(self) -> None:
+    def install_stand_ins(self) -> None:
+        """Put ours in place of the host's compiled packages, and wrap nothing.
+
+        ``activate`` does it too; ``deactivate`` takes them back after either.
+
+        Raises:
+            LateImportError: the host has imported one of its own.
+        """
         from importlib.util import find_spec
 
         self._made = self._made or self.dialect.modules(self.draw)
@@ -266,11 +274,11 @@ class Session:
 
     def _refuse_leftovers(self) -> None:
         """A host imported under an earlier session holds its classes, and draws with them."""
+        inside = f"{self.repo.root}{os.sep}"
         hosts = [
             module
             for module in list(sys.modules.values())
-            if (file := getattr(module, "__file__", None))
-            and Path(file).is_relative_to(self.repo.root)
+            if str(getattr(module, "__file__", "")).startswith(inside)
         ]
         for name, stand_in in self._stand_ins.items():
             for member, ours in vars(stand_in).items():

@@ -17,15 +17,17 @@ from fragprune_plugins.testing import invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
 from fragprune_plugins.testing.host import Host
 from fragprune_plugins.testing.invariants import Case
+from fragprune_plugins.testing.plugin import COVERED, NOT_APPLICABLE
 
-MINIATURE = "miniature"
+MINIATURE, INSTALLED = "miniature", "installed"
 
 
 class AdapterConformance:
     """Inherit, name the adapter and how to drive its host: every invariant is then a test.
 
-    Each test runs in a process of its own, on the miniature that ``host`` writes and on every
-    checkout in the folder ``FRAGPRUNE_HOSTS`` that the adapter fits.
+    Each test runs in a process of its own, on the miniature that ``host`` writes, or the installed
+    package that it names, and on every checkout in the folder ``FRAGPRUNE_HOSTS`` that the adapter
+    fits.
 
     Attributes:
         adapter: name of an installed one, or the object itself.
@@ -46,19 +48,27 @@ class AdapterConformance:
             fitting = [
                 path for path in found if found_adapter(self.adapter).match(HostRepo(path)).fits
             ]
-            names = [path.name for path in fitting]
-            metafunc.parametrize("place", [None, *fitting], ids=[MINIATURE, *names])
+            first = INSTALLED if self.host.package else MINIATURE
+            names = [first, *(path.name for path in fitting)]
+            variant = f" {self.host.variant}" if self.host.variant else ""
+            ids = [name + variant for name in names]
+            metafunc.parametrize("place", [None, *fitting], ids=ids)
 
     @pytest.fixture
     def case(self, place: Path | None, tmp_path: Path) -> Case:
         """Adapter and host; the miniature is written anew for each test."""
-        driver = self.host()
-        if place is None:
+        driver, root = self.host(), place or tmp_path
+        if place is None and driver.package:
+            installed = HostRepo.installed(driver.package)
+            if installed is None:
+                pytest.skip(f"{driver.package} is not installed")
+            root = installed.root
+        elif place is None:
             driver.write(tmp_path)
         return Case(
             found_adapter(self.adapter),
             driver,
-            place or tmp_path,
+            root,
             examples=self.examples,
             longest=self.longest_order,
         )
@@ -73,13 +83,13 @@ class AdapterConformance:
                 try:
                     covered.append(fresh(*call))
                 except NotApplicable as reason:
-                    pytest.skip(str(reason))
+                    pytest.skip(f"{NOT_APPLICABLE}{reason}")
                 except FreshProcessError as error:
                     failure = str(error)
                 if failure:  # here, or pytest would print it twice
                     pytest.fail(failure, pytrace=False)
-            note = f"{len(calls)} orders; " if len(calls) > 2 else ""
-            request.node.user_properties.append(("fragprune covered", note + covered[-1]))
+            note = f"{len(calls) - 1} orders of {covered[0]}; " if len(calls) > 1 else ""
+            request.node.user_properties.append((COVERED, note + covered[-1]))
 
         return run
 
@@ -100,9 +110,13 @@ class AdapterConformance:
         """Truncation only takes away, and takes all."""
         check((invariants.monotone, case))
 
-    def test_round_trip(self, case: Case, check: Any) -> None:
+    def test_model_file(self, case: Case, check: Any) -> None:
         """What is saved is loaded."""
-        check((invariants.round_trip, case))
+        check((invariants.model_file, case))
+
+    def test_checkpoint(self, case: Case, check: Any) -> None:
+        """What is captured is restored."""
+        check((invariants.checkpoint, case))
 
     def test_freeze(self, case: Case, check: Any) -> None:
         """Stage 2 moves what it names."""

@@ -14,11 +14,11 @@ import math
 import shutil
 import sys
 from argparse import ArgumentParser
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,9 @@ from fragprune_plugins.types import View
 
 MINIATURE = Path(demo.__file__).with_name("host")
 """The demo's training repository: vanilla 3DGS of 2023 by its interface, small."""
+
+FAINT = -9.0
+"""The opacity's logit in rows that an action makes too faint to keep, before it calls the host."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +81,17 @@ class Host:
     """How to drive one host; override what it has otherwise than vanilla 3DGS of 2023.
 
     ``write`` makes a miniature of it, for where no checkout is at hand; everything else must work
-    on a real checkout too.
+    on a real checkout too. A host that is an installed package is driven as it is installed.
     """
 
+    package: str = ""
+    """Import name of the installed package that is the host; no miniature is written then."""
+    variant: str = ""
+    """What tells this way of driving a host from others, in the report."""
+    lacks: Mapping[str, str] = MappingProxyType({})
+    """Promises that cannot be asked of the host, by name ("checkpoint"), and why not."""
+    draws_alone: bool = True
+    """Without a session the host can draw here, through our stand-ins for compiled packages."""
     opacity: frozenset[str] = frozenset({"opacity"})
     """Parameters that ``--train opacity`` moves; all others stand still."""
     colour: frozenset[str] = frozenset({"f_dc", "f_rest"})
@@ -196,6 +207,14 @@ class Host:
         """Every trained tensor by the name of its param group."""
         return {group["name"]: group["params"][0] for group in model.optimizer.param_groups}
 
+    def bands(self, model: Any) -> int:
+        """How many SH bands above the constant one are drawn."""
+        return int(model.active_sh_degree)
+
+    def use_bands(self, model: Any, count: int) -> None:
+        """Draw so many of those that the model has."""
+        model.active_sh_degree = min(count, model.max_sh_degree)
+
     # -- rows ------------------------------------------------------------------------------------
 
     def actions(self) -> Mapping[str, Action]:
@@ -287,7 +306,7 @@ def densify_and_prune(model: Any, arguments: Any, chance: Chance, *more: Any) ->
     model.xyz_gradient_accum = chance.uniform(n, 1)
     model.denom = chance.rows(n, 0.8)[:, None].float()
     with torch.no_grad():
-        model._opacity[chance.rows(n, chance.share / 2)] = -9.0
+        model._opacity[chance.rows(n, chance.share / 2)] = FAINT
     model.max_radii2D = 40 * chance.uniform(n)
     largest = 20 if chance.heads else None
     radii = [torch.ones(n)] if _takes_radii(model.densify_and_prune) else []
@@ -334,8 +353,13 @@ class Running:
 
 
 @contextlib.contextmanager
-def imported(path: Path) -> Iterator[None]:
-    """A host's folder first on the path; its modules are forgotten afterwards."""
+def imported(path: Path, packages: Sequence[str] = ()) -> Iterator[None]:
+    """A host's folder first on the path; its modules are forgotten afterwards.
+
+    Args:
+        path: the folder.
+        packages: the host's own in it, where it is the folder of all that is installed.
+    """
     known = set(sys.modules)
     sys.path.insert(0, str(path))
     try:
@@ -344,7 +368,8 @@ def imported(path: Path) -> Iterator[None]:
         sys.path.remove(str(path))
         for name in sys.modules.keys() - known:
             file = getattr(sys.modules[name], "__file__", None) or ""
-            if Path(file).is_relative_to(path):
+            own = not packages or name.split(".")[0] in packages
+            if own and Path(file).is_relative_to(path):
                 del sys.modules[name]
 
 
@@ -374,14 +399,32 @@ def running(
     for index, plugin in enumerate(plugins or ()):
         loaded.register(plugin, f"test-{index}")
     settings, driver = settings or Settings(iterations=20), driver or Host()
-    session = Session(adapter, HostRepo(path), loaded, settings, **({"drop_in": True} | options))
-    with imported(path), cpu_only():
+    repo = HostRepo(path, driver.package)
+    session = Session(adapter, repo, loaded, settings, **({"drop_in": True} | options))
+    with imported(path, packages_of(adapter, driver)), cpu_only():
         if active:
             session.activate()
         try:
             yield Running(session, driver, driver.arguments())
         finally:
             session.deactivate()
+
+
+def packages_of(adapter: HostAdapter, driver: Host) -> tuple[str, ...]:
+    """The installed packages that are the host; none where it is a folder of its own."""
+    return adapter.installed if driver.package else ()
+
+
+@contextlib.contextmanager
+def alone(*, driver: Host, **options: Any) -> Iterator[Running]:
+    """The host by itself, nothing wrapped; our stand-ins are its compiled packages.
+
+    One that cannot draw so on this machine has a session that follows no model, and only draws.
+    """
+    with running(driver=driver, active=not driver.draws_alone, learn=False, **options) as host:
+        if driver.draws_alone:
+            host.session.install_stand_ins()
+        yield host
 
 
 def joint(settings: Settings | None = None, **options: Any) -> Any:
@@ -419,7 +462,8 @@ def label(host: Running, model: Any) -> None:
 def expect_ancestors(host: Running, model: Any) -> None:
     """Every row has the threshold of the row it descends from, and its moments or none.
 
-    The marks are the shadow model: the host itself copies them from parents to children.
+    The marks are the shadow model: the host itself copies them from parents to children. Of the
+    descendants of one row at most one has its moments.
 
     Raises:
         AssertionError: with the first row that has another's threshold.
@@ -441,3 +485,6 @@ def expect_ancestors(host: Running, model: Any) -> None:
             f"{expected[row]:g} and moments {own[row]:g} or 0; it has {state['logits'][row]:g} "
             f"and {moments[row]:g}"
         )
+    held = moments[moments != 0]
+    if len(held.unique()) != len(held):
+        raise AssertionError(f"two rows have the moments of one: {sorted(held.tolist())}")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from fragprune_plugins.hosts.seams import Seam
@@ -12,14 +14,32 @@ from fragprune_plugins.hosts.source import HostRepo
 RENAMED = "renamed_by_the_conformance_kit"
 
 
-def copy_source(root: Path, target: Path) -> HostRepo:
-    """A copy of a host's Python files, and nothing else of it."""
-    for file in root.rglob("*.py"):
-        if ".git" not in file.parts:
-            copied = target / file.relative_to(root)
-            copied.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copied)
-    return HostRepo(target)
+def copy_source(repo: HostRepo, target: Path, packages: Sequence[str] = ()) -> HostRepo:
+    """A copy of a host's Python files, and nothing else of it.
+
+    Args:
+        repo: the host.
+        target: an empty folder.
+        packages: the host's own, where its folder holds all that is installed.
+    """
+    for folder in [repo.root / name for name in packages] or [repo.root]:
+        for file in folder.rglob("*.py"):
+            if ".git" not in file.parts:
+                copied = target / file.relative_to(repo.root)
+                copied.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, copied)
+    return HostRepo(target, repo.package)
+
+
+@contextmanager
+def changing(repo: HostRepo, seam: Seam) -> Iterator[None]:
+    """Inside, the module of a seam may be changed; it is put back afterwards."""
+    path, _ = _definition(repo, seam)
+    original = path.read_bytes()
+    try:
+        yield
+    finally:
+        path.write_bytes(original)
 
 
 def rename_function(repo: HostRepo, seam: Seam) -> None:

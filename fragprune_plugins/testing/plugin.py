@@ -1,4 +1,8 @@
-"""The kit's pytest plugin: a table of adapters and invariants at the end, and as a file."""
+"""The kit's pytest plugin: a table of adapters and invariants at the end, and as a file.
+
+Loaded by who asks for it: ``pytest_plugins = ["fragprune_plugins.testing.plugin"]`` in the topmost
+``conftest.py``, or ``pytest -p fragprune_plugins.testing.plugin``.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,9 @@ import pytest
 
 RESULTS = pytest.StashKey[list[dict[str, Any]]]()
 WHAT, COVERED = "fragprune invariant", "fragprune covered"
-_SIGNS = {"passed": "ok", "failed": "FAILED", "skipped": "skipped"}
+NOT_APPLICABLE = "n/a: "
+"""Begins the reason where a promise cannot be asked of a host; other tests are skipped."""
+_SIGNS = {"passed": "ok", "failed": "FAILED"}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -51,14 +57,16 @@ class _Collector:
             return
         adapter, host, invariant = properties[WHAT]
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longreprtext
+        reason = "" if report.passed else str(reason).strip().removeprefix("Skipped: ")
+        inapplicable = report.skipped and reason.startswith(NOT_APPLICABLE)
         self.results.append(
             {
                 "adapter": adapter,
                 "host": host,
                 "invariant": invariant,
-                "outcome": report.outcome,
+                "outcome": "n/a" if inapplicable else report.outcome,
                 "covered": properties.get(COVERED, ""),
-                "reason": "" if report.passed else str(reason).strip(),
+                "reason": reason.removeprefix(NOT_APPLICABLE),
                 "seconds": round(report.duration, 2),
             }
         )
@@ -80,9 +88,9 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     for line in table(results):
         terminalreporter.line(line)
     for result in results:
-        if result["outcome"] == "skipped":
+        if result["outcome"] in ("n/a", "skipped"):
             terminalreporter.line(
-                "skipped: {adapter} on {host}, {invariant}: {reason}".format(**result)
+                "{outcome}: {adapter} on {host}, {invariant}: {reason}".format(**result)
             )
 
 
@@ -92,7 +100,7 @@ def table(results: list[dict[str, Any]]) -> list[str]:
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for result in results:
         row = rows.setdefault((result["adapter"], result["host"]), {})
-        row[result["invariant"]] = _SIGNS[result["outcome"]]
+        row[result["invariant"]] = _SIGNS.get(result["outcome"], result["outcome"])
     heads = ("adapter", "host")
     widths = [max(len(head), *(len(key[i]) for key in rows)) + 2 for i, head in enumerate(heads)]
     cells = [max(len(column), 7) + 2 for column in columns]

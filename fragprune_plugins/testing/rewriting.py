@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 Changes = Sequence[tuple[str, str]]
@@ -39,8 +39,18 @@ def rewrite(root: Path, changes: Mapping[str, Changes], added: type | None = Non
         file.write_text(changed(file.read_text(encoding="utf-8"), passages), encoding="utf-8")
     if added is not None:
         model = root / "scene" / "gaussian_model.py"
-        text = model.read_text(encoding="utf-8")
+        text = without(model.read_text(encoding="utf-8"), vars(added))
         model.write_text(f"{text}\n{_body(added)}", encoding="utf-8")
+
+
+def without(text: str, names: Collection[str]) -> str:
+    """A module's text without the functions, or methods, of these names."""
+    lines, gone = text.splitlines(keepends=True), set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef) and node.name in names:
+            first = min([node.lineno, *(each.lineno for each in node.decorator_list)])
+            gone |= set(range(first, (node.end_lineno or first) + 1))
+    return "".join(line for number, line in enumerate(lines, 1) if number not in gone)
 
 
 def _body(kind: type) -> str:

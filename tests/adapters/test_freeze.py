@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from miniature import running, tensors
+from miniatures.vanilla_3dgs import running, tensors
 
 from fragprune_plugins.injection.stepping import asking_for_no_gradient
 from fragprune_plugins.learning.schedule import Settings

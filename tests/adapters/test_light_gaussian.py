@@ -9,21 +9,21 @@ from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
-import light_gaussian_host
 import numpy as np
 import pytest
 import torch
-from miniature import HOST, TINY, expect_ancestors, joint, label, running, tensors
+from miniatures import light_gaussian, runs
+from miniatures.light_gaussian import LightGaussianHost
+from miniatures.runs import OPTIONS, edit, frozen_differences, written
+from miniatures.vanilla_3dgs import expect_ancestors, joint, label, running
 from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
-from fragprune_plugins.errors import UnknownHostError, UsageError
-from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 
@@ -32,7 +32,7 @@ COUNT = 16
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    return light_gaussian_host.make(tmp_path_factory.mktemp("light"))
+    return written(LightGaussianHost, tmp_path_factory.mktemp("light"))
 
 
 def of(mini, **options):
@@ -42,40 +42,25 @@ def of(mini, **options):
 # -- which host ----------------------------------------------------------------------------------
 
 
-def test_each_host_has_its_adapter_and_no_other(mini):
-    adapters = load_plugins().adapters
-    assert choose(HostRepo(mini), adapters).name == "light-gaussian"
-    assert choose(HostRepo(HOST), adapters).name == "vanilla-3dgs"
-    with pytest.raises(UnknownHostError, match="LightGaussian"):
-        choose(HostRepo(mini), adapters, "vanilla-3dgs")
-    with pytest.raises(UnknownHostError, match="as vanilla 3DGS has it"):
-        choose(HostRepo(HOST), adapters, "light-gaussian")
-
-
-RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
+RENDERER = "gaussian_renderer/__init__.py"
 
 
 @pytest.mark.parametrize(
     ("file", "old", "new", "code"),
     [
-        (RENDERER, "def count_render", "def counting", "seam-missing"),
         (RENDERER, "f_count", "f_counts", "other-host"),
         (RENDERER, "GaussianRasterizationSettings(", "S(", "rasterizer-call"),
-        (MODEL, "def prune_gaussians", "def prune", "seam-missing"),
-        (MODEL, "def load_ply_sh(self, path", "def load_ply_sh(self, file", "seam-signature"),
     ],
 )
 def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, code):
-    path = light_gaussian_host.make(tmp_path) / file
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
+    edit(written(LightGaussianHost, tmp_path) / file, old, new)
     match = LightGaussian().match(HostRepo(tmp_path))
     assert code in [f.code for f in match.findings if f.level == "error"]
 
 
 @pytest.mark.parametrize("script", ["train_densify_prune", "prune_finetune", "distill_train"])
 def test_a_missing_script_is_named(tmp_path, script):
-    (light_gaussian_host.make(tmp_path) / f"{script}.py").unlink()
+    (written(LightGaussianHost, tmp_path) / f"{script}.py").unlink()
     (error,) = [f for f in LightGaussian().match(HostRepo(tmp_path)).findings if f.level == "error"]
     assert (error.code, error.found) == ("other-host", f"no {script}.py")
 
@@ -146,8 +131,8 @@ def test_pruning_counts_what_is_left_after_truncation(mini, monkeypatch):
         pipe = SimpleNamespace(debug=False, compute_cov3D_python=False, convert_SHs_python=False)
         count = import_module("gaussian_renderer").count_render
         scene = SimpleNamespace(getTrainCameras=lambda: [camera, host.camera(side=0.3)])
-        monkeypatch.setattr(light_gaussian_host, "count_render", count, raising=False)
-        prune_list = light_gaussian_host.prune_list
+        monkeypatch.setattr(light_gaussian, "count_render", count, raising=False)
+        prune_list = light_gaussian.prune_list
         with torch.no_grad():
             counts, _ = prune_list(model, scene, pipe, torch.zeros(3))
             with host.paused():
@@ -194,54 +179,23 @@ def test_a_point_cloud_read_with_fewer_bands_has_its_thresholds(mini, tmp_path, 
 
 # -- stage 2 -------------------------------------------------------------------------------------
 
-MOVES = {
-    "opacity": {"opacity"},
-    "appearance": {"opacity", "f_dc", "f_rest"},
-    "all": {"xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"},
-}
 
-
-@pytest.mark.parametrize("train", MOVES)
-def test_decay_schedulers_and_pruning_move_nothing_frozen(mini, train):
-    rates = torch.optim.lr_scheduler.ExponentialLR
-    options = Settings(iterations=9, train=train, opacity_lr=0.02)
-    with running(options, **of(mini), from_step=2) as host:
-        model, camera = host.model(COUNT), host.camera()
-        model.active_sh_degree = 1
-        model.scheduler = rates(model.optimizer, gamma=0.5)
-        for iteration in (1, 2):
-            host.step(model, camera, iteration)  # moments, so that a step without a gradient drifts
-        assert all(group["weight_decay"] for group in model.optimizer.param_groups)
-        before = tensors(model)
-        for iteration in (3, 4, 5, 6):
-            model.update_learning_rate(iteration)
+def test_the_rate_of_stage_two_is_not_the_hosts_schedulers(mini):
+    with running(Settings(iterations=9, opacity_lr=0.02), **of(mini)) as host:
+        model, rates = host.model(COUNT), []
+        model.scheduler = torch.optim.lr_scheduler.ExponentialLR(model.optimizer, gamma=0.5)
+        model.optimizer.register_step_pre_hook(
+            lambda optimizer, *_: rates.append({g["name"]: g["lr"] for g in optimizer.param_groups})
+        )
+        for iteration in (1, 2, 3):
+            host.step(model, host.camera(), iteration)
             model.scheduler.step()
-            host.render(camera, model)["render"].mean().backward()
-            with torch.no_grad():
-                model.prune_gaussians(0.5, torch.rand(COUNT))
-                model.prune_opacity(0.5)
-                model.densify(1e-9, 1.0)
-                model.optimizer.step()
-                model.optimizer.zero_grad(set_to_none=True)
-        assert len(model.get_xyz) == COUNT
-        moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
-        assert moved == MOVES[train]
-        (rate,) = [g["lr"] for g in model.optimizer.param_groups if g["name"] == "opacity"]
-        assert rate == host.schedule.at(4).opacity_lr  # stage 2's, not the scheduler's
+        expected = [host.schedule.at(step).opacity_lr for step in (1, 2, 3)]
+        assert [rate["opacity"] for rate in rates] == expected
 
 
 def command(mini, script, scene, out, iterations, *more):
-    flags = ["-s", scene, "-m", out, "--iterations", iterations, *TINY]
-    return [str(mini / script), *map(str, flags), *map(str, more)]
-
-
-OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
-FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
-
-
-def frozen_differences(before, after):
-    one, other = read_ply(before), read_ply(after)
-    return [name for name in FROZEN if not torch.equal(getattr(one, name), getattr(other, name))]
+    return runs.command(mini / script, scene, out, iterations, *more)
 
 
 @pytest.fixture(scope="module")

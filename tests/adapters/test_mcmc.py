@@ -5,29 +5,23 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
-from importlib import import_module
 
-import mcmc_host
 import pytest
 import torch
-from miniature import (
-    HOST,
-    TINY,
+from miniatures import runs
+from miniatures.mcmc import MCMCHost
+from miniatures.runs import OPTIONS, edit, frozen_differences, written
+from miniatures.vanilla_3dgs import (
     expect_ancestors,
     identity,
     joint,
     label,
-    running,
-    tensors,
 )
 
 from fragprune_mcmc import MCMC
-from fragprune_plugins.errors import AlignmentError, UnknownHostError, UsageError
-from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.errors import AlignmentError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection.launch import HostFailed, RunOptions, run
-from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.injection.launch import HostFailed, run
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 
@@ -36,7 +30,7 @@ COUNT = 24
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    return mcmc_host.make(tmp_path_factory.mktemp("mcmc"))
+    return written(MCMCHost, tmp_path_factory.mktemp("mcmc"))
 
 
 def of(mini, **options):
@@ -46,27 +40,12 @@ def of(mini, **options):
 # -- which host ----------------------------------------------------------------------------------
 
 
-def test_each_host_has_its_adapter_and_no_other(mini):
-    adapters = load_plugins().adapters
-    assert choose(HostRepo(mini), adapters).name == "mcmc"
-    assert choose(HostRepo(HOST), adapters).name == "vanilla-3dgs"
-    with pytest.raises(UnknownHostError, match="3DGS-MCMC"):
-        choose(HostRepo(mini), adapters, "vanilla-3dgs")
-    with pytest.raises(UnknownHostError, match="compute_relocation"):
-        choose(HostRepo(HOST), adapters, "mcmc")
-
-
 MODEL = "scene/gaussian_model.py"
 
 
 @pytest.mark.parametrize(
     ("file", "old", "new", "code"),
     [
-        (MODEL, "relocate_gs(self, dead_mask", "relocate_gs(self, mask", "seam-signature"),
-        (MODEL, "_update_params(self, idxs", "_update_params(self, rows", "seam-signature"),
-        (MODEL, "add_new_gs(self, cap_max", "add_new_gs(self, most", "seam-signature"),
-        (MODEL, "_to_optimizer(self, inds", "_to_optimizer(self, rows", "seam-signature"),
-        (MODEL, "def relocate_gs", "def relocate", "seam-missing"),
         ("utils/reloc_utils.py", "compute_relocation", "another", "no-relocation"),
         ("gaussian_renderer/__init__.py", "radii, is_used =", "radii =", "rasterizer-call"),
         (
@@ -78,9 +57,7 @@ MODEL = "scene/gaussian_model.py"
     ],
 )
 def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, code):
-    path = mcmc_host.make(tmp_path) / file
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
+    edit(written(MCMCHost, tmp_path) / file, old, new)
     match = MCMC().match(HostRepo(tmp_path))
     assert [f.code for f in match.findings if f.level == "error"] == [code]
 
@@ -164,50 +141,12 @@ MOVES = {
 }
 
 
-@pytest.mark.parametrize("train", MOVES)
-def test_noise_relocation_addition_and_regularisers_stand_still(mini, train):
-    with running(Settings(iterations=9, train=train), **of(mini)) as host:
-        model, camera = host.model(COUNT), host.camera()
-        model.active_sh_degree = 1
-        script = import_module("train")
-        host.arguments.cap_max = 99
-        script.args = host.arguments
-        moments = []
-        before = tensors(model)
-        for iteration in range(1, 6):
-            rate = model.update_learning_rate(iteration)
-            assert rate == 0.0
-            loss = host.render(camera, model)["render"].mean() + script.regularisers(model)
-            loss.backward()
-            with torch.no_grad():
-                model.relocate_gs(dead_mask=torch.arange(COUNT) < 5)
-                assert not model.add_new_gs(cap_max=99)
-                model.optimizer.step()
-                model.optimizer.zero_grad(set_to_none=True)
-                stepped = model._xyz.detach().clone()
-                model._opacity.data[0] = -7.0  # where the host's noise is loudest
-                script.wander(model, rate)
-                assert torch.equal(model._xyz, stepped)
-            moments.append(len(model.optimizer.state))
-        moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
-        assert moved == MOVES[train]
-        assert moments[-1] == len(MOVES[train])  # what is frozen has no moments either
-        assert len(model.get_xyz) == COUNT == len(host.store(model))
-
-
 def command(mini, scene, out, iterations, *more):
-    flags = ["-s", scene, "-m", out, "--iterations", iterations, *TINY, "--noise_lr", 5e7]
-    return [str(mini / "train.py"), *map(str, flags), *map(str, more)]
+    words = runs.command(mini / "train.py", scene, out, iterations, "--noise_lr", 5e7)
+    return [*words, *map(str, more)]
 
 
 CAP = ("--cap_max", 170)
-OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
-FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
-
-
-def frozen_differences(before, after):
-    one, other = read_ply(before), read_ply(after)
-    return [name for name in FROZEN if not torch.equal(getattr(one, name), getattr(other, name))]
 
 
 def test_train_then_finetune_moves_no_frozen_bit(mini, photographs, tmp_path):
@@ -221,12 +160,6 @@ def test_train_then_finetune_moves_no_frozen_bit(mini, photographs, tmp_path):
     assert len(store) == summary.gaussians == len(read_ply(summary.model_after).xyz)
     assert info.adapter == "mcmc"
     assert summary.fragments_after < summary.fragments_before
-
-
-def test_without_that_seam_the_noise_would_move_positions(mini, photographs, tmp_path, monkeypatch):
-    monkeypatch.setattr(MCMC, "still_rate", lambda self, rate: rate)
-    summary = run(command(mini, photographs, tmp_path / "out", 12, *CAP), OPTIONS)
-    assert frozen_differences(summary.model_before, summary.model_after) == ["xyz"]
 
 
 def test_joint_learning_through_relocation_and_addition(mini, photographs, tmp_path):

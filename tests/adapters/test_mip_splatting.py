@@ -5,26 +5,23 @@ from __future__ import annotations
 import shutil
 import sys
 
-import mip_splatting_host
 import numpy as np
 import pytest
 import torch
-from miniature import HOST, TINY, joint, label, running
-from mip_splatting_host import MipHost
+from miniatures.mip_splatting import MipHost
+from miniatures.runs import OPTIONS, command, edit, frozen_differences, written
+from miniatures.vanilla_3dgs import joint, label, running
 from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins import rasterize
 from fragprune_plugins.cli.run import _measure, _photographs
-from fragprune_plugins.errors import ModelFileError, NotComparedError, UnknownHostError
+from fragprune_plugins.errors import ModelFileError, NotComparedError
 from fragprune_plugins.finetuning import load_dataset
-from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.measure import Candidate
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 
@@ -33,7 +30,7 @@ COUNT = 16
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    return mip_splatting_host.make(tmp_path_factory.mktemp("mip"))
+    return written(MipHost, tmp_path_factory.mktemp("mip"))
 
 
 def of(mini, **options):
@@ -41,15 +38,6 @@ def of(mini, **options):
 
 
 # -- which host ----------------------------------------------------------------------------------
-
-
-def test_each_host_has_its_adapter_and_no_other(mini):
-    adapters = load_plugins().adapters
-    assert choose(HostRepo(mini), adapters).name == "mip-splatting"
-    with pytest.raises(UnknownHostError, match="Mip-Splatting"):
-        choose(HostRepo(mini), adapters, "vanilla-3dgs")
-    with pytest.raises(UnknownHostError, match="no kernel_size"):
-        choose(HostRepo(HOST), adapters, "mip-splatting")
 
 
 RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
@@ -62,7 +50,6 @@ RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
         (RENDERER, "        subpixel_offset=", "        offset=", "no subpixel_offset"),
         (MODEL, "compute_3D_filter", "compute_filter", "no compute_3D_filter"),
         (MODEL, "grads_abs", "absolute", "no grads_abs"),
-        (MODEL, "def save_fused_ply", "def fuse", "no such function"),
         (
             MODEL,
             "    def _both",
@@ -75,9 +62,7 @@ RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
 def test_a_changed_host_and_a_descendant_are_refused_by_what_is_otherwise(
     tmp_path, file, old, new, found
 ):
-    path = mip_splatting_host.make(tmp_path) / file
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
+    edit(written(MipHost, tmp_path) / file, old, new)
     errors = [f.found for f in MipSplatting().match(HostRepo(tmp_path)).findings]
     assert any(found in error for error in errors)
 
@@ -186,30 +171,22 @@ def test_a_hosts_model_says_who_may_read_it(mini, tmp_path):
 
 # -- whole runs ----------------------------------------------------------------------------------
 
-OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
-FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
-
-
-def command(mini, scene, out, iterations, *more):
-    flags = ["-s", scene, "-m", out, "--iterations", iterations, *TINY]
-    return [str(mini / "train.py"), *map(str, flags), *map(str, more)]
-
 
 def models(summary):
     paths = (summary.model_before, summary.model_after)
     return [MipSplatting().read_model(path) for path in paths]
 
 
-def frozen_differences(summary):
-    before, after = models(summary)
-    return [name for name in FROZEN if not torch.equal(getattr(before, name), getattr(after, name))]
+def moved(summary):
+    paths = (summary.model_before, summary.model_after)
+    return frozen_differences(*paths, MipSplatting().read_model)
 
 
 @pytest.fixture(scope="module")
 def trained(mini, photographs, tmp_path_factory):
     """Trained with jittered rays and another kernel, then fine-tuned."""
     out = tmp_path_factory.mktemp("trained")
-    words = command(mini, photographs, out, 20, "-k", "0.2", "--ray_jitter")
+    words = command(mini / "train.py", photographs, out, 20, "-k", "0.2", "--ray_jitter")
     return run(words, OPTIONS), words, out
 
 
@@ -217,7 +194,7 @@ def test_stage_two_moves_opacities_and_thresholds_alone(trained):
     summary, _, _ = trained
     assert (summary.adapter, summary.iterations) == ("mip-splatting", 8)
     assert summary.gaussians != 150  # it densified
-    assert frozen_differences(summary) == []
+    assert moved(summary) == []
     before, after = models(summary)
     assert not torch.equal(before.opacity, after.opacity)
     store, info = sidecar.load(summary.model_after)
@@ -255,16 +232,16 @@ def test_the_size_of_the_2d_filter_is_read_from_the_command_or_the_source(mini, 
 def test_a_point_cloud_alone_is_resumed(mini, photographs, trained, tmp_path):
     summary, _, _ = trained
     shutil.copytree(summary.model_after.parent, tmp_path / "point_cloud" / "iteration_28")
-    words = command(mini, photographs, tmp_path, 20)
+    words = command(mini / "train.py", photographs, tmp_path, 20)
     again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
-    assert frozen_differences(again) == []
+    assert moved(again) == []
     first, second = (sidecar.load(s.model_after)[0] for s in (summary, again))
     assert (first.steps, second.steps) == (8, 16)
 
 
 def test_thresholds_learn_beside_densification(mini, photographs, tmp_path):
     options = RunOptions(device="cpu", stage="joint", from_iter=3, settings=OPTIONS.settings)
-    summary = run(command(mini, photographs, tmp_path, 20), options)
+    summary = run(command(mini / "train.py", photographs, tmp_path, 20), options)
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == len(MipSplatting().read_model(summary.model_after)) != 150
     assert not store.neutral

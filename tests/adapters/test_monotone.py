@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from miniature import joint
+from miniatures.vanilla_3dgs import joint
 
 from fragprune_plugins.constants import RIM_REACH, RIM_WIDTH
 from fragprune_plugins.testing.invariants.case import FixedThresholds

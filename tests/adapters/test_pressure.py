@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from miniature import joint, running
+from miniatures.vanilla_3dgs import joint, running
 
 from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
 from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
-from baseline_hosts import LPHost, SpeedyHost
-from miniature import TINY, joint
-from skeleton import skeleton
+from miniatures import runs
+from miniatures.compact_3dgs import CompactHost
+from miniatures.lp_3dgs import LPHost
+from miniatures.runs import edit, frozen_differences, written
+from miniatures.speedy_splat import SpeedyHost
+from miniatures.vanilla_3dgs import joint, running
+from plyfile import PlyData
 
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_lp_3dgs import LP3DGS
-from fragprune_plugins.errors import EngineError, UnknownHostError, UsageError
-from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.errors import EngineError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_speedy_splat import SpeedySplat
@@ -29,40 +31,24 @@ OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=6, threshold_lr=
 
 @pytest.fixture(scope="module")
 def speedy(tmp_path_factory):
-    root = tmp_path_factory.mktemp("speedy")
-    SpeedyHost().write(root)
-    return root
+    return written(SpeedyHost, tmp_path_factory.mktemp("speedy"))
 
 
 @pytest.fixture(scope="module")
 def lp(tmp_path_factory):
-    root = tmp_path_factory.mktemp("lp")
-    LPHost().write(root)
-    return root
+    return written(LPHost, tmp_path_factory.mktemp("lp"))
 
 
-def command(root, scene, out, iterations, *more):
-    words = [root / "train.py", "-s", scene, "-m", out, "--iterations", iterations, *TINY, *more]
-    return [str(word) for word in words]
+def command(root, *more):
+    return runs.command(root / "train.py", *more)
 
 
 def expect_fine_tuned(summary):
-    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
-    for name in ("xyz", "f_dc", "f_rest", "scaling", "rotation"):
-        assert torch.equal(getattr(before, name), getattr(after, name))
+    assert frozen_differences(summary.model_before, summary.model_after) == []
     store, _ = sidecar.load(summary.model_after)
-    assert len(store) == len(after.xyz)
+    assert len(store) == summary.gaussians
     assert not store.neutral
     assert summary.fragments_after < summary.fragments_before
-
-
-def test_each_is_told_from_the_others(speedy, lp, tmp_path):
-    adapters = load_plugins().adapters
-    assert choose(HostRepo(speedy), adapters).name == "speedy-splat"
-    assert choose(HostRepo(lp), adapters).name == "lp-3dgs"
-    assert choose(compact(tmp_path), adapters).name == "compact-3dgs"
-    with pytest.raises(UnknownHostError, match="kernel_times"):
-        choose(HostRepo(speedy), adapters, "vanilla-3dgs")
 
 
 # -- Speedy-Splat --------------------------------------------------------------------------------
@@ -156,17 +142,43 @@ def test_the_model_with_a_mask_is_refused_before_stage_one(lp, photographs, tmp_
 # -- Compact-3DGS --------------------------------------------------------------------------------
 
 
-def compact(root, **methods) -> HostRepo:
-    """As far as its source goes: what it needs, no machine without a GPU has."""
-    own = dict.fromkeys(("vq_scale", "recolor", "mlp_head", "mask_prune", "sort_morton"), "")
-    files = dict.fromkeys(("save_npz", "save_npz_pp", "load_model"), "path")
-    return skeleton(root, **(own | files | methods))
+@pytest.fixture(scope="module")
+def compact(tmp_path_factory):
+    return written(CompactHost, tmp_path_factory.mktemp("compact"))
 
 
 def test_compact_is_known_by_its_codebooks_and_hash_grid(tmp_path):
-    assert Compact3DGS().match(compact(tmp_path / "whole")).fits
-    findings = Compact3DGS().match(compact(tmp_path / "other", recolor=None)).findings
+    edit(written(CompactHost, tmp_path) / "scene/gaussian_model.py", "recolor", "colours")
+    findings = Compact3DGS().match(HostRepo(tmp_path)).findings
     assert "no recolor" in str(findings[0])
+
+
+def test_compact_learns_in_the_later_part_of_its_run(compact, photographs, tmp_path):
+    options = replace(OPTIONS, stage="finetune", from_iter=10)
+    summary = run(command(compact, photographs, tmp_path, 16), options)
+    store, info = sidecar.load(summary.model_after)
+    assert (info.adapter, summary.iterations) == ("compact-3dgs", 6)
+    assert len(store) == info.rows == len(PlyData.read(summary.model_after)["vertex"].data)
+    assert not store.neutral
+    assert summary.fragments_after < summary.fragments_before
+
+
+def test_compacts_thresholds_follow_their_gaussians_through_the_last_sort(
+    compact, photographs, tmp_path
+):
+    """The same training, stored in two orders: --comp sorts by place before it saves."""
+    options = replace(OPTIONS, stage="joint", from_iter=3)
+    stored = []
+    for form in ("point_cloud.npz", "point_cloud_pp.npz"):
+        out = tmp_path / form
+        more = ["--store_npz", *(["--comp"] if "pp" in form else [])]
+        run(command(compact, photographs, out, 16, *more), options)
+        file = out / "point_cloud" / "iteration_16" / form
+        stored.append((np.load(file)["arr_0"].tolist(), sidecar.load(file)[0].logits.tolist()))
+    (plain, logits), (ordered, followed) = stored
+    assert plain != ordered
+    assert len({tuple(place) for place in plain}) == len(plain)
+    assert [logits[plain.index(place)] for place in ordered] == followed
 
 
 def test_compact_is_not_resumed():
@@ -191,15 +203,18 @@ def test_compacts_files_are_found_as_the_host_finds_them(tmp_path, there, method
     assert Compact3DGS().file_at("save_ply", tmp_path / "a.ply") == tmp_path / "a.ply"
 
 
-def test_compacts_codebooks_stop_where_they_are_in_use():
-    def layer(used):
-        codebook = SimpleNamespace(initted=torch.tensor([used]))
-        return SimpleNamespace(training=True, _codebook=codebook)
-
-    model = SimpleNamespace(
-        vq_scale=SimpleNamespace(layers=[layer(True)]),
-        vq_rot=SimpleNamespace(layers=[layer(False)]),
-    )
-    Compact3DGS().prepare_stage2(model, None)
-    assert not model.vq_scale.layers[0].training
-    assert model.vq_rot.layers[0].training  # it is still to be made from the data
+@pytest.mark.parametrize("used", [True, False])
+def test_compacts_codebooks_stop_where_they_are_in_use(compact, used):
+    """They learn in the forward pass, by a backward pass of their own."""
+    start = {"driver": CompactHost(), "from_step": 2 if used else 1}
+    with running(path=compact, adapter=Compact3DGS(), **start) as host:
+        model, camera = host.model(20), host.camera()
+        for iteration in (1, 2):
+            host.step(model, camera, iteration)  # the second is the first to use them
+        books = [layer._codebook for layer in (*model.vq_scale.layers, *model.vq_rot.layers)]
+        before = [book.embed.detach().clone() for book in books]
+        for iteration in (3, 4):
+            host.step(model, camera, iteration)
+        after = [book.embed.detach() for book in books]
+    stopped = [torch.equal(*pair) for pair in zip(before, after, strict=True)]
+    assert all(stopped) if used else not any(stopped)

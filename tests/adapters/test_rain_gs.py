@@ -9,20 +9,18 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-import rain_gs_host
 import torch
-from miniature import HOST, TINY, expect_ancestors, identity, joint, label, running
-from rain_gs_host import RainHost
+from miniatures import runs
+from miniatures.rain_gs import RainHost
+from miniatures.runs import OPTIONS, edit, frozen_differences, written
+from miniatures.vanilla_3dgs import expect_ancestors, identity, joint, label, running
 
 from fragprune_plugins import rasterize
 from fragprune_plugins.cli.run import _measure, _photographs
-from fragprune_plugins.errors import AlignmentError, UnknownHostError
-from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_rain_gs import PACKAGE, RainGS
@@ -32,7 +30,7 @@ COUNT = 16
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    return rain_gs_host.make(tmp_path_factory.mktemp("rain"))
+    return written(RainHost, tmp_path_factory.mktemp("rain"))
 
 
 def of(mini, **options):
@@ -40,15 +38,6 @@ def of(mini, **options):
 
 
 # -- which host, and its rasterizer ----------------------------------------------------------------
-
-
-def test_each_host_has_its_adapter_and_no_other(mini):
-    adapters = load_plugins().adapters
-    assert choose(HostRepo(mini), adapters).name == "rain-gs"
-    with pytest.raises(UnknownHostError, match="RAIN-GS"):
-        choose(HostRepo(mini), adapters, "vanilla-3dgs")
-    with pytest.raises(UnknownHostError, match="no low_pass"):
-        choose(HostRepo(HOST), adapters, "rain-gs")
 
 
 @pytest.mark.parametrize(
@@ -61,9 +50,7 @@ def test_each_host_has_its_adapter_and_no_other(mini):
     ],
 )
 def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, found):
-    path = rain_gs_host.make(tmp_path) / file
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
+    edit(written(RainHost, tmp_path) / file, old, new)
     errors = [f.found for f in RainGS().match(HostRepo(tmp_path)).findings]
     assert any(found in error for error in errors)
 
@@ -162,14 +149,10 @@ def test_a_split_that_forgets_one_of_its_appends_is_refused(mini, monkeypatch):
 
 # -- whole runs ----------------------------------------------------------------------------------
 
-OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
-FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
-
 
 def command(mini, scene, out, iterations, *more):
-    flags = [f for f in TINY if f != "--eval"]
-    flags = ["-s", scene, "-m", out, "--iterations", iterations, *flags]
-    return [str(mini / "train.py"), *map(str, flags), *map(str, more)]
+    words = runs.command(mini / "train.py", scene, out, iterations, *more)
+    return [word for word in words if word != "--eval"]
 
 
 @pytest.fixture
@@ -186,10 +169,9 @@ def test_every_mode_is_fine_tuned_and_moves_opacities_and_thresholds_alone(
     words = command(mini, scene, tmp_path / "out", 22, f"--{mode}", "--num_gaussians", 60)
     summary = run([*words, "--c2f"], OPTIONS)
     assert (summary.adapter, summary.iterations) == ("rain-gs", 8)
-    before, after = (read_ply(p) for p in (summary.model_before, summary.model_after))
-    assert [n for n in FROZEN if not torch.equal(getattr(before, n), getattr(after, n))] == []
+    assert frozen_differences(summary.model_before, summary.model_after) == []
     store, info = sidecar.load(summary.model_after)
-    assert len(store) == info.rows == summary.gaussians == len(after)
+    assert len(store) == info.rows == summary.gaussians
     assert summary.fragments_after < summary.fragments_before
     assert summary.drawing == {}
     assert _measure(_photographs(summary))  # though no --eval is in the command

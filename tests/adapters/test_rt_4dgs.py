@@ -7,7 +7,7 @@ from importlib import import_module
 
 import pytest
 import torch
-from rt_4dgs_host import PythonHost, RigidHost, RT4DGSHost
+from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
 
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
@@ -194,19 +194,6 @@ def test_rows_that_are_not_those_of_the_moment_are_refused_with_both_counts(mini
             host.render(camera, model)
         assert caught.value.found == f"{other} Gaussians"
         assert f"the {there} of {COUNT}" in caught.value.expected
-
-
-def test_thresholds_leave_radii_alone(mini):
-    with joint(**of(mini)) as host:
-        model, camera = spread_out(host.model(COUNT)), host.camera()
-        store = host.store(model)
-        found = []
-        for tau in (None, 0.7):
-            with torch.no_grad():
-                if tau:
-                    store.logits.fill_(float(torch.logit(torch.tensor(tau))))
-                found.append(host.render(camera, model)["radii"])
-        assert torch.equal(*found)
 
 
 # -- runs ------------------------------------------------------------------------------------------

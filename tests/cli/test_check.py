@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from cli.commands import run, run_json
-from skeleton import STATES, skeleton
+from miniatures.skeletons import STATES, skeleton
 
 from fragprune_plugins import demo
 from fragprune_plugins.hosts.seams import Role, Seam
@@ -20,7 +20,7 @@ MODEL, RENDERER = "scene/gaussian_model.py", "gaussian_renderer/__init__.py"
 
 @pytest.fixture
 def host(tmp_path):
-    return mutations.copy_source(MINIATURE, tmp_path).root
+    return mutations.copy_source(HostRepo(MINIATURE), tmp_path).root
 
 
 def of(report, name="vanilla-3dgs"):

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 
-import broken_adapters as broken
 import pytest
-from miniature import HOST
+from conformance import broken_adapters as broken
+from miniatures.vanilla_3dgs import HOST
 
+from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
@@ -29,9 +32,9 @@ def case(adapter, **options):
         (invariants.neutral_is_the_host, broken.TakesRandomNumbers, "differ from the host's own"),
         (invariants.alignment, broken.MixesUpParents, "descends from"),
         (invariants.monotone, broken.LeavesATrace, "not close"),
-        (invariants.round_trip, broken.LosesTheCheckpoint, "of a restored model differ"),
-        (invariants.round_trip, broken.LeavesParametersAsleep, "resumed, ['f_dc', 'opacity',"),
-        (invariants.round_trip, broken.LeavesItsRates, "resumed, rates are"),
+        (invariants.checkpoint, broken.LosesTheCheckpoint, "of a restored model differ"),
+        (invariants.checkpoint, broken.LeavesParametersAsleep, "resumed, ['f_dc', 'opacity',"),
+        (invariants.checkpoint, broken.LeavesItsRates, "resumed, rates are"),
         (invariants.freeze, broken.TrainsTooMuch, "moved ['opacity', 'scaling']"),
         (invariants.freeze, broken.LeavesParametersAsleep, "left other parameters asking"),
         (invariants.refuse, broken.FitsEverything, "still taken for the host"),
@@ -122,17 +125,49 @@ def test_the_table_has_adapters_down_and_invariants_across():
             ("one", "miniature", "freeze", "passed"),
             ("one", "miniature", "alignment", "failed"),
             ("another", "checkout", "freeze", "skipped"),
+            ("another", "checkout", "alignment", "n/a"),
         ]
     ]
     assert [line.split() for line in table(results)] == [
         ["adapter", "host", "freeze", "alignment"],
         ["one", "miniature", "ok", "FAILED"],
-        ["another", "checkout", "skipped", "-"],
+        ["another", "checkout", "skipped", "n/a"],
     ]
 
 
-def test_every_adapter_has_a_miniature_or_is_known_to_have_none():
+@pytest.mark.parametrize("options", [(), ("-p", "fragprune_plugins.testing.plugin")], ids=str)
+def test_only_who_asks_for_the_kits_plugin_loads_it(tmp_path, options):
+    (tmp_path / "test_anything.py").write_text(
+        "import sys\n\n\n"
+        "def test_anything():\n"
+        f"    assert any(name.startswith('fragprune') for name in sys.modules) == {bool(options)}\n"
+    )
+    command = [sys.executable, "-m", "pytest", *options, "-c", os.devnull, str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout
+
+
+def test_every_adapter_is_driven():
     tested = Path(__file__).parent.glob("test_*.py")
-    said = {name for file in tested for name in re.findall(r'adapter = "(.+)"', file.read_text())}
-    installed = {adapter.name for adapter in load_plugins().adapters}
-    assert installed - said == {"compact-3dgs", "gaussian-splatting", "gsplat"}
+    driven = re.compile(r'^    adapter = "(.+)"$', re.MULTILINE)
+    said = {name for file in tested for name in driven.findall(file.read_text())}
+    assert said == {adapter.name for adapter in load_plugins().adapters}
+
+
+class Unsaved(Host):
+    lacks = {"model file": "nobody keeps it"}  # noqa: RUF012
+
+
+@pytest.mark.parametrize("check", [invariants.model_file, invariants.checkpoint])
+def test_a_promise_that_a_host_cannot_be_asked_needs_a_reason(check):
+    class Seamless(Vanilla3DGS):
+        seams = tuple(seam for seam in Vanilla3DGS.seams if seam.role in (Role.ATTACH, Role.STEP))
+
+    unsaid = invariants.Case(Seamless(), Host(), HOST)
+    with pytest.raises(AssertionError, match=r"no seam for (SAVE|CAPTURE and RESTORE)"):
+        check(unsaid)
+
+
+def test_a_reason_is_given_where_a_promise_cannot_be_asked():
+    with pytest.raises(NotApplicable, match="nobody keeps it"):
+        fresh(invariants.model_file, invariants.Case(Vanilla3DGS(), Unsaved(), HOST))

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from light_gaussian_host import LightGaussianHost
+from miniatures.light_gaussian import LightGaussianHost
 
 from fragprune_plugins.testing import AdapterConformance
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from mcmc_host import MCMCHost
+from miniatures.mcmc import MCMCHost
 
 from fragprune_plugins.testing import AdapterConformance
 

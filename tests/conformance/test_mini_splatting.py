@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from mini_splatting_host import MiniSplattingHost
+from miniatures.mini_splatting import MiniSplattingHost
 
 from fragprune_plugins.testing import AdapterConformance
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from mip_splatting_host import MipHost
+from miniatures.mip_splatting import MipHost
 
 from fragprune_plugins.testing import AdapterConformance
 

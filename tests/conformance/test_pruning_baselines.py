@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from baseline_hosts import LPHost, SpeedyHost
+from miniatures.lp_3dgs import LPHost
+from miniatures.speedy_splat import SpeedyHost
 
 from fragprune_plugins.testing import AdapterConformance
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from rain_gs_host import RainHost
+from miniatures.rain_gs import RainHost
 
 from fragprune_plugins.testing import AdapterConformance
 

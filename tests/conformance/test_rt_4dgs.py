@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from rt_4dgs_host import PythonHost, RigidHost, RT4DGSHost
+from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
 
 from fragprune_plugins.testing import AdapterConformance
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from skeleton import SETTINGS, STATES, skeleton
+from miniatures.skeletons import SETTINGS, STATES, skeleton
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.choosing import choose, locate

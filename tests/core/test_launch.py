@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from skeleton import skeleton
+from miniatures.skeletons import skeleton
 
 from fragprune_plugins.errors import HostNeedsError, Interrupted, UnknownHostError, UsageError
 from fragprune_plugins.injection.launch import (

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from miniature import running
+from miniatures.vanilla_3dgs import running
 
 from fragprune_plugins.datasets.dataset import Dataset
 from fragprune_plugins.finetuning import finetune

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 import torch
-from miniature import HOST, joint, running
+from miniatures.vanilla_3dgs import HOST, joint, running
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.hosts.choosing import choose

@@ -12,7 +12,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from skeleton import STATES
+from miniatures.skeletons import STATES
 
 from fragprune_mcmc import MCMC
 from fragprune_mip_splatting import MipSplatting

@@ -1,18 +1,17 @@
 from __future__ import annotations
 
-import sys
 from contextlib import contextmanager
 from importlib.util import find_spec
 
 import pytest
+from installed.gaussian_splatting_host import GaussianSplattingHost
+from installed.gsplat_host import GsplatHost
 
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection.cpu_only import cpu_only
-from fragprune_plugins.injection.launch import _forget_modules
-from fragprune_plugins.injection.session import Session
-from fragprune_plugins.learning.schedule import JointSchedule, Settings
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.testing.host import running
+
+DRIVERS = {"gaussian-splatting": GaussianSplattingHost, "gsplat": GsplatHost}
 
 
 @pytest.fixture(autouse=True)
@@ -29,33 +28,17 @@ def photographs(tmp_path_factory):
 
 
 @pytest.fixture
-def session_on(request):
-    """``session_on(adapter, ...)``: the installed host under a session, its modules fresh."""
+def session_on():
+    """``session_on(adapter, settings)``: the installed host under a session, its modules fresh."""
 
     @contextmanager
-    def running(adapter, **options):
-        package = adapter.installed[0]
-        repo, known = HostRepo.installed(package), set(sys.modules)
-        session = Session(adapter, repo, load_plugins(), drop_in=True, **options)
-        try:
-            with cpu_only(), session:
-                yield session
-        finally:
-            _forget_modules(repo.root, known, adapter.installed)
+    def begin(adapter, settings=None, **options):
+        driver = DRIVERS[adapter.name]()
+        path = HostRepo.installed(driver.package).root
+        with running(settings, adapter=adapter, path=path, driver=driver, **options) as host:
+            yield host.session
 
-    return running
-
-
-@pytest.fixture
-def unmoved(session_on):
-    """As ``session_on``, for a joint run whose thresholds never move: rows alone change them."""
-
-    def running(adapter):
-        settings = Settings()
-        schedule = JointSchedule(settings, from_step=10**9)
-        return session_on(adapter, settings=settings, schedule=schedule, freeze=False)
-
-    return running
+    return begin
 
 
 def pytest_ignore_collect(collection_path):

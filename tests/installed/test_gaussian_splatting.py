@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
+from installed.gaussian_splatting_host import GaussianSplattingHost
 
 from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_plugins.errors import SessionError
@@ -30,37 +29,9 @@ OPTIONS = {
     "prune_interval": 6,
     "prune_until_iter": 20,
 }
-RELOCATION = {
-    "relocate_from_iter": 3,
-    "relocate_interval": 3,
-    "relocate_until_iter": 20,
-    "cap_max": 190,
-    "noise_lr": 5e5,
-}
-TRAINERS = ["densify", "mcmc"] if find_spec("gaussian_splatting_mcmc") else ["densify"]
 
 
-def trained(kind: str, photographs: Path, **options):
-    """(trainer, model, cameras) of the installed package, made as its own scripts make them."""
-    from gaussian_splatting import GaussianModel
-    from gaussian_splatting.dataset.colmap import ColmapCameraDataset, colmap_init
-    from gaussian_splatting.trainer import BaseOpacityResetDensificationTrainer, NoopDensifier
-
-    dataset = ColmapCameraDataset(str(photographs), load_mask=False, load_depth=False).to("cuda")
-    model = colmap_init(GaussianModel(1).to("cuda"), str(photographs))
-    if kind == "mcmc":
-        from gaussian_splatting_mcmc.trainer import MCMCTrainerWrapper
-
-        make = partial(MCMCTrainerWrapper, NoopDensifier)
-        return make(model, dataset, **{**RELOCATION, **options}), model, dataset
-    return (
-        BaseOpacityResetDensificationTrainer(model, dataset, **{**OPTIONS, **options}),
-        model,
-        dataset,
-    )
-
-
-def test_only_the_installed_package_fits_and_every_seam_is_found(tmp_path):
+def test_only_the_installed_package_fits(tmp_path):
     adapter, repo = GaussianSplatting(), HostRepo.installed("gaussian_splatting")
     match = adapter.match(repo)
     assert match.fits, match.findings
@@ -70,79 +41,16 @@ def test_only_the_installed_package_fits_and_every_seam_is_found(tmp_path):
     assert not adapter.match(HostRepo(repo.root / "gaussian_splatting")).fits
 
 
-@pytest.mark.parametrize("kind", TRAINERS)
-def test_rows_keep_their_thresholds_through_every_change(kind, photographs, unmoved):
-    with unmoved(GaussianSplatting()) as session:
-        torch.manual_seed(0)
-        trainer, model, cameras = trained(kind, photographs, feature_lr=0.0)
-        rows = len(model.get_xyz)
-        names = torch.arange(rows, dtype=torch.float32)
-        with torch.no_grad():
-            model._features_dc[:, 0, 0] = names  # copied by every operation, moved by none
-            if kind == "mcmc":
-                model._opacity[::3] = -6.0  # dead: to be relocated
-        store = session.store(model)
-        store.logits = (-20 + names / 100).requires_grad_(True)
-        store._set_moments(names + 1, names + 1, torch.tensor(1.0))
-        before, changes = names, 0
-        for step in range(24):
-            trainer.step(cameras[step % len(cameras)])
-            now = model._features_dc.detach()[:, 0, 0]
-            changes += not torch.equal(now, before)
-            before = now
-            assert len(store) == len(model.get_xyz)
-            torch.testing.assert_close(store.logits.detach(), -20 + now / 100, rtol=0, atol=0)
-            moments = store.optimizer.state[store.logits]["exp_avg"]
-            assert torch.all((moments == now + 1) | (moments == 0))
-            assert len(moments[moments > 0].unique()) == (moments > 0).sum()  # nobody's twice
-        assert changes >= 4
-        assert len(model.get_xyz) != rows
-
-
-@pytest.mark.parametrize("kind", TRAINERS)
-def test_stage_2_moves_opacities_and_thresholds_alone(kind, photographs, session_on):
-    with session_on(
-        GaussianSplatting(), settings=Settings(iterations=8, threshold_lr=0.3)
-    ) as session:
-        options = {"opacity_reset_from_iter": 1, "opacity_reset_interval": 1}
-        trainer, model, cameras = trained(
-            kind, photographs, **(options if kind == "densify" else {})
-        )
-        before = {
-            name: getattr(model, f"_{name}").detach().clone()
-            for name in ("xyz", "features_dc", "features_rest", "scaling", "rotation", "opacity")
-        }
-        neutral = session.store(model).logits.detach().clone()
-        for step in range(8):
-            trainer.step(cameras[step % len(cameras)])
-        moved = {n for n, old in before.items() if not torch.equal(getattr(model, f"_{n}"), old)}
-        assert moved == {"opacity"}
-        assert (model.get_opacity > 0.02).any()  # no reset, and the optimizer's step was made
-        assert not torch.equal(session.store(model).logits.detach(), neutral)
-        session.expect_drawn()
-
-
-def test_steps_that_draw_nothing_with_thresholds_are_an_error(photographs, session_on):
+def test_steps_that_draw_nothing_with_thresholds_are_an_error(session_on):
+    host = GaussianSplattingHost()
     with session_on(GaussianSplatting()) as session:
-        trainer, _, cameras = trained("densify", photographs)
+        model = host.model(host.arguments(), 20, seed=0, degree=1, setup=True)
         session.expect_drawn()  # nothing has begun
-        trainer.update_learning_rate()
+        model.trainer.update_learning_rate()
         with pytest.raises(SessionError, match="no view"):
             session.expect_drawn()
-        trainer.step(cameras[0])
+        host.step(model, host.camera(16, 12), 2, torch.zeros(3))
         session.expect_drawn()
-
-
-def test_every_original_is_back_when_the_session_ends(photographs, session_on):
-    with session_on(GaussianSplatting()) as session:
-        trained("densify", photographs)
-        from gaussian_splatting import GaussianModel
-        from gaussian_splatting.trainer import BaseTrainer
-
-        assert hasattr(GaussianModel.save_ply, "__wrapped__")
-        originals = [GaussianModel.save_ply.__wrapped__, BaseTrainer.__init__.__wrapped__]
-        assert session.deactivate() == []
-        assert [GaussianModel.save_ply, BaseTrainer.__init__] == originals
 
 
 def test_another_backend_is_refused_by_name():

@@ -140,6 +140,8 @@ class GraphdecoAdapter(HostAdapter):
     """Base of every adapter of this lineage; a subclass adds name, fingerprint and what differs."""
 
     package = "diff_gaussian_rasterization"
+    renderer = RENDERER
+    """The module of the functions that call the rasterizer."""
     contracts: tuple[Contract, ...] = (Contract(),)
     """Calls of the rasterizer that the dialect answers; a function may make any one of its own."""
     scripts: tuple[str, ...] = ("train.py",)
@@ -161,27 +163,29 @@ class GraphdecoAdapter(HostAdapter):
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """What every descendant has: a rasterizer called as the dialect knows it."""
         functions = dict.fromkeys(contract.function for contract in self.contracts)
-        there = [name for name in functions if repo.function(RENDERER, name)]  # else a missing seam
+        there = [
+            name for name in functions if repo.function(self.renderer, name)
+        ]  # else a missing seam
         return [finding for name in there for finding in self._differences(repo, name)]
 
     def _differences(self, repo: HostRepo, function: str) -> list[Finding]:
         """What one drawing function does otherwise than any contract of it says."""
         known = [contract for contract in self.contracts if contract.function == function]
-        calls = read_calls(repo, RENDERER, function)
+        calls = read_calls(repo, self.renderer, function)
         found = [
-            (repo.at(RENDERER, call.line), str(call.contract), "Use the adapter of that host.")
+            (repo.at(self.renderer, call.line), str(call.contract), "Use the adapter of that host.")
             for call in calls
             if call.contract not in known
         ]
         if not calls:
             nothing = "no call of GaussianRasterizationSettings with keywords"
             remedy = "Check that this is the folder of the training script."
-            found.append((repo.place(RENDERER, function), nothing, remedy))
+            found.append((repo.place(self.renderer, function), nothing, remedy))
         return [
             Finding(
                 "error",
                 "rasterizer-call",
-                f"{RENDERER}:{function} ({at})",
+                f"{self.renderer}:{function} ({at})",
                 what,
                 " or ".join(map(str, known)),
                 remedy,

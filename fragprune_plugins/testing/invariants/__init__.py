@@ -14,18 +14,19 @@ from fragprune_plugins.testing.invariants.neutral import neutral_is_the_host
 from fragprune_plugins.testing.invariants.off import nothing_stays, off_is_off, orders
 from fragprune_plugins.testing.invariants.picture import same_picture
 from fragprune_plugins.testing.invariants.refuse import refuse
-from fragprune_plugins.testing.invariants.round_trip import round_trip
+from fragprune_plugins.testing.invariants.round_trip import checkpoint, model_file
 
 __all__ = [
     "Case",
     "alignment",
+    "checkpoint",
     "freeze",
+    "model_file",
     "monotone",
     "neutral_is_the_host",
     "nothing_stays",
     "off_is_off",
     "orders",
     "refuse",
-    "round_trip",
     "same_picture",
 ]

@@ -13,7 +13,8 @@ from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.testing.host import Host, Running
+from fragprune_plugins.testing.fresh import NotApplicable
+from fragprune_plugins.testing.host import Host, Running, packages_of
 
 COUNT = 16
 
@@ -25,7 +26,7 @@ class Case:
     Attributes:
         adapter: under test.
         driver: how the host is driven.
-        root: the host's folder, a miniature or a checkout; it is only read.
+        root: the folder of a miniature, of a checkout or of what is installed; it is only read.
         examples: sequences of actions to try.
         longest: order of import, activation and deactivation to try.
     """
@@ -39,7 +40,16 @@ class Case:
     @property
     def repo(self) -> HostRepo:
         """The host's source."""
-        return HostRepo(self.root)
+        return self.source(self.root)
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """The host's own in ``root``, where that is the folder of all that is installed."""
+        return packages_of(self.adapter, self.driver)
+
+    def source(self, folder: Path) -> HostRepo:
+        """A copy of the host's source, read as the host is."""
+        return HostRepo(folder, self.driver.package)
 
     @property
     def seams(self) -> tuple[Seam, ...]:
@@ -49,6 +59,18 @@ class Case:
     def has(self, role: Role) -> bool:
         """Whether the adapter wraps anything for a role."""
         return any(seam.role is role for seam in self.seams)
+
+    def expect(self, promise: str, *roles: Role) -> None:
+        """Raise NotApplicable where the host says why a promise cannot be asked of it.
+
+        Raises:
+            AssertionError: it says nothing, and a role has no seam.
+        """
+        if promise in self.driver.lacks:
+            raise NotApplicable(self.driver.lacks[promise])
+        missing = [role.name for role in roles if not self.has(role)]
+        where = f'{type(self.driver).__name__}.lacks["{promise}"]'
+        require(not missing, f"no seam for {' and '.join(missing)}, and no reason in {where}")
 
     def options(self) -> dict[str, Any]:
         """For ``running`` and ``joint``."""

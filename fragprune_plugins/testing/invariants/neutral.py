@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.testing.host import Chance, Running, joint, running, tensors
+from fragprune_plugins.testing.host import Chance, Running, alone, joint, running, tensors
 from fragprune_plugins.testing.invariants.case import COUNT, Case, require
 
 
@@ -25,16 +25,15 @@ class NeverLearning(Schedule):
 def neutral_is_the_host(case: Case) -> str:
     """Followed but not learning, parameters and random streams are the host's own to the bit."""
     never = NeverLearning(Settings(iterations=20))
-    with running(active=False, **case.options()) as host:
-        host.session._install_stand_ins()  # the compiled packages a host cannot do without
-        alone = _lifetime(host)
+    with alone(**case.options()) as host:
+        own = _lifetime(host)
     with running(never.settings, schedule=never, freeze=False, **case.options()) as host:
         followed = _lifetime(host)
         require(host.last_state is not None, "the session never saw the model")
         require(host.last_state.steps == _STEPS, f"{host.last_state.steps} steps were counted")
-    _compare(alone, followed)
+    _compare(own, followed)
     pixels, gradients = _opened_changes_nothing(case)
-    return f"{len(alone)} tensors after {_STEPS} steps; {pixels} pixels, {gradients} gradients"
+    return f"{len(own)} tensors after {_STEPS} steps; {pixels} pixels, {gradients} gradients"
 
 
 _STEPS = 6
@@ -63,9 +62,9 @@ def _lifetime(host: Running) -> dict[str, Any]:
     }
 
 
-def _compare(alone: dict[str, Any], followed: dict[str, Any]) -> None:
-    require(alone.keys() == followed.keys(), f"{sorted(alone)} became {sorted(followed)}")
-    for name, value in alone.items():
+def _compare(own: dict[str, Any], followed: dict[str, Any]) -> None:
+    require(own.keys() == followed.keys(), f"{sorted(own)} became {sorted(followed)}")
+    for name, value in own.items():
         require(torch.equal(value, followed[name]), f"{name} differ from the host's own")
 
 

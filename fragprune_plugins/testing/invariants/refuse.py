@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from fragprune_plugins.errors import FragpruneError, SeamError
+from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import session as sessions
+from fragprune_plugins.plugins.hooks import select_adapter
+from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import mutations
 from fragprune_plugins.testing.host import running
 from fragprune_plugins.testing.invariants.case import Case, require
@@ -19,29 +23,45 @@ from fragprune_plugins.testing.invariants.case import Case, require
 def refuse(case: Case) -> str:
     """A host with one thing changed is refused by that thing's name, and nothing stays patched."""
     require(case.adapter.match(case.repo).fits, "the adapter does not fit the host it is for")
+    _is_chosen(case)
     changes = 0
-    for seam in dict.fromkeys(seam for seam in case.seams if not seam.external):
-        for name in (None, *seam.needs):
-            with TemporaryDirectory() as folder:
-                repo = mutations.copy_source(case.root, Path(folder))
-                if name is None:
-                    mutations.rename_function(repo, seam)
-                else:
-                    mutations.rename_parameter(repo, seam, name)
-                _expect_refusal(case, HostRepo(Path(folder)), seam, name)
-                changes += 1
-    for seam in (seam for seam in case.seams if seam.role is Role.VIEW):
-        with TemporaryDirectory() as folder:
-            repo = mutations.copy_source(case.root, Path(folder))
-            line = mutations.unpack_one_more(repo, seam)
-            if line is not None:
-                _expect_place(case, HostRepo(Path(folder)), seam, line)
-                changes += 1
     with TemporaryDirectory() as folder:
-        match = case.adapter.match(HostRepo(Path(folder)))
+        copy = mutations.copy_source(case.repo, Path(folder), case.packages)
+        for seam in dict.fromkeys(seam for seam in case.seams if not seam.external):
+            for name in (None, *seam.needs):
+                with mutations.changing(copy, seam):
+                    if name is None:
+                        mutations.rename_function(copy, seam)
+                    else:
+                        mutations.rename_parameter(copy, seam, name)
+                    _expect_refusal(case, case.source(copy.root), seam, name)
+                    changes += 1
+        for seam in _callers(case):
+            with mutations.changing(copy, seam):
+                line = mutations.unpack_one_more(copy, seam)
+                if line is not None:
+                    _expect_place(case, case.source(copy.root), seam, line)
+                    changes += 1
+        _import_is_refused(case, copy)
+    with TemporaryDirectory() as folder:
+        match = case.adapter.match(case.source(Path(folder)))
         require(not match.fits, "an empty folder is taken for the host")
-    _import_is_refused(case)
     return f"{changes} changed sources"
+
+
+def _callers(case: Case) -> list[Seam]:
+    """Functions of the host that call its rasterizer, and are not the rasterizer itself."""
+    drawn = {str(seam) for seam in case.seams if seam.role is Role.RASTERIZE}
+    return [seam for seam in case.seams if seam.role is Role.VIEW and str(seam) not in drawn]
+
+
+def _is_chosen(case: Case) -> None:
+    """Of all adapters that are installed, where several could fit."""
+    plugins = load_plugins()
+    adapters = {each.name: each for each in (*plugins.adapters, case.adapter)}
+    tie = partial(select_adapter, plugins=plugins)
+    chosen = choose(case.repo, list(adapters.values()), select=tie)
+    require(chosen.name == case.adapter.name, f"{chosen.name} is chosen for the host")
 
 
 def _expect_refusal(case: Case, repo: HostRepo, seam: Seam, name: str | None) -> None:
@@ -62,22 +82,20 @@ def _expect_place(case: Case, repo: HostRepo, seam: Seam, line: int) -> None:
     require(any(f.where == at for f in errors), f"{what}: said {[str(error) for error in errors]}")
 
 
-def _import_is_refused(case: Case) -> None:
+def _import_is_refused(case: Case, copy: HostRepo) -> None:
     """Where detection was skipped, the host's own import fails, and the session leaves no trace."""
     seam = next(seam for seam in case.seams if seam.needs and not seam.external)
-    with TemporaryDirectory() as folder:
-        repo = mutations.copy_source(case.root, Path(folder))
-        mutations.rename_parameter(repo, seam, seam.needs[0])
-        with running(**{**case.options(), "path": Path(folder)}, active=False) as host:
-            host.session.activate()
-            try:
-                import_module(seam.module)
-            except SeamError as error:
-                require(seam.needs[0] in error.expected, f"another parameter is named: {error}")
-            except FragpruneError as error:
-                raise AssertionError(f"refused for another reason: {error}") from error
-            else:
-                raise AssertionError(f"{seam} was imported without {seam.needs[0]}")
-            require(seam.module not in sys.modules, f"{seam.module} is half imported")
-            require(not host.deactivate(), "something could not be restored")
-            require(sessions.active_session() is None, "a session is still active")
+    mutations.rename_parameter(copy, seam, seam.needs[0])
+    with running(**{**case.options(), "path": copy.root}, active=False) as host:
+        host.session.activate()
+        try:
+            import_module(seam.module)
+        except SeamError as error:
+            require(seam.needs[0] in error.expected, f"another parameter is named: {error}")
+        except FragpruneError as error:
+            raise AssertionError(f"refused for another reason: {error}") from error
+        else:
+            raise AssertionError(f"{seam} was imported without {seam.needs[0]}")
+        require(seam.module not in sys.modules, f"{seam.module} is half imported")
+        require(not host.deactivate(), "something could not be restored")
+        require(sessions.active_session() is None, "a session is still active")

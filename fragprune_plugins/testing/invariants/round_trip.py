@@ -11,25 +11,25 @@ import torch
 from fragprune_plugins.errors import SidecarError
 from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.storage import sidecar
-from fragprune_plugins.testing.fresh import NotApplicable
-from fragprune_plugins.testing.host import Running, joint, running, tensors
+from fragprune_plugins.testing.host import Running, alone, joint, running, tensors
 from fragprune_plugins.testing.invariants.case import Case, require
 
 
-def round_trip(case: Case) -> str:
-    """What is saved is loaded bit for bit, and the host's files stay the host's."""
-    parts = []
+def model_file(case: Case) -> str:
+    """A saved model is loaded with its thresholds, and the host's file stays the host's."""
+    case.expect("model file", Role.SAVE)
     with TemporaryDirectory() as folder:
-        if case.has(Role.SAVE) and case.has(Role.LOAD):
-            _through_a_model_file(case, Path(folder) / "point_cloud.ply")
-            parts.append("model file")
-        if case.has(Role.CAPTURE) and case.has(Role.RESTORE):
-            _through_a_checkpoint(case, Path(folder) / "chkpnt3.pth")
-            _out_of_stage_two(case, Path(folder) / "chkpnt3.pth")
-            parts.append("checkpoint")
-    if not parts:
-        raise NotApplicable("the adapter wraps neither saving and loading nor checkpoints")
-    return " and ".join(parts)
+        _through_a_model_file(case, Path(folder) / "point_cloud.ply")
+    return "model file"
+
+
+def checkpoint(case: Case) -> str:
+    """A checkpoint is resumed with its thresholds, by the host alone as well."""
+    case.expect("checkpoint", Role.CAPTURE, Role.RESTORE)
+    with TemporaryDirectory() as folder:
+        _through_a_checkpoint(case, Path(folder) / "chkpnt3.pth")
+        _out_of_stage_two(case, Path(folder) / "chkpnt3.pth")
+    return "checkpoint"
 
 
 def _trained(host: Running, count: int = 20) -> Any:
@@ -52,7 +52,7 @@ def _through_a_model_file(case: Case, path: Path) -> None:
         state = host.store(model).state_dict()
         with torch.no_grad():
             picture = host.render(host.camera(), model)["render"]
-        bands = getattr(model, "active_sh_degree", None)
+        bands = host.driver.bands(model)
         ours = path.read_bytes()
         host.deactivate()
         host.driver.save(model, path)
@@ -62,9 +62,10 @@ def _through_a_model_file(case: Case, path: Path) -> None:
     with running(learn=False, **case.options()) as host:  # as a host's render script does
         loaded = host.model(5, setup=False)
         host.driver.load(loaded, path)
-        _require_same(state, host.store(loaded).state_dict(), "of a loaded model")
-        if bands is not None:
-            loaded.active_sh_degree = bands  # load_ply uses every band; training was not so far
+        store = host.store(loaded)
+        require(store is not None, "a loaded model has no thresholds")
+        _require_same(state, store.state_dict(), "of a loaded model")
+        host.driver.use_bands(loaded, bands)  # hosts load with all; training was not so far
         with torch.no_grad():
             again = host.render(host.camera(), loaded)["render"]
         require(torch.equal(again, picture), "a loaded model's picture is not the saved one's")
@@ -87,8 +88,7 @@ def _through_a_checkpoint(case: Case, path: Path) -> None:
         _require_same(state, host.store(model).state_dict(), "of a restored model")
         _require_same(parameters, tensors(host.driver, model), "of a restored model")
         host.step(model, host.camera(), 4)
-    with running(active=False, **case.options()) as host:
-        host.session._install_stand_ins()
+    with alone(**case.options()) as host:
         model = _resumed(host, path)  # the host alone reads it too
         _require_same(parameters, tensors(host.driver, model), "restored without us")
 
@@ -99,8 +99,7 @@ def _out_of_stage_two(case: Case, path: Path) -> None:
     for learn in (False, True):
         with running(learn=learn, **case.options()) as host:
             torch.save((host.driver.capture(_trained(host)), 3), path)
-        with running(active=False, **case.options()) as host:  # the host alone
-            host.session._install_stand_ins()
+        with alone(**case.options()) as host:
             model = _resumed(host, path)
             before = tensors(host.driver, model)
             for iteration in (4, 5, 6):

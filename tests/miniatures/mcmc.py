@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import inspect
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import torch
-from miniature import rewrite
 
-from fragprune_plugins import demo
 from fragprune_plugins.testing import Chance, Host
 from fragprune_plugins.testing.host import prune
+from fragprune_plugins.testing.rewriting import rewrite
 
 args = SimpleNamespace()  # the host's training loop reads its own script's global of this name
 
@@ -21,7 +19,6 @@ RELOCATION_MODULE = '''"""The rasterizer package's relocation, with its table ma
 import math
 
 import torch
-from miniature import rewrite
 from diff_gaussian_rasterization import compute_relocation
 
 N_max = 51
@@ -200,24 +197,18 @@ CHANGES = {
 }
 
 
-def make(root: Path) -> Path:
-    """Write the host into a folder; returns it."""
-    shutil.copytree(Path(demo.__file__).with_name("host"), root, dirs_exist_ok=True)
-    rewrite(root, CHANGES, Added)
-    (root / "utils" / "reloc_utils.py").write_text(RELOCATION_MODULE)
-    added = "\n\n".join(inspect.getsource(f) for f in (regularisers, move_in, wander))
-    text = (root / "train.py").read_text()
-    (root / "train.py").write_text(text.replace("if __name__", added + "\n\nif __name__"))
-    return root
-
-
 class MCMCHost(Host):
     """Relocation, addition and noise in place of densification."""
 
     routine = ("relocate", "add", "another band")
 
-    def write(self, root):
-        make(root)
+    def write(self, root: Path) -> None:
+        super().write(root)
+        rewrite(root, CHANGES, Added)
+        (root / "utils" / "reloc_utils.py").write_text(RELOCATION_MODULE)
+        added = "\n\n".join(inspect.getsource(f) for f in (regularisers, move_in, wander))
+        text = (root / "train.py").read_text()
+        (root / "train.py").write_text(text.replace("if __name__", added + "\n\nif __name__"))
 
     def step(self, model, camera, iteration, background):
         rate = model.update_learning_rate(iteration)

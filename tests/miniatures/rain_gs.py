@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from miniature import rewrite
 
 from fragprune_plugins.testing.host import Host, densify_and_prune
+from fragprune_plugins.testing.rewriting import rewrite
 
 PACKAGE = "submodules/diff_gaussian_rasterization"
 
@@ -228,9 +228,3 @@ class RainHost(Host):
                 del model.densify_and_prune
 
         return {**super().actions(), "far split": far, "densify and prune": both}
-
-
-def make(root: Path) -> Path:
-    """Write the host into a folder; returns it."""
-    RainHost().write(root)
-    return root

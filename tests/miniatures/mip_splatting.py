@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from miniature import rewrite
 from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.testing.host import Host
+from fragprune_plugins.testing.rewriting import rewrite
 
 
 class Added:
@@ -327,9 +327,3 @@ class MipHost(Host):
             "split": densifying("densify_and_split", 1e-6),
             "densify and prune": both,
         }
-
-
-def make(root: Path) -> Path:
-    """Write the host into a folder; returns it."""
-    MipHost().write(root)
-    return root

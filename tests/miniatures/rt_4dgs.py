@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 import inspect
 from importlib import import_module
@@ -12,7 +11,7 @@ from types import SimpleNamespace
 import torch
 
 from fragprune_plugins.testing.host import Chance, Host
-from fragprune_plugins.testing.rewriting import changed, rewrite
+from fragprune_plugins.testing.rewriting import changed, rewrite, without
 
 ATTRIBUTES = {
     "xyz": "_xyz",
@@ -479,24 +478,16 @@ MAIN = """    parser.add_argument("--config")
 """
 
 
-def without(text: str, names: set[str]) -> str:
-    """A module's text without these methods of its classes."""
-    lines, gone = text.splitlines(), set()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef) and node.name in names:
-            gone |= set(range(node.lineno, (node.end_lineno or 0) + 1))
-    return "\n".join(line for i, line in enumerate(lines, 1) if i not in gone) + "\n"
-
-
 def change(path: Path, changes: list[tuple[str, str]], *gone: str) -> Path:
     """Rewrite a module without some of its functions, and changed."""
-    path.write_text(changed(without(path.read_text(), set(gone)), changes))
+    path.write_text(changed(without(path.read_text(), gone), changes))
     return path
 
 
 class RT4DGSHost(Host):
     """Space and time; no PLY, several views a step, and a gradient that the loop reads."""
 
+    lacks = {"model file": "it has no PLY: its checkpoints are its models"}  # noqa: RUF012
     rot_4d = True
     python = False
 
@@ -504,8 +495,7 @@ class RT4DGSHost(Host):
         super().write(root)
         (root / "gaussian_renderer" / "__init__.py").write_text(RENDERER)
         (root / "gaussian_renderer" / "diff_gaussian_rasterization.py").write_text(RASTERIZER)
-        own = {name for name in vars(Added) if callable(getattr(Added, name))}
-        own |= {"save_ply", "load_ply", "construct_list_of_attributes"}
+        own = ("save_ply", "load_ply", "construct_list_of_attributes")
         begin = "\n\nclass GaussianModel:\n"
         names = [(begin, f"\n\nATTRIBUTES = {ATTRIBUTES}\n{begin}")]
         change(root / "scene" / "gaussian_model.py", names, *own)
@@ -558,6 +548,7 @@ class RT4DGSHost(Host):
 class RigidHost(RT4DGSHost):
     """Without 4D rotation: the host's backward pass gives time and its scale zeros."""
 
+    variant = "without 4D rotation"
     rot_4d = False
 
     def parameters(self, model):
@@ -568,6 +559,7 @@ class RigidHost(RT4DGSHost):
 class PythonHost(RT4DGSHost):
     """Slicing in Python, and leaving out who is not there."""
 
+    variant = "sliced in Python"
     python = True
 
 

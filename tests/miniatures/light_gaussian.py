@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,7 +11,6 @@ import numpy as np
 import torch
 from torch.optim.lr_scheduler import ExponentialLR
 
-from fragprune_plugins import demo
 from fragprune_plugins.testing import Chance, Host
 from fragprune_plugins.testing.rewriting import changed
 
@@ -187,50 +185,6 @@ START = (
 PARSE = "    args = parser.parse_args()\n"
 
 
-def make(root: Path) -> Path:
-    """Write the host into a folder; returns it."""
-    shutil.copytree(Path(demo.__file__).with_name("host"), root, dirs_exist_ok=True)
-    renderer, model = root / "gaussian_renderer/__init__.py", root / "scene/gaussian_model.py"
-    text = changed(
-        renderer.read_text(),
-        [("debug=pipe.debug,\n", "debug=pipe.debug,\n        f_count=False,\n")],
-    )
-    counting = changed(
-        text[text.index("def render(") :],
-        [
-            ("def render(", "def count_render("),
-            ("f_count=False", "f_count=True"),
-            ("    image, radii =", "    count, score, image, radii ="),
-            (
-                '        "radii": radii,\n',
-                '        "radii": radii,\n        "gaussians_count": count,\n'
-                '        "important_score": score,\n',
-            ),
-        ],
-    )
-    renderer.write_text(text + "\n\n" + counting)
-    methods = "".join(inspect.getsourcelines(Added)[0][2:])
-    text = changed(model.read_text(), [("torch.optim.Adam(", "torch.optim.AdamW(")])
-    model.write_text(text + "\n" + methods)
-    functions = (prune_list, prune, last_checkpoint, begin, distil)
-    own = "\n\n".join(inspect.getsource(f) for f in functions)
-    text = changed((root / "train.py").read_text(), SCRIPT)
-    text = text.replace("if __name__", own + "\n\nif __name__")
-    train = changed(text, [(PARSE, FLAGS + PARSE + NO_START)])
-    finetune = changed(text, [(PARSE, FLAGS + START), (DENSIFY, "")])
-    call = text[text.index("    training(\n        lp.extract") :]
-    parse = TEACHING + PARSE
-    new_call = (
-        "    distil(lp.extract(args), op.extract(args), pp.extract(args), args.start_checkpoint)\n"
-    )
-    distilling = changed(text, [(PARSE, parse), (call, new_call)])
-    (root / "train_densify_prune.py").write_text(train)
-    (root / "prune_finetune.py").write_text(finetune)
-    (root / "distill_train.py").write_text(distilling)
-    (root / "train.py").unlink()
-    return root
-
-
 class LightGaussianHost(Host):
     """Pruning by a score, and densification without it."""
 
@@ -243,8 +197,56 @@ class LightGaussianHost(Host):
         "another band",
     )
 
-    def write(self, root):
-        make(root)
+    def write(self, root: Path) -> None:
+        super().write(root)
+        renderer, model = root / "gaussian_renderer/__init__.py", root / "scene/gaussian_model.py"
+        text = changed(
+            renderer.read_text(),
+            [("debug=pipe.debug,\n", "debug=pipe.debug,\n        f_count=False,\n")],
+        )
+        counting = changed(
+            text[text.index("def render(") :],
+            [
+                ("def render(", "def count_render("),
+                ("f_count=False", "f_count=True"),
+                ("    image, radii =", "    count, score, image, radii ="),
+                (
+                    '        "radii": radii,\n',
+                    '        "radii": radii,\n        "gaussians_count": count,\n'
+                    '        "important_score": score,\n',
+                ),
+            ],
+        )
+        renderer.write_text(text + "\n\n" + counting)
+        methods = "".join(inspect.getsourcelines(Added)[0][2:])
+        text = changed(model.read_text(), [("torch.optim.Adam(", "torch.optim.AdamW(")])
+        model.write_text(text + "\n" + methods)
+        functions = (prune_list, prune, last_checkpoint, begin, distil)
+        own = "\n\n".join(inspect.getsource(f) for f in functions)
+        text = changed((root / "train.py").read_text(), SCRIPT)
+        text = text.replace("if __name__", own + "\n\nif __name__")
+        train = changed(text, [(PARSE, FLAGS + PARSE + NO_START)])
+        finetune = changed(text, [(PARSE, FLAGS + START), (DENSIFY, "")])
+        call = text[text.index("    training(\n        lp.extract") :]
+        parse = TEACHING + PARSE
+        groups = ", ".join(f"{group}.extract(args)" for group in ("lp", "op", "pp"))
+        new_call = f"    distil({groups}, args.start_checkpoint)\n"
+        distilling = changed(text, [(PARSE, parse), (call, new_call)])
+        (root / "train_densify_prune.py").write_text(train)
+        (root / "prune_finetune.py").write_text(finetune)
+        (root / "distill_train.py").write_text(distilling)
+        (root / "train.py").unlink()
+
+    def model(self, arguments, count, *, seed, degree, setup):
+        model = super().model(arguments, count, seed=seed, degree=degree, setup=setup)
+        if setup:
+            model.scheduler = ExponentialLR(model.optimizer, gamma=0.9)
+        return model
+
+    def descend(self, model):
+        """The loop's own scheduler changes every rate."""
+        super().descend(model)
+        model.scheduler.step()
 
     def actions(self):
         return {

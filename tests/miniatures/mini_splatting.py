@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from light_gaussian_host import changed
 
 from fragprune_plugins.testing.host import Chance, Host
+from fragprune_plugins.testing.rewriting import changed
 
 args = SimpleNamespace()  # the host's scripts hold their options under this name
 

@@ -12,37 +12,19 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing import host as kit
 from fragprune_plugins.testing.host import MINIATURE as HOST
 from fragprune_plugins.testing.host import Running, imported
-from fragprune_plugins.testing.rewriting import rewrite
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 __all__ = [
     "HOST",
-    "TINY",
     "Running",
     "expect_ancestors",
     "identity",
     "imported",
     "joint",
     "label",
-    "rewrite",
     "running",
     "tensors",
 ]
-
-TINY = [
-    *("-r", "1", "--sh_degree", "1", "--eval"),
-    *("--densify_from_iter", "4", "--densification_interval", "5"),
-    *(
-        "--densify_until_iter",
-        "18",
-        "--densify_grad_threshold",
-        "0.0008",
-        "--opacity_reset_interval",
-        "3000",
-    ),
-    *("--test_iterations", "-1"),
-]
-"""Flags with which a run of a few dozen iterations densifies and prunes."""
 
 
 def running(

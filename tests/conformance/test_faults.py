@@ -1,0 +1,145 @@
+"""What one host alone can show of its adapter is found on that host."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+import pytest
+import torch
+from installed.gaussian_splatting_host import GaussianSplattingHost
+from installed.gsplat_host import GsplatHost
+from miniatures.compact_3dgs import CompactHost
+from miniatures.light_gaussian import LightGaussianHost
+from miniatures.mcmc import MCMCHost
+
+from fragprune_compact_3dgs import Compact3DGS
+from fragprune_gaussian_splatting import GaussianSplatting
+from fragprune_gsplat import ROWS, Gsplat
+from fragprune_light_gaussian import LightGaussian
+from fragprune_mcmc import MCMC
+from fragprune_plugins.hosts.adapter import RowTrace
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.testing import invariants
+from fragprune_plugins.testing.fresh import FreshProcessError, fresh
+
+
+def but(kind, attribute):
+    """An adapter's seams without those at an attribute."""
+    return tuple(seam for seam in kind.seams if seam.attribute != attribute)
+
+
+class Shaking(MCMC):
+    """Leaves the host the rate that its noise is made of."""
+
+    def still_rate(self, rate):
+        return rate
+
+
+class Growing(MCMC):
+    """Lets the host add Gaussians."""
+
+    seams = but(MCMC, "GaussianModel.add_new_gs")
+
+
+class Unchosen(MCMC):
+    """Does not know which rows a relocation copies."""
+
+    seams = but(MCMC, "GaussianModel._update_params")
+
+
+class Pruning(LightGaussian):
+    """Lets the host prune."""
+
+    seams = but(LightGaussian, "GaussianModel.prune_gaussians")
+
+
+class Unsorted(Compact3DGS):
+    """Takes no notice of the last sort."""
+
+    seams = but(Compact3DGS, "GaussianModel.sort_morton")
+
+
+class Resetting(Gsplat):
+    """Lets opacities be reset."""
+
+    seams = but(Gsplat, "reset_opa")
+
+
+class Inheriting(Gsplat):
+    """Gives children their parents' moments."""
+
+    @contextmanager
+    def tracing(self, *given):
+        with super().tracing(*given) as trace:
+            yield trace
+        trace.fresh = torch.zeros_like(trace.fresh)
+
+
+class Littering(Gsplat):
+    """Leaves its row numbers in the user's model."""
+
+    @contextmanager
+    def tracing(self, model, *given):
+        with super().tracing(model, *given) as trace:
+            yield trace
+        model[ROWS] = torch.nn.Parameter(torch.zeros(len(model["means"])), requires_grad=False)
+
+
+class Unexported(Gsplat):
+    """Writes no thresholds beside what is exported."""
+
+    seams = but(Gsplat, "export_splats")
+
+
+class Skipping(GaussianSplatting):
+    """Holds back the step in which opacities would be reset."""
+
+    def stand_still(self, wrapped, arguments):
+        return None
+
+
+class Untraced(GaussianSplatting):
+    """Thinks that densifiers leave rows where they were."""
+
+    @contextmanager
+    def tracing(self, *given):
+        yield RowTrace()
+
+
+class Misread(GaussianSplatting):
+    """Takes any call of the rasterizer for the one it answers."""
+
+    def fingerprint(self, repo):
+        return []
+
+
+@pytest.mark.parametrize(
+    ("check", "adapter", "host", "words"),
+    [
+        (invariants.freeze, Shaking, MCMCHost, "moved ['opacity', 'xyz']"),
+        (invariants.freeze, Growing, MCMCHost, "add made "),
+        (invariants.alignment, Unchosen, MCMCHost, "descends from"),
+        (invariants.freeze, Pruning, LightGaussianHost, "prune by score made "),
+        (invariants.alignment, Unsorted, CompactHost, "descends from"),
+        (invariants.freeze, Resetting, GsplatHost, "reset opacity changed opacities"),
+        (invariants.alignment, Inheriting, GsplatHost, "two rows have the moments of one"),
+        (invariants.neutral_is_the_host, Littering, GsplatHost, "became"),
+        (invariants.model_file, Unexported, GsplatHost, "no seam for SAVE"),
+        (invariants.freeze, Skipping, GaussianSplattingHost, "0 threshold steps of 4"),
+        (invariants.alignment, Untraced, GaussianSplattingHost, "one per threshold"),
+        (invariants.refuse, Misread, GaussianSplattingHost, "takes one value more"),
+    ],
+    ids=lambda value: getattr(value, "__name__", "words"),
+)
+def test_a_fault_is_found_on_the_host_that_shows_it(check, adapter, host, words, tmp_path):
+    driver, root = host(), tmp_path
+    if driver.package:
+        installed = HostRepo.installed(driver.package)
+        if installed is None:
+            pytest.skip(f"{driver.package} is not installed")
+        root = installed.root
+    else:
+        driver.write(root)
+    with pytest.raises(FreshProcessError) as caught:
+        fresh(check, invariants.Case(adapter(), driver, root, examples=5))
+    assert words in str(caught.value)

@@ -1,0 +1,15 @@
+from __future__ import annotations
+
+from installed.gaussian_splatting_host import GaussianSplattingHost, MCMCHost
+
+from fragprune_plugins.testing import AdapterConformance
+
+
+class TestGaussianSplatting(AdapterConformance):
+    adapter = "gaussian-splatting"
+    host = GaussianSplattingHost
+
+
+class TestGaussianSplattingMCMC(AdapterConformance):
+    adapter = "gaussian-splatting"
+    host = MCMCHost

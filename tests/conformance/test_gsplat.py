@@ -1,0 +1,10 @@
+from __future__ import annotations
+
+from installed.gsplat_host import GsplatHost
+
+from fragprune_plugins.testing import AdapterConformance
+
+
+class TestGsplat(AdapterConformance):
+    adapter = "gsplat"
+    host = GsplatHost

@@ -1,0 +1,52 @@
+"""Whole runs of a miniature's own scripts, and what must not have moved in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.injection.launch import RunOptions
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.testing import Host
+
+TINY = [
+    *("-r", "1", "--sh_degree", "1", "--eval"),
+    *("--densify_from_iter", "4", "--densification_interval", "5"),
+    *("--densify_until_iter", "18", "--densify_grad_threshold", "0.0008"),
+    *("--opacity_reset_interval", "3000", "--test_iterations", "-1"),
+]
+"""Flags with which a run of a few dozen iterations densifies and prunes."""
+
+OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=8, threshold_lr=0.3))
+FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
+
+
+def written(host: type[Host], root: Path) -> Path:
+    """The folder, a miniature now."""
+    host().write(root)
+    return root
+
+
+def command(script: Path, scene: object, out: object, iterations: int, *more: object) -> list[str]:
+    """The words that train on a scene."""
+    words = [script, "-s", scene, "-m", out, "--iterations", iterations, *TINY, *more]
+    return [str(word) for word in words]
+
+
+def frozen_differences(
+    before: Path, after: Path, read: Callable[[Path], Any] = read_ply
+) -> list[str]:
+    """In which tensors two files of a model differ, opacities aside."""
+    one, other = read(before), read(after)
+    return [name for name in FROZEN if not torch.equal(getattr(one, name), getattr(other, name))]
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    """Replace a passage of a miniature's source, which must be there."""
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
