@@ -419,7 +419,7 @@ class HostAdapter(ABC):
         """Names of param groups that stage 2 trains for ``--train``; None for all of them."""
 
     def elsewhere(self, model: Any) -> list[Tensor]:
-        """Parameters moved by an optimizer that is out of our reach; frozen as the rest is."""
+        """Parameters of an optimizer that is out of our reach, moved by what is drawn alone."""
         return []
 
     def _lacks(self, method: str, reason: str) -> NotImplementedError:

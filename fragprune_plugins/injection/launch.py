@@ -349,7 +349,7 @@ class _Runner:
         if not saved and newer:
             raise UsageError(
                 "--stage finetune",
-                f"nothing in {where} but what was written while thresholds learned",
+                f"nothing in {where} but what was learned here, or a control",
                 "what training alone wrote",
                 f"To go on from one of these files, name it with {flag}.",
             )

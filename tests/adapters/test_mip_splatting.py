@@ -232,7 +232,8 @@ def test_the_size_of_the_2d_filter_is_read_from_the_command_or_the_source(mini, 
 def test_a_point_cloud_alone_is_resumed(mini, photographs, trained, tmp_path):
     summary, _, _ = trained
     shutil.copytree(summary.model_after.parent, tmp_path / "point_cloud" / "iteration_28")
-    words = command(mini / "train.py", photographs, tmp_path, 20)
+    start = tmp_path / "point_cloud" / "iteration_28" / "point_cloud.ply"
+    words = command(mini / "train.py", photographs, tmp_path, 20, "--start_checkpoint", start)
     again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
     assert moved(again) == []
     first, second = (sidecar.load(s.model_after)[0] for s in (summary, again))

@@ -67,30 +67,35 @@ def test_what_is_taken_is_said_in_one_line(once, out, started):
 
 
 def test_results_do_not_compound_run_after_run(out, started):
-    first = (out / ply(16)).read_bytes()
+    first = (out / ply(17)).read_bytes()
     for _ in range(2):
         started(out, 10)
-        assert (out / ply(16)).read_bytes() == first
-        assert not (out / ply(22)).exists()
+        assert (out / ply(17)).read_bytes() == first
+        assert not (out / ply(24)).exists()
 
 
 def test_after_a_control_stage_two_starts_where_the_control_did(out, started):
-    shutil.rmtree(out / ply(16).parent)
     for _ in range(2):  # the second control is one as well
         assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10, options=CONTROL)
-        assert sidecar.load(out / ply(16))[0].neutral
+        assert sidecar.load(out / "control" / ply(17))[0].neutral
     assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10)
 
 
+def test_what_a_control_wrote_is_no_starting_point_in_its_own_folder(photographs, out, started):
+    started(out, 10, "--checkpoint_iterations", 13, options=CONTROL)
+    assert (out / "control" / "chkpnt13.pth").exists()
+    with pytest.raises(UsageError, match="but what was learned here, or a control"):
+        run(command(photographs, out / "control", 10), FINETUNE)
+
+
 def test_a_control_of_version_0_1_is_known_by_its_record(out, started):
-    sidecar.path_beside(out / ply(16)).unlink()  # it wrote none
-    records.leave(out / ply(16), "run", {})
+    sidecar.path_beside(out / ply(17)).unlink()  # it wrote none
+    records.leave(out / ply(17), "run", {})
     assert f"{out / 'chkpnt10.pth'}:" in started(out, 10)
 
 
-@pytest.mark.parametrize("options", [FINETUNE, CONTROL], ids=["learned", "control"])
-def test_checkpoints_of_stage_two_are_no_starting_points(out, started, options):
-    started(out, 10, "--checkpoint_iterations", 13, options=options)
+def test_checkpoints_of_stage_two_are_no_starting_points(out, started):
+    started(out, 10, "--checkpoint_iterations", 13)
     assert (out / "chkpnt13.pth").exists()
     assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10)
 
@@ -111,11 +116,11 @@ def test_training_again_as_long_leaves_an_old_checkpoint_behind(photographs, out
 
 
 def test_training_again_over_a_result_of_stage_two_makes_it_stage_ones(photographs, out, started):
-    run(command(photographs, out, 16), replace(OPTIONS, stage="off"))
+    run(command(photographs, out, 17), replace(OPTIONS, stage="off"))
     with pytest.raises(SidecarError, match="thresholds of another model"):
-        started(out, 16)
-    sidecar.path_beside(out / ply(16)).unlink()
-    assert f"iteration 16, {out / ply(16)}:" in started(out, 16)
+        started(out, 17)
+    sidecar.path_beside(out / ply(17)).unlink()
+    assert f"iteration 17, {out / ply(17)}:" in started(out, 17)
 
 
 def test_a_checkpoint_goes_before_the_ply_of_its_iteration(photographs, tmp_path, started):
@@ -131,14 +136,14 @@ def test_a_later_ply_goes_before_an_early_checkpoint(photographs, tmp_path, star
 
 
 def test_what_the_command_names_is_taken_also_of_stage_two(out, started):
-    learned = sidecar.load(out / ply(16))[0].steps
-    line = started(out, 10, "--start_checkpoint", out / ply(16))
-    assert line.endswith(f"iteration 16, {out / ply(16)}: the command names it")
-    assert sidecar.load(out / ply(22))[0].steps == 2 * learned
+    learned = sidecar.load(out / ply(17))[0].steps
+    line = started(out, 10, "--start_checkpoint", out / ply(17))
+    assert line.endswith(f"iteration 17, {out / ply(17)}: the command names it")
+    assert sidecar.load(out / ply(24))[0].steps == 2 * learned
     started(out, 10, "--checkpoint_iterations", 13)
     line = started(out, 10, "--start_checkpoint", out / "chkpnt13.pth")
     assert line.endswith(f"iteration 13, {out / 'chkpnt13.pth'}: the command names it")
-    assert sidecar.load(out / ply(19))[0].steps == 3 + learned
+    assert sidecar.load(out / ply(20))[0].steps == 3 + learned
 
 
 def test_a_ply_whose_folder_tells_no_iteration_is_a_usage_error(photographs, out):
@@ -151,7 +156,7 @@ def test_a_ply_whose_folder_tells_no_iteration_is_a_usage_error(photographs, out
 def test_a_folder_with_nothing_of_stage_one_says_how_to_go_on(photographs, out):
     (out / "chkpnt10.pth").unlink()
     shutil.rmtree(out / ply(10).parent)
-    with pytest.raises(UsageError, match="but what was written while thresholds learned") as caught:
+    with pytest.raises(UsageError, match="but what was learned here") as caught:
         run(command(photographs, out, 10), FINETUNE)
     assert "--start_checkpoint" in caught.value.remedy
 
