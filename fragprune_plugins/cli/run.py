@@ -196,7 +196,10 @@ def _describe(
             models = f"{summary.model_before} {summary.model_after}"
             lines.append(f"Compare: fragprune compare {models}")
     if summary.target_reached is False:
-        lines.append("The target speed-up was missed by more than 5%; see --help of finetune.")
+        lines.append(
+            f"The target of {summary.settings['target_speedup']:g}x fewer fragments was missed by "
+            "more than 5 % on the training views. More --iters or another target may help."
+        )
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "

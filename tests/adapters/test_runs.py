@@ -203,6 +203,7 @@ def test_train_then_finetune_then_render(photographs, tmp_path):
     assert frozen_differences(summary.model_before, summary.model_after) == []
     assert not torch.equal(before.opacity, after.opacity)
     store, _ = sidecar.load(summary.model_after)
+    assert store.steps == OPTIONS.settings.iterations  # though hosts take none in their last one
     assert len(store) == summary.gaussians == len(after.xyz)
     assert summary.fragments_after < summary.fragments_before
     assert [c["step"] for c in summary.curves] == list(range(1, 9))

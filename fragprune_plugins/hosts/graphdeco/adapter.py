@@ -367,7 +367,7 @@ class GraphdecoAdapter(HostAdapter):
                 "the host's command",
                 f"no {line.hold_out[-1]}: every view is trained on",
                 "views that are held out",
-                f"Add {line.hold_out[-1]} to both stages.",
+                f"Train with {line.hold_out[-1]}, from stage 1 on.",
             )
         return Photographs(
             Path(flags.source or ""),
