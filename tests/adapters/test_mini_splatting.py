@@ -98,14 +98,14 @@ TINY = [
     *("--densify_from_iter", "2", "--densification_interval", "4"),
     *("--densify_grad_threshold", "0.0008"),
 ]
-OWN = ["--depth_interval", 6, "--num_depth", 90, "--simp_iteration2", 13]
+OWN = ["--depth_interval", 6, "--num_depth", 240, "--simp_iteration2", 13]
 FLAGS = {
     "gs": ["--densify_until_iter", 10],
     "ms": ["--densify_until_iter", 10, "--simp_iteration1", 10, *OWN, "--imp_metric", "indoor"],
     "ms_d": ["--densify_until_iter", 10, *OWN],
 }
 OPTIONS = RunOptions(
-    device="cpu", engine="reference", settings=Settings(iterations=6, threshold_lr=0.3)
+    device="cpu", settings=Settings(iterations=6, threshold_lr=0.3)
 )
 
 

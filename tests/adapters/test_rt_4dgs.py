@@ -223,7 +223,6 @@ OptimizationParams:
 """
 OPTIONS = {
     "device": "cpu",
-    "engine": "reference",
     "settings": Settings(iterations=5, threshold_lr=0.3),
 }
 
