@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import shutil
 import subprocess
 import sys
@@ -28,6 +29,21 @@ def modules(package: str) -> list[str]:
         for path in folder.rglob("*.py")
         if not path.is_relative_to(HOST)
     )
+
+
+def imported(package: str) -> set[str]:
+    """Names of all modules that a package's source imports, wherever it does."""
+    folder = Path(find_spec(package).origin).parent
+    nodes = [
+        node
+        for path in folder.rglob("*.py")
+        if not path.is_relative_to(HOST)
+        for node in ast.walk(ast.parse(path.read_text()))
+    ]
+    return {
+        *(alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names),
+        *(node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)),
+    }
 
 
 MODULES = [module for package in PACKAGES for module in modules(package)]
@@ -105,6 +121,14 @@ def test_import_rules_hold():
     assert done.returncode == 0, done.stdout
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_of_ours_know_each_other_in_one_direction(package):
+    """Adapters know the core and not each other, the core no adapter, the oracle nobody."""
+    others = {name.split(".")[0] for name in imported(package)} - {package}
+    known = {"reference_renderer": set(), "fragprune_plugins": {"reference_renderer"}}
+    assert others & set(PACKAGES) <= known.get(package, {"fragprune_plugins"})
+
+
 @pytest.mark.parametrize("name", fragprune_plugins.__all__)
 def test_public_names_resolve(name):
     value = getattr(fragprune_plugins, name)
@@ -132,6 +156,8 @@ def test_the_shelf_is_no_package_and_every_book_on_it_is_an_entry_point():
     assert not (ROOT / "adapters" / "__init__.py").exists()
     loaded = load_plugins().loaded.values()
     assert set(ADAPTERS) <= set(loaded)
+    project = (ROOT / "pyproject.toml").read_text()
+    assert [adapter for adapter in ADAPTERS if project.count(adapter) != 1] == []
 
 
 def test_versions_agree():

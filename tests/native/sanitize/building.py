@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -39,16 +40,12 @@ def builds() -> list[str]:
     return [name for name, needs in binding.BUILDS.items() if needs & ~features == 0]
 
 
-def shipped_flags(build: str) -> tuple[list[str], list[str]]:
-    """Sources and compiler flags of a build as pyproject.toml has them."""
-    tomllib = pytest.importorskip("tomllib", reason="Python 3.10 cannot read pyproject.toml")
-    modules = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    for module in modules["ext-modules"]:
-        if module["name"].endswith(f"._cpu_{build}"):
-            macros = [f"-D{name}={value}" for name, value in module["define-macros"]]
-            kept = [flag for flag in module["extra-compile-args"] if not flag.startswith("-O")]
-            return [str(ROOT / source) for source in module["sources"]], kept + macros
-    raise LookupError(f"pyproject.toml builds no {build}")
+def shipped_flags(build: str) -> tuple[str, list[str]]:
+    """Source and compiler flags of a build as setup.py has them."""
+    shipped = runpy.run_path(str(ROOT / "setup.py"))
+    lanes, flags = shipped["BUILDS"][build]
+    kept = [flag for flag in flags if not flag.startswith("-O")]
+    return str(ROOT / shipped["SOURCE"]), [*kept, f"-DFP_LANES={lanes}"]
 
 
 @dataclass
@@ -65,17 +62,17 @@ class Toolchain:
     _objects: dict[tuple[str, ...], Future[Path]] = field(default_factory=dict)
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
 
-    def engine(self, build: str, sanitizers: tuple[str, ...]) -> list[Future[Path]]:
+    def engine(self, build: str, sanitizers: tuple[str, ...]) -> Future[Path]:
         """Start compiling the engine."""
-        sources, flags = shipped_flags(build)
-        return [self._object(source, *flags, *sanitizers) for source in sources]
+        source, flags = shipped_flags(build)
+        return self._object(source, *flags, *sanitizers)
 
     def program(self, source: str, build: str, sanitizers: tuple[str, ...]) -> Path:
         """Link one of the tests' programs with the engine."""
         include = f"-I{ROOT / 'fragprune_plugins/native/include'}"
         flags = ["-std=c++17", include, f"-I{TESTS / 'sanitize'}"]
         pending = [
-            *self.engine(build, sanitizers),
+            self.engine(build, sanitizers),
             self._object(str(TESTS / source), *flags, *sanitizers),
         ]
         objects = [str(job.result()) for job in pending]
