@@ -20,7 +20,7 @@ from fragprune_compact_3dgs import Compact3DGS
 from fragprune_lp_3dgs import LP3DGS
 from fragprune_plugins.errors import EngineError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.launch import HostFailed, RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
@@ -83,7 +83,7 @@ def test_lp_ends_in_its_own_error_and_stage_two_begins_from_what_it_saved(
     lp, photographs, tmp_path
 ):
     words = command(lp, photographs, tmp_path, 11, "--checkpoint_iterations", 11)
-    with pytest.raises(KeyError, match="ours_30000"):
+    with pytest.raises(HostFailed, match="ours_30000"):
         run(words, replace(OPTIONS, stage="off"))
     expect_fine_tuned(run(words, replace(OPTIONS, stage="finetune")))
 
@@ -91,12 +91,12 @@ def test_lp_ends_in_its_own_error_and_stage_two_begins_from_what_it_saved(
 def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
     """bw_score at iteration 12: 70 % stay; in stage 2, which passes it again, all do."""
     words = command(lp, photographs, tmp_path, 10, "--prune_method", "mini_splatting")
-    with pytest.raises(KeyError, match="ours_30000"):
+    with pytest.raises(HostFailed, match="ours_30000"):
         run([*words, "--iterations", "14"], replace(OPTIONS, stage="off"))
     (pruned,) = tmp_path.glob("point_cloud/iteration_14/point_cloud.ply")
     again = tmp_path / "again"
     words[words.index("-m") + 1] = str(again)
-    with pytest.raises(KeyError, match="ours_30000"):
+    with pytest.raises(HostFailed, match="ours_30000"):
         run(
             [*words, "--iterations", "11", "--checkpoint_iterations", "11"],
             replace(OPTIONS, stage="off"),
