@@ -9,10 +9,12 @@ import sys
 
 import pytest
 from cli.commands import run, run_json
-from miniature import HOST, TINY
+from miniatures.runs import TINY
+from miniatures.vanilla_3dgs import HOST
 from PIL import Image
 
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.testing import mutations
 
 WORDS = ["--device", "cpu", "--iters", 6]
@@ -129,7 +131,7 @@ def test_what_cannot_be_compared_says_why(scene, tmp_path):
 
 
 def test_a_host_that_raises_leaves_one_json_object_on_stdout(tmp_path):
-    host = mutations.copy_source(HOST, tmp_path / "host").root
+    host = mutations.copy_source(HostRepo(HOST), tmp_path / "host").root
     script = host / "train.py"
     script.write_text(script.read_text().replace("import torch\n", "import torch\n1 / 0\n", 1))
     result = run("run", "--device", "cpu", "--json", "--", script, "-s", tmp_path, "-m", "out")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from skeleton import skeleton
+from miniatures.skeletons import skeleton
 
 from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.demo import demo

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from miniature import HOST
+from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
 from fragprune_plugins.hosts.source import HostRepo

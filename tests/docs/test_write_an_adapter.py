@@ -55,6 +55,7 @@ def test_the_page_has_every_file_and_command():
     check = ["fragprune", "check"]
     assert words == [
         check,
+        check,
         ["pip", "install"],
         check,
         ["pytest", "test_soft_3dgs.py"],
