@@ -104,9 +104,7 @@ FLAGS = {
     "ms": ["--densify_until_iter", 10, "--simp_iteration1", 10, *OWN, "--imp_metric", "indoor"],
     "ms_d": ["--densify_until_iter", 10, *OWN],
 }
-OPTIONS = RunOptions(
-    device="cpu", settings=Settings(iterations=6, threshold_lr=0.3)
-)
+OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=6, threshold_lr=0.3))
 
 
 def command(mini, variant, scene, out, iterations, *more):
