@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import CliRunner
-from miniature import HOST, TINY, joint, running
+from miniatures.runs import TINY
+from miniatures.vanilla_3dgs import HOST, joint, running
 
 from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import DivergedError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 import torch
-from miniature import joint
+from miniatures.vanilla_3dgs import joint
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from fragprune_plugins.learning.schedule import Settings

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from miniature import HOST, TINY
+from miniatures.runs import TINY
+from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, _forget_modules, _host_process, run

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from miniature import HOST, TINY
+from miniatures.runs import TINY
+from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.errors import ModelFileError, SidecarError, UsageError
 from fragprune_plugins.injection.launch import HostFailed, RunOptions, run

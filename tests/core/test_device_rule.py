@@ -7,7 +7,7 @@ import contextlib
 import pytest
 import torch
 from cli.commands import run
-from skeleton import skeleton
+from miniatures.skeletons import skeleton
 
 from fragprune_plugins import engines
 from fragprune_plugins.errors import UsageError

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from miniature import HOST, joint, running
+from miniatures.vanilla_3dgs import HOST, joint, running
 
 from fragprune_plugins.errors import InputError, PluginError, UnknownHostError
 from fragprune_plugins.hosts.choosing import choose
