@@ -99,6 +99,8 @@ class EngineError(FragpruneError):
 class KernelError(EngineError):
     """Kernels that cannot be compiled for, or loaded into, a GPU."""
 
+    code = "kernel"
+
 
 class InputError(FragpruneError):
     """Tensors of the wrong shape, dtype or device."""

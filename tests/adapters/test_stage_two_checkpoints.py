@@ -38,7 +38,7 @@ def alone(words):
     known = set(sys.modules)
     with _host_process(Path(words[0]), words[1:], "cpu"):
         try:
-            session._install_stand_ins()
+            session.install_stand_ins()
             runpy.run_path(words[0], run_name="__main__")
         finally:
             session.deactivate()
