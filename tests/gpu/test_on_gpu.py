@@ -9,6 +9,8 @@ import torch
 from gpu.test_against_oracle import KINDS
 from native.test_dialects import dialect
 
+from fragprune_plugins.engines.cuda.comparison import compare
+from fragprune_plugins.engines.cuda.driver import Driver
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.testing import scenes
@@ -48,6 +50,10 @@ def test_images_and_gradients_equal_the_oracle(engine: CudaEngine, kind: str) ->
     for name, grad in expected.items():
         scale = grad.abs().max().item() + 1e-3
         assert (found[name] - grad).abs().max().item() < 3e-4 * scale, name
+
+
+def test_the_check_that_comes_before_use_is_passed() -> None:
+    assert compare(Driver(), torch.device("cuda:0")) == []
 
 
 def test_runs_agree_to_the_bit_at_size(engine: CudaEngine) -> None:
