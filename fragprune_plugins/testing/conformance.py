@@ -17,7 +17,7 @@ from fragprune_plugins.testing import invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
 from fragprune_plugins.testing.host import Host
 from fragprune_plugins.testing.invariants import Case
-from fragprune_plugins.testing.plugin import COVERED, NOT_APPLICABLE
+from fragprune_plugins.testing.plugin import COVERED
 
 MINIATURE, INSTALLED = "miniature", "installed"
 
@@ -83,7 +83,7 @@ class AdapterConformance:
                 try:
                     covered.append(fresh(*call))
                 except NotApplicable as reason:
-                    pytest.skip(f"{NOT_APPLICABLE}{reason}")
+                    pytest.skip(str(reason))
                 except FreshProcessError as error:
                     failure = str(error)
                 if failure:  # here, or pytest would print it twice

@@ -15,7 +15,8 @@ import pytest
 RESULTS = pytest.StashKey[list[dict[str, Any]]]()
 WHAT, COVERED = "fragprune invariant", "fragprune covered"
 NOT_APPLICABLE = "n/a: "
-"""Begins the reason where a promise cannot be asked of a host; other tests are skipped."""
+"""Begins the reason where a promise cannot be asked of a host; where this machine lacks something,
+the test is skipped."""
 _SIGNS = {"passed": "ok", "failed": "FAILED"}
 
 

@@ -15,6 +15,7 @@ from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing.fresh import NotApplicable
 from fragprune_plugins.testing.host import Host, Running, packages_of
+from fragprune_plugins.testing.plugin import NOT_APPLICABLE
 
 COUNT = 16
 
@@ -67,7 +68,7 @@ class Case:
             AssertionError: it says nothing, and a role has no seam.
         """
         if promise in self.driver.lacks:
-            raise NotApplicable(self.driver.lacks[promise])
+            raise NotApplicable(f"{NOT_APPLICABLE}{self.driver.lacks[promise]}")
         missing = [role.name for role in roles if not self.has(role)]
         where = f'{type(self.driver).__name__}.lacks["{promise}"]'
         require(not missing, f"no seam for {' and '.join(missing)}, and no reason in {where}")
