@@ -189,7 +189,7 @@ def test_the_engine_works_out_gradients_of_what_trains_alone(session_on, train, 
     with session_on(Gsplat(), settings=Settings(iterations=8, train=train)) as session:
         from gsplat import DefaultStrategy
 
-        params, optimizers = new_params()
+        params, optimizers = new_params(40)
         DefaultStrategy().check_sanity(params, optimizers)
         engine, asking = session.engine(torch.device("cpu")), []
         rasterize = engine.rasterize
