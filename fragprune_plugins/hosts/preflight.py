@@ -107,7 +107,7 @@ Module = tuple[HostRepo, str]
 
 def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterator[tuple[str, str]]:
     """Top-level names that a script imports and that are not the host's, and where."""
-    if repo.package:
+    if repo.package and script.is_relative_to(repo.root):  # else a script beside the package
         begin = repo, ".".join(script.relative_to(repo.root).with_suffix("").parts)
     else:
         begin = HostRepo(script.parent), script.stem
