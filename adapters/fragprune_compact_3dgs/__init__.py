@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from fragprune_plugins.errors import NotComparedError, UsageError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo, RowTrace
-from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter
-from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.seams import Role, Seam, revised
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 
@@ -33,6 +32,7 @@ class Compact3DGS(GraphdecoAdapter):
     """Compact-3DGS."""
 
     name = "compact-3dgs"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "Compact 3D Gaussian Representation",
         repo="maincold2/Compact-3DGS",
@@ -44,32 +44,16 @@ class Compact3DGS(GraphdecoAdapter):
             "colours are not in them.",
         ),
     )
+    groups = ("xyz", "opacity", "scaling", "rotation", "mask")
+    own_names = tuple(f"{MODEL}:{name}" for name in ("vq_scale", "recolor", "mlp_head"))
     seams = (
-        *(s for s in GraphdecoAdapter.seams if s.attribute != "GaussianModel.load_ply"),
+        *revised(GraphdecoAdapter.seams, {"GaussianModel.load_ply": None}),
         Seam(Role.LOAD, MODEL, "GaussianModel.load_model", ("path",)),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_npz", ("path",)),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_npz_pp", ("path",)),
         Seam(Role.STILL, MODEL, "GaussianModel.mask_prune"),
         Seam(Role.REARRANGE, MODEL, "GaussianModel.sort_morton"),
     )
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Codebooks and a hash grid in the model."""
-        findings = super().fingerprint(repo)
-        names = {"vq_scale", "recolor", "mlp_head"}
-        if missing := names - repo.mentions([MODEL], names).keys():
-            findings.insert(
-                0,
-                Finding(
-                    "error",
-                    "other-host",
-                    repo.place(MODEL, "GaussianModel"),
-                    f"no {', no '.join(sorted(missing))} in the model",
-                    "codebooks and a hash grid, as Compact-3DGS has them",
-                    "Use the adapter of that host.",
-                ),
-            )
-        return findings
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """Nothing can.

@@ -23,7 +23,7 @@ from fragprune_plugins.errors import (
 )
 from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo, RowTrace
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -104,7 +104,9 @@ class GaussianSplatting(GraphdecoAdapter):
     installed = (PACKAGE, MCMC, REDUCED)
     package = RASTERIZER
     renderer = MODEL
-    contracts = (Contract(frozenset({"antialiasing"}), 3, "GaussianModel.render"),)
+    calls = (RasterizerCall(frozenset({"antialiasing"}), 3, "GaussianModel.render"),)
+    scripts = (f"{PACKAGE}/train.py",)
+    dialect_type = PackageDialect
     seams = (
         Seam(Role.ATTACH, f"{TRAINER}.base", "BaseTrainer.__init__", ("model",)),
         Seam(Role.STEP, f"{TRAINER}.abc", "AbstractTrainer.update_learning_rate"),

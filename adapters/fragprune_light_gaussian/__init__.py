@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -57,6 +56,7 @@ class LightGaussian(GraphdecoAdapter):
     """LightGaussian."""
 
     name = "light-gaussian"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "LightGaussian",
         repo="VITA-Group/LightGaussian",
@@ -65,10 +65,11 @@ class LightGaussian(GraphdecoAdapter):
             "VecTree and render.py --load_vq know no thresholds: their pictures are untruncated.",
         ),
     )
-    contracts = (
-        Contract(frozenset({"f_count"})),
-        Contract(frozenset({"f_count"}), 4, "count_render"),
+    calls = (
+        RasterizerCall(frozenset({"f_count"})),
+        RasterizerCall(frozenset({"f_count"}), 4, "count_render"),
     )
+    dialect_type = LightGaussianDialect
     scripts = (TRAIN, PRUNE, DISTIL)
     optimizer = "AdamW"
     seams = (
@@ -79,19 +80,6 @@ class LightGaussian(GraphdecoAdapter):
         Seam(Role.STILL, MODEL, "GaussianModel.densify"),
         Seam(Role.LOAD, MODEL, "GaussianModel.load_ply_sh", ("path",)),
     )
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """A rasterizer that counts, and the three training scripts."""
-        found = [f"no {name}" for name in self.scripts if not (repo.root / name).is_file()]
-        if "f_count" not in self.dialect(repo).settings:
-            found.insert(0, "no f_count among the rasterizer's settings")
-        if found and repo.path("train"):
-            found.append("but train.py, as vanilla 3DGS has it")
-        return [*self.other_host(repo, found), *super().fingerprint(repo)]
-
-    def dialect(self, repo: HostRepo) -> LightGaussianDialect:
-        """As the lineage reads it from ``render``."""
-        return LightGaussianDialect(**vars(super().dialect(repo)))
 
     def command_line(self, repo: HostRepo) -> CommandLine:
         """Pruning and distillation are given a checkpoint to work on."""

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.errors import EngineError, UsageError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
@@ -69,6 +68,7 @@ class LP3DGS(GraphdecoAdapter):
     """LP-3DGS."""
 
     name = "lp-3dgs"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "LP-3DGS",
         repo="ASU-ESIC-FAN-Lab/LP-3DGS",
@@ -80,7 +80,8 @@ class LP3DGS(GraphdecoAdapter):
             "it has saved: begin stage 2 with --stage finetune then.",
         ),
     )
-    contracts = (Contract(frozenset(SCORES), None),)
+    calls = (RasterizerCall(frozenset(SCORES), None),)
+    dialect_type = LP3DGSDialect
     seams = (
         *GraphdecoAdapter.seams,
         *(
@@ -95,10 +96,6 @@ class LP3DGS(GraphdecoAdapter):
         Seam(Role.STILL, "metrics", "evaluate", ("model_paths",)),
         Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
     )
-
-    def dialect(self, repo: HostRepo) -> LP3DGSDialect:
-        """As the lineage reads it."""
-        return LP3DGSDialect(**vars(super().dialect(repo)))
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The same script; one of its models is another.

@@ -13,8 +13,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from fragprune_plugins.types import RasterOutputs
 
 MODEL = "scene.gaussian_model"
-RELOCATION = "utils.reloc_utils"
 
 
 @dataclass(frozen=True)
@@ -53,6 +51,7 @@ class MCMC(GraphdecoAdapter):
     """3DGS-MCMC."""
 
     name = "mcmc"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "3D Gaussian Splatting as Markov Chain Monte Carlo",
         repo="ubc-vision/3dgs-mcmc",
@@ -61,7 +60,9 @@ class MCMC(GraphdecoAdapter):
             "Ours clips at 3 sigma, as the rasterizer it pins; that one's branch gs-mcmc at 1.8.",
         ),
     )
-    contracts = (Contract(outputs=3),)
+    calls = (RasterizerCall(outputs=3),)
+    own_names = ("utils.reloc_utils:compute_relocation",)
+    dialect_type = MCMCDialect
     seams = (
         *GraphdecoAdapter.seams,
         Seam(Role.CHOICE, MODEL, "GaussianModel._update_params", ("idxs", "ratio")),
@@ -69,24 +70,6 @@ class MCMC(GraphdecoAdapter):
         Seam(Role.FORGET, MODEL, "GaussianModel.replace_tensors_to_optimizer", ("inds",)),
         Seam(Role.STILL, MODEL, "GaussianModel.add_new_gs", ("cap_max",)),
     )
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Relocation by the rasterizer package's formula."""
-        if repo.mentions([RELOCATION], ["compute_relocation"]):
-            return super().fingerprint(repo)
-        missing = Finding(
-            "error",
-            "no-relocation",
-            RELOCATION,
-            "no use of the rasterizer package's compute_relocation",
-            "one, as 3DGS-MCMC has it",
-            "Use the adapter of that host.",
-        )
-        return [missing, *super().fingerprint(repo)]
-
-    def dialect(self, repo: HostRepo) -> MCMCDialect:
-        """As the lineage reads it."""
-        return MCMCDialect(**vars(super().dialect(repo)))
 
     def command_line(self, repo: HostRepo) -> CommandLine:
         """The lineage's, and a configuration file whose values win over the flags."""

@@ -15,10 +15,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
@@ -83,17 +81,19 @@ class MiniSplatting(GraphdecoAdapter):
     """Mini-Splatting and Mini-Splatting-D."""
 
     name = "mini-splatting"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "Mini-Splatting",
         repo="fatPeter/mini-splatting",
         states="gs, ms, ms_d and ms_c",
         limits=("--compute_cov3D_python is refused where the host asks for depth (ms, ms_d).",),
     )
-    contracts = (
-        Contract(),
-        Contract(outputs=5, function="render_imp"),
-        Contract(outputs=None, function="render_depth"),
+    calls = (
+        RasterizerCall(),
+        RasterizerCall(outputs=5, function="render_imp", package=SCORING),
+        RasterizerCall(outputs=None, function="render_depth", package=SCORING),
     )
+    dialect_type = MiniSplattingDialect
     scripts = SCRIPTS
     seams = (
         *GraphdecoAdapter.seams,
@@ -116,27 +116,6 @@ class MiniSplatting(GraphdecoAdapter):
         Seam(Role.PACK, "numpy", "savez_compressed", ("file", "args"), external=True),
         Seam(Role.UNPACK, "numpy", "load", ("file",), external=True),
     )
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """The training scripts in their folders."""
-        missing = [name for name in self.scripts if not (repo.root / name).is_file()]
-        if not missing:
-            return super().fingerprint(repo)
-        return [
-            *super().fingerprint(repo),
-            Finding(
-                "error",
-                "other-host",
-                str(repo.root),
-                f"no {', no '.join(missing)}",
-                "a Mini-Splatting checkout",
-                "Use the adapter of that host.",
-            ),
-        ]
-
-    def dialect(self, repo: HostRepo) -> MiniSplattingDialect:
-        """As the lineage reads it from ``render``."""
-        return MiniSplattingDialect(**vars(super().dialect(repo)))
 
     def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
         """The masked split takes the rows under the mask besides."""

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.hosts.graphdeco.adapter import default, reaches
-from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_plugins.hosts.graphdeco.adapter import CLONE, SPLIT, default, reaches
+from fragprune_plugins.hosts.seams import Role, Seam, revised
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 
@@ -32,14 +31,6 @@ if TYPE_CHECKING:
 
 MODEL = "scene.gaussian_model"
 KERNEL_SIZE = 0.1
-OWN = (
-    *("kernel_size", "subpixel_offset", "grads_abs", "grad_abs_threshold"),
-    *("compute_3D_filter", "get_opacity_with_3D_filter", "filter_3D"),
-)
-"""Settings of the rasterizer, parameters of densification and members of the model."""
-
-DESCENDANTS = ("view2gaussian_precomp", "get_view2gaussian", "integrate")
-"""Names of Gaussian Opacity Fields and what descends from it: they keep all of the host's own."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +54,15 @@ class MipDialect(GraphdecoDialect):
         }
 
 
+ABSOLUTE = ("grads_abs", "grad_abs_threshold")
+"""What densification is given besides vanilla's gradients and their threshold."""
+
+
 class MipSplatting(GraphdecoAdapter):
     """Mip-Splatting."""
 
     name = "mip-splatting"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "Mip-Splatting",
         repo="autonomousvision/mip-splatting",
@@ -75,27 +71,19 @@ class MipSplatting(GraphdecoAdapter):
             "fragprune finetune, render and compare take create_fused_ply.py's PLY, not its own.",
         ),
     )
-    contracts = (Contract(frozenset({"kernel_size", "subpixel_offset"})),)
+    calls = (RasterizerCall(frozenset({"kernel_size", "subpixel_offset"})),)
+    own_names = tuple(
+        f"{MODEL}:{name}"
+        for name in ("compute_3D_filter", "get_opacity_with_3D_filter", "filter_3D")
+    )
+    dialect_type = MipDialect
     seams = (
-        *GraphdecoAdapter.seams,
+        *revised(
+            GraphdecoAdapter.seams,
+            {seam.attribute: {"needs": (*seam.needs, *ABSOLUTE)} for seam in (CLONE, SPLIT)},
+        ),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_fused_ply", ("path",)),
     )
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Both filters and the absolute gradients, and nothing of what descends from it."""
-        own = {
-            **dict.fromkeys(self.dialect(repo).settings),
-            **dict.fromkeys(repo.parameters(MODEL, "GaussianModel.densify_and_split") or ()),
-            **repo.mentions([MODEL], OWN),
-        }
-        cousins = repo.mentions(("gaussian_renderer", MODEL, "train"), DESCENDANTS)
-        found = [f"no {name}" for name in OWN if name not in own]
-        found += [f"{name} ({at}), which a descendant has" for name, at in cousins.items()]
-        return [*self.other_host(repo, found), *super().fingerprint(repo)]
-
-    def dialect(self, repo: HostRepo) -> MipDialect:
-        """As the lineage reads it from ``render``."""
-        return MipDialect(**vars(super().dialect(repo)))
 
     def opacities(self, model: Any) -> Tensor:
         """(N,) as they are drawn: dimmed by the 3D filter."""

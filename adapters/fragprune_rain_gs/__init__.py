@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.hosts.seams import Role
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_plugins.hosts.graphdeco.adapter import SPLIT
+from fragprune_plugins.hosts.seams import revised
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 MODEL = "scene.gaussian_model"
 PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 """Inside the checkout, and compiled when it is imported."""
-
-OWN = ("low_pass", "divide_ratio", "abe_split", "args_dict")
-"""A setting of the rasterizer and parameters of the model, of its split and of the scene."""
 
 SMALLER = {
     **dict.fromkeys(("bicycle", "flowers", "garden", "stump", "treehill"), "images_4"),
@@ -68,6 +65,7 @@ class RainGS(GraphdecoAdapter):
     """RAIN-GS."""
 
     name = "rain-gs"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "RAIN-GS",
         repo="KU-CVLAB/RAIN-GS",
@@ -75,33 +73,21 @@ class RainGS(GraphdecoAdapter):
         limits=("Stage 2 leaves its modes out (--ours, --ours_new, --c2f): they cannot resume.",),
     )
     package = PACKAGE
-    contracts = (Contract(frozenset({"low_pass"}), 3),)
+    calls = (RasterizerCall(frozenset({"low_pass"}), 3),)
+    own_names = (f"{MODEL}:divide_ratio", "scene:args_dict", f"{PACKAGE}:GaussianRasterizer")
+    dialect_type = RainDialect
     steps_by_rendering = True
-    seams = tuple(
-        replace(seam, module=PACKAGE) if seam.role is Role.RASTERIZE else seam
-        for seam in GraphdecoAdapter.seams
+    seams = revised(
+        GraphdecoAdapter.seams,
+        {
+            "GaussianRasterizer.forward": {"module": PACKAGE},
+            SPLIT.attribute: {"needs": (*SPLIT.needs, "abe_split")},
+        },
     )
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """The dilation, the far split, and the rasterizer inside the checkout."""
-        own = {
-            *self.dialect(repo).settings,
-            *(repo.parameters(MODEL, "GaussianModel.__init__") or ()),
-            *(repo.parameters(MODEL, "GaussianModel.densify_and_split") or ()),
-            *(repo.parameters("scene", "Scene.__init__") or ()),
-        }
-        missing = [f"no {name}" for name in OWN if name not in own]
-        if repo.path(PACKAGE) is None:
-            missing.append(f"no {PACKAGE}")
-        return [*self.other_host(repo, missing), *super().fingerprint(repo)]
-
-    def dialect(self, repo: HostRepo) -> RainDialect:
-        """As the lineage reads it from ``render``."""
-        return RainDialect(**vars(super().dialect(repo)))
 
     def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
         """A far split appends N - 1 copies of each row before it appends N children."""
-        copies = 2 * arguments["N"] - 1 if arguments.get("abe_split") else arguments.get("N", 1)
+        copies = 2 * arguments["N"] - 1 if arguments["abe_split"] else arguments.get("N", 1)
         return super().parents(model, method, {**arguments, "N": copies})
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:

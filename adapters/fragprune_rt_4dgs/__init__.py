@@ -20,27 +20,24 @@ from fragprune_plugins.errors import (
     UsageError,
 )
 from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter
-from fragprune_plugins.hosts.seams import Role
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, RasterizerCall
+from fragprune_plugins.hosts.seams import revised
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_rt_4dgs.config import YAMLFile
-from fragprune_rt_4dgs.dialect import OUTPUTS, RASTERIZER, SETTINGS, RT4DGSDialect
+from fragprune_rt_4dgs.dialect import ARGUMENTS, OUTPUTS, RASTERIZER, SETTINGS, RT4DGSDialect
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 MODEL = "scene.gaussian_model"
 
-OWN = ("flow_2d", "ts", "scales_t", "rotations_r", "prefilter_var")
-"""What its rasterizer takes and vanilla's does not."""
-
 
 class RT4DGS(GraphdecoAdapter):
     """RT-4DGS, with and without 4D rotation."""
 
     name = "rt-4dgs"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "RT-4DGS",
         repo="fudan-zvg/4d-gaussian-splatting",
@@ -51,26 +48,19 @@ class RT4DGS(GraphdecoAdapter):
         ),
     )
     package = RASTERIZER
-    contracts = (Contract(SETTINGS, OUTPUTS),)
+    calls = (RasterizerCall(SETTINGS, OUTPUTS, arguments=ARGUMENTS),)
+    groups = (*GraphdecoAdapter.groups, "t", "scaling_t", "rotation_r")
+    own_names = (f"{MODEL}:get_marginal_t", f"{RASTERIZER}:GaussianRasterizer")
+    dialect_type = RT4DGSDialect
     gradients_read = frozenset({"t"})
-    seams = tuple(
-        replace(seam, module=RASTERIZER) if seam.role is Role.RASTERIZE else seam
-        for seam in GraphdecoAdapter.seams
-        if seam.role not in (Role.SAVE, Role.LOAD)
+    seams = revised(
+        GraphdecoAdapter.seams,
+        {
+            "GaussianRasterizer.forward": {"module": RASTERIZER},
+            "GaussianModel.save_ply": None,
+            "GaussianModel.load_ply": None,
+        },
     )
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Gaussians with a marginal in time, and a rasterizer of their own inside the host."""
-        found = []
-        if not repo.function(MODEL, "GaussianModel.get_marginal_t"):
-            found.append("no get_marginal_t")
-        taken = repo.parameters(RASTERIZER, "GaussianRasterizer.forward") or ()
-        found += [f"no {name} for {RASTERIZER}" for name in OWN if name not in taken]
-        return [*super().fingerprint(repo), *self.other_host(repo, found)]
-
-    def dialect(self, repo: HostRepo) -> RT4DGSDialect:
-        """As the lineage reads it from ``render``."""
-        return RT4DGSDialect(**vars(super().dialect(repo)))
 
     # -- its command line ------------------------------------------------------------------------
 

@@ -23,6 +23,9 @@ SETTINGS = frozenset(
 )
 """Those that vanilla does not have."""
 
+ARGUMENTS = frozenset(("flow_2d", "ts", "scales_t", "rotations_r", "prefilter_var"))
+"""Likewise, of the call."""
+
 OUTPUTS = 6
 
 

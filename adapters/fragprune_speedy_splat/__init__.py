@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter, GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
@@ -66,6 +64,7 @@ class SpeedySplat(GraphdecoAdapter):
     """Speedy-Splat."""
 
     name = "speedy-splat"
+    descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "Speedy-Splat",
         repo="j-alex-hanson/speedy-splat",
@@ -76,33 +75,14 @@ class SpeedySplat(GraphdecoAdapter):
             "rasterizer also draws fragments beyond, of an alpha below 0.0111.",
         ),
     )
-    contracts = (Contract(outputs=3),)
+    calls = (RasterizerCall(outputs=3, arguments=frozenset({"scores"})),)
+    own_names = ("gaussian_renderer:kernel_times",)
+    dialect_type = SpeedySplatDialect
     seams = (
         *GraphdecoAdapter.seams,
         Seam(Role.STILL, "scene.gaussian_model", "GaussianModel.prune_gaussians"),
         Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
     )
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Kernel times among the rasterizer's outputs."""
-        findings = super().fingerprint(repo)
-        if repo.mentions(["gaussian_renderer"], ["kernel_times"]):
-            return findings
-        return [
-            *findings,
-            Finding(
-                "error",
-                "other-host",
-                repo.place("gaussian_renderer", "render"),
-                "no kernel_times among what the rasterizer returns",
-                "them, as Speedy-Splat has it",
-                "Use the adapter of that host.",
-            ),
-        ]
-
-    def dialect(self, repo: HostRepo) -> SpeedySplatDialect:
-        """As the lineage reads it."""
-        return SpeedySplatDialect(**vars(super().dialect(repo)))
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The same script, without pruning: its scores would be computed for nothing."""

@@ -15,30 +15,13 @@ from typing import Any
 
 from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import Contract, GraphdecoAdapter
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.hosts.graphdeco.adapter import MODEL
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
 
 OUTPUTS = 3
 """Colour, radii and, since August 2024, inverse depth."""
-
-OTHER_HOSTS = {
-    "compute_3D_filter": "Mip-Splatting",
-    "relocate_gs": "3DGS-MCMC",
-    "divide_ratio": "RAIN-GS",
-    "count_render": "LightGaussian",
-    "render_imp": "Mini-Splatting",
-    "get_marginal_t": "RT-4DGS",
-    "bw_score": "LP-3DGS",
-    "kernel_times": "Speedy-Splat",
-    "vq_scale": "Compact-3DGS",
-    "clamp_color": "c3dgs",
-    "get_view2gaussian": "Gaussian Opacity Fields",
-    "depth_ratio": "2D Gaussian Splatting",
-    "_deformation": "4DGaussians",
-}
-"""Names that vanilla does not have and a descendant does."""
 
 
 class Vanilla3DGS(GraphdecoAdapter):
@@ -52,28 +35,14 @@ class Vanilla3DGS(GraphdecoAdapter):
         "(separate_sh, sparse Adam)",
         limits=("With --antialiasing or --train_test_exp run does not compare before and after.",),
     )
-    contracts = (Contract(), Contract(frozenset({"antialiasing"}), OUTPUTS))
+    calls = (
+        RasterizerCall(),
+        RasterizerCall(frozenset({"antialiasing"}), OUTPUTS, arguments=frozenset({"dc"})),
+    )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """The revision found, or the descendant whose names occur."""
-        mentioned = repo.mentions(
-            ("train", "gaussian_renderer", "scene.gaussian_model"), OTHER_HOSTS
-        )
-        findings = [
-            Finding(
-                "error",
-                "other-host",
-                where,
-                f"{name}, which belongs to {OTHER_HOSTS[name]}",
-                "a vanilla 3DGS checkout",
-                "Use the adapter of that host.",
-            )
-            for name, where in mentioned.items()
-        ]
-        missing = super().fingerprint(repo)
-        if not missing:
-            findings.append(self._state(repo))
-        return [*findings, *missing]
+        """The revision, where nothing speaks against this host."""
+        return super().fingerprint(repo) or [self._state(repo)]
 
     def _state(self, repo: HostRepo) -> Finding:
         """The revision, for people; an error where it has no checkpoints to resume."""

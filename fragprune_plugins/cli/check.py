@@ -34,7 +34,7 @@ def command(host: Path, adapter: str | None, verbose: bool) -> Report:
       fragprune check gsplat                                    (an installed package)
     """
     from fragprune_plugins.errors import UnknownHostError
-    from fragprune_plugins.hosts.choosing import attempt
+    from fragprune_plugins.hosts.choosing import attempt, closest
     from fragprune_plugins.hosts.preflight import install
     from fragprune_plugins.hosts.source import HostRepo
     from fragprune_plugins.plugins.loading import load_plugins
@@ -55,7 +55,8 @@ def command(host: Path, adapter: str | None, verbose: bool) -> Report:
             )
     repo = _repository(host, adapters, adapter)
     tried = attempt(repo, adapters)
-    fitting = [each for each in tried if each.match.fits]
+    closer = closest([each.adapter for each in tried if each.match.fits], adapters)
+    fitting = [each for each in tried if each.adapter in closer]
     verdict = fitting[0] if len(fitting) == 1 else None
     missing = _missing(repo, verdict.adapter) if verdict else []
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
@@ -82,9 +83,20 @@ def _in_short(tried: list[Tried], fitting: list[Tried]) -> list[str]:
     shown = fitting or [each for each in tried if each.held]
     if not shown:
         return [f"None of {len(tried)} adapters finds anything of its host."]
-    others = len(tried) - len(shown)
+    ancestors = [each for each in tried if each.match.fits and each not in shown]
+    others = len(tried) - len(shown) - len(ancestors)
     why = "do not fit (--verbose says why)" if fitting else "find nothing of their hosts"
-    return [*(each.brief() for each in shown), *([f"{others} others {why}."] if others else [])]
+    return [
+        *(each.brief() for each in shown),
+        *(f"{each.verdict()}; {_aside(each, fitting)}" for each in ancestors),
+        *([f"{others} others {why}."] if others else []),
+    ]
+
+
+def _aside(tried: Tried, fitting: list[Tried]) -> str:
+    """Why an adapter is not among those that fit best."""
+    nearer = ", ".join(each.adapter.name for each in fitting)
+    return str(tried.errors[0]) if tried.errors else f"{nearer} descends from it"
 
 
 _SIGNS = {"missing": "MISSING in", "changed": "CHANGED at", "at import": "(checked at import)"}
@@ -107,7 +119,7 @@ def _in_full(tried: list[Tried], fitting: list[Tried]) -> list[str]:
             lines += ["  What will not work:", *(f"  - {limit}" for limit in info.limits)]
     others = [each for each in tried if each not in shown]
     lines += ["", "Others:"] if others else []
-    return [*lines, *(f"  {each.verdict()}; {each.errors[0]}" for each in others)]
+    return [*lines, *(f"  {each.verdict()}; {_aside(each, fitting)}" for each in others)]
 
 
 def _as_dict(tried: Tried) -> dict[str, Any]:

@@ -285,6 +285,8 @@ class HostAdapter(ABC):
     name: str
     info: HostInfo
     seams: tuple[Seam, ...]
+    descends_from: tuple[str, ...] = ()
+    """Names of adapters whose hosts this one was made from: where they fit too, they step back."""
     installed: tuple[str, ...] = ()
     """Import names of the packages that are the host, where it is installed, not checked out."""
     steps_by_rendering = False

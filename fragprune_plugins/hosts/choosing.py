@@ -112,6 +112,8 @@ def choose(
 ) -> HostAdapter:
     """The adapter for a checkout: the one asked for, or the only one that fits.
 
+    Where the adapters of a host and of an ancestor of it both fit, it is the host's: ``closest``.
+
     Args:
         repo: the checkout.
         adapters: to choose from.
@@ -128,17 +130,20 @@ def choose(
         )
     wanted = [by_name[name.replace("_", "-")]] if name else list(adapters)
     matches = [(adapter, adapter.match(repo)) for adapter in wanted]
-    fitting = [adapter for adapter, match in matches if match.fits]
+    fitting = closest([adapter for adapter, match in matches if match.fits], adapters)
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:
+        others = [a.name for a in adapters if a not in wanted and a.match(repo).fits]
         raise UnknownHostError(
             str(repo.root),
             f"no adapter fits ({_nearest(repo, wanted)})",
             "a codebase that an installed adapter knows",
-            "Run fragprune check on the folder to see more, or write an adapter.",
+            f"Choose {' or '.join(others)}, which fits."
+            if others
+            else "Run fragprune check on the folder to see more, or write an adapter.",
         )
-    tied = [match for _, match in matches if match.fits]
+    tied = [match for adapter, match in matches if adapter in fitting]
     selected = select(repo=repo, matches=tied) if select else None
     for adapter in fitting:
         if adapter.name == selected:
@@ -159,3 +164,20 @@ def _nearest(repo: HostRepo, adapters: Sequence[HostAdapter]) -> str:
     if len(adapters) == 1:
         return f"{best.adapter.name}: {'; '.join(map(str, best.errors[:1]))}"
     return f"the nearest, {best.brief()}" if best.held else "none finds anything of its host"
+
+
+def closest(fitting: Sequence[HostAdapter], adapters: Sequence[HostAdapter]) -> list[HostAdapter]:
+    """Those of the adapters that fit which no other of them descends from.
+
+    Args:
+        fitting: adapters that fit a checkout.
+        adapters: all there are, for the way from a host to an ancestor of its ancestors.
+    """
+    parents = {adapter.name: adapter.descends_from for adapter in adapters}
+    ancestors: set[str] = set()
+    for adapter in fitting:
+        new = set(adapter.descends_from)
+        while new := new - ancestors:
+            ancestors |= new
+            new = {name for each in new for name in parents.get(each, ())}
+    return [adapter for adapter in fitting if adapter.name not in ancestors] or list(fitting)

@@ -6,8 +6,10 @@ undone; a procedure cannot.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 
 class Role(Enum):
@@ -57,3 +59,22 @@ class Seam:
 
     def __str__(self) -> str:
         return f"{self.module}:{self.attribute}"
+
+
+def revised(
+    seams: Iterable[Seam], changes: Mapping[str, Mapping[str, Any] | None]
+) -> tuple[Seam, ...]:
+    """A table of seams as a descendant has it.
+
+    Args:
+        seams: the ancestor's.
+        changes: other fields of a seam, by its attribute; None leaves it out.
+
+    Raises:
+        ValueError: a seam that is changed is not there.
+    """
+    table = tuple(seams)
+    if missing := changes.keys() - {seam.attribute for seam in table}:
+        raise ValueError(f"no seam at {', '.join(sorted(missing))}")
+    fields = ((seam, changes.get(seam.attribute, {})) for seam in table)
+    return tuple(replace(seam, **new) for seam, new in fields if new is not None)

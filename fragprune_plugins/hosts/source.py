@@ -133,6 +133,15 @@ class HostRepo:
             and node.func.id == name
         ]
 
+    def absolute(self, module: str, node: ast.ImportFrom) -> str:
+        """The dotted name that a ``from ... import`` in a module means, relative ones resolved."""
+        if not node.level:
+            return node.module or ""
+        path = self.path(module)
+        up = node.level - (path is not None and path.name == "__init__.py")
+        parts = module.split(".")
+        return ".".join([*parts[: len(parts) - up], *([node.module] if node.module else [])])
+
     def mentions(self, modules: Iterable[str], names: Iterable[str]) -> dict[str, str]:
         """Which of the names occur as identifiers, attributes or parameters, and where."""
         wanted = set(names)

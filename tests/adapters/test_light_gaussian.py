@@ -48,7 +48,7 @@ RENDERER = "gaussian_renderer/__init__.py"
 @pytest.mark.parametrize(
     ("file", "old", "new", "code"),
     [
-        (RENDERER, "f_count", "f_counts", "other-host"),
+        (RENDERER, "f_count", "f_counts", "rasterizer-call"),
         (RENDERER, "GaussianRasterizationSettings(", "S(", "rasterizer-call"),
     ],
 )

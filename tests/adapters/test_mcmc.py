@@ -46,7 +46,7 @@ MODEL = "scene/gaussian_model.py"
 @pytest.mark.parametrize(
     ("file", "old", "new", "code"),
     [
-        ("utils/reloc_utils.py", "compute_relocation", "another", "no-relocation"),
+        ("utils/reloc_utils.py", "compute_relocation", "another", "other-host"),
         ("gaussian_renderer/__init__.py", "radii, is_used =", "radii =", "rasterizer-call"),
         (
             "gaussian_renderer/__init__.py",

@@ -46,17 +46,11 @@ RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
 @pytest.mark.parametrize(
     ("file", "old", "new", "found"),
     [
-        (RENDERER, "        kernel_size=kernel_size,\n", "", "no kernel_size"),
-        (RENDERER, "        subpixel_offset=", "        offset=", "no subpixel_offset"),
+        (RENDERER, "        kernel_size=kernel_size,\n", "", "subpixel_offset besides"),
+        (RENDERER, "        subpixel_offset=", "        offset=", "kernel_size, offset besides"),
         (MODEL, "compute_3D_filter", "compute_filter", "no compute_3D_filter"),
-        (MODEL, "grads_abs", "absolute", "no grads_abs"),
-        (
-            MODEL,
-            "    def _both",
-            "    def get_view2gaussian(self): ...\n    def _both",
-            "descendant",
-        ),
-        (RENDERER, "def render(", "def integrate(): ...\ndef render(", "descendant"),
+        (MODEL, "grads_abs", "absolute", "absolute"),
+        (RENDERER, "means2D=", "view2gaussian_precomp=None, means2D=", "view2gaussian_precomp"),
     ],
 )
 def test_a_changed_host_and_a_descendant_are_refused_by_what_is_otherwise(

@@ -43,9 +43,9 @@ def of(mini, **options):
 @pytest.mark.parametrize(
     ("file", "old", "new", "found"),
     [
-        ("gaussian_renderer/__init__.py", "low_pass=low_pass,\n", "", "no low_pass"),
-        ("scene/gaussian_model.py", "abe_split", "far", "no abe_split"),
-        ("scene/gaussian_model.py", "int, divide_ratio)", "int, ratio)", "no divide_ratio"),
+        ("gaussian_renderer/__init__.py", "low_pass=low_pass,\n", "", "the shared settings alone"),
+        ("scene/gaussian_model.py", "abe_split", "far", "far)"),
+        ("scene/gaussian_model.py", "divide_ratio", "ratio", "no divide_ratio"),
         ("scene/__init__.py", "args_dict", "options", "no args_dict"),
     ],
 )

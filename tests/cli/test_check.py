@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from cli.commands import run, run_json
@@ -12,7 +13,9 @@ from miniatures.skeletons import STATES, skeleton
 from fragprune_plugins import demo
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins import loading
 from fragprune_plugins.testing import mutations
+from fragprune_vanilla_3dgs import Vanilla3DGS
 
 MINIATURE = Path(demo.__file__).with_name("host")
 MODEL, RENDERER = "scene/gaussian_model.py", "gaussian_renderer/__init__.py"
@@ -151,21 +154,27 @@ def test_public_states_are_told_apart(tmp_path, state):
     assert [f["found"] for f in findings if f["code"] == "revision"] == [state]
 
 
-@pytest.mark.parametrize(
-    ("marker", "cousin"),
-    [
-        ("_deformation", "4DGaussians"),
-        ("get_view2gaussian", "Gaussian Opacity Fields"),
-        ("clamp_color", "c3dgs"),
-        ("depth_ratio", "2D Gaussian Splatting"),
-    ],
-)
-def test_a_cousin_is_called_by_its_name(tmp_path, marker, cousin):
-    skeleton(tmp_path, **{marker: ""})
-    refused(tmp_path)
+def test_a_cousin_is_told_by_what_it_has_otherwise(tmp_path):
+    skeleton(tmp_path, groups=("xyz", "opacity", "scaling", "rotation", "mask"))
+    report = of(refused(tmp_path))
+    assert [f["code"] for f in report["findings"]] == ["param-groups"]
     result = run("check", tmp_path, "--verbose")
-    assert f"{marker}, which belongs to {cousin}" in result.stdout
+    assert "xyz, opacity, scaling, rotation, mask; expected xyz, f_dc" in result.stdout
     assert "No adapter fits" in result.stdout
+
+
+def test_an_ancestor_of_the_host_steps_back_and_says_so(tmp_path, monkeypatch):
+    class Fork(Vanilla3DGS):
+        name, descends_from = "fork", ("vanilla-3dgs",)
+
+    plugins = SimpleNamespace(adapters=[Vanilla3DGS(), Fork()])
+    monkeypatch.setattr(loading, "load_plugins", lambda: plugins)
+    skeleton(tmp_path)
+    assert run_json("check", tmp_path)["fits"] == "fork"
+    said = run("check", tmp_path).stdout
+    assert "fork fits" in said
+    assert "vanilla-3dgs fits: 15 of 15 seams hold; fork descends from it" in said
+    assert "Use: fragprune run" in said
 
 
 def test_a_folder_that_is_no_host(tmp_path):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import pytest
-from miniatures.skeletons import SETTINGS, STATES, skeleton
+from miniatures.skeletons import GROUPS, SETTINGS, STATES, skeleton
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.findings import Match
+from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_vanilla_3dgs import OTHER_HOSTS, Vanilla3DGS
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
 def errors(repo):
@@ -42,15 +44,57 @@ def test_a_state_from_before_there_were_checkpoints_is_refused_by_its_date(tmp_p
         choose(repo, [Vanilla3DGS()])
 
 
-@pytest.mark.parametrize("marker", OTHER_HOSTS)
-def test_a_descendant_is_refused_by_name(tmp_path, marker):
-    repo = skeleton(tmp_path, **{marker: ""})
-    found = errors(repo)
-    assert [f.code for f in found] == ["other-host"]
-    assert OTHER_HOSTS[marker] in found[0].found
-    assert "scene.gaussian_model" in found[0].where
-    with pytest.raises(UnknownHostError, match=OTHER_HOSTS[marker]):
-        choose(repo, [Vanilla3DGS()], "vanilla-3dgs")
+COUSINS = {
+    "2D Gaussian Splatting": {"package": "diff_surfel_rasterization", "outputs": 3},
+    "3DGS-MCMC": {"outputs": 3},
+    "4DGaussians": {"outputs": 3, "groups": ("xyz", "deformation", "grid", *GROUPS[1:])},
+    "AbsGS": {"package": "diff_gaussian_rasterization_abs", "outputs": 3},
+    "c3dgs": {"settings": ["clamp_color"]},
+    "Compact-3DGS": {"groups": ("xyz", "opacity", "scaling", "rotation", "mask")},
+    "Gaussian Opacity Fields": {
+        "settings": ["kernel_size", "subpixel_offset"],
+        "arguments": ["view2gaussian_precomp"],
+        "functions": ["render", "integrate"],
+    },
+    "LightGaussian": {"settings": ["f_count"], "functions": ["render", "count_render"]},
+    "LP-3DGS": {"settings": ["f_count", "bw_score", "mw_score", "top_K_dT"], "outputs": 4},
+    "Mini-Splatting": {"functions": ["render", "render_imp", "render_depth"]},
+    "Mip-Splatting": {"settings": ["kernel_size", "subpixel_offset"]},
+    "RAIN-GS": {
+        "package": "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization",
+        "settings": ["low_pass"],
+        "outputs": 3,
+    },
+    "RT-4DGS": {"package": ".diff_gaussian_rasterization", "settings": ["timestamp"]},
+    "Speedy-Splat": {"arguments": ["scores"], "outputs": 3},
+    "a rasterizer of its own and nothing else": {"package": "my_rasterization"},
+    "an argument and nothing else": {"arguments": ["pixel_weights"]},
+}
+"""What vanilla's seams are not to be found without: hosts in which all of them hold."""
+
+
+@pytest.mark.parametrize("cousin", COUSINS)
+def test_what_draws_or_trains_otherwise_is_not_vanilla_whichever_adapters_there_are(
+    tmp_path, cousin
+):
+    repo = skeleton(tmp_path, **COUSINS[cousin])
+    assert {f.code for f in errors(repo)} <= {"rasterizer-call", "param-groups"}
+    for adapters in ([Vanilla3DGS()], load_plugins().adapters):
+        with pytest.raises(UnknownHostError, match="no adapter fits"):
+            choose(repo, adapters)
+
+
+def test_a_host_without_its_training_script_is_not_vanilla(tmp_path):
+    repo = skeleton(tmp_path)
+    (tmp_path / "train.py").rename(tmp_path / "train_densify.py")
+    (error,) = errors(repo)
+    assert (error.code, error.found) == ("other-host", "no train.py")
+
+
+def test_both_calls_of_a_late_state_are_vanillas_own(tmp_path):
+    repo = skeleton(tmp_path, "October 2024", arguments=["dc"])
+    assert Vanilla3DGS().match(repo).fits
+    assert not Vanilla3DGS().match(skeleton(tmp_path / "early", arguments=["dc"])).fits
 
 
 @pytest.mark.parametrize("seam", [s for s in Vanilla3DGS.seams if not s.external], ids=str)
@@ -60,8 +104,9 @@ def test_every_seam_that_is_gone_or_changed_is_named(tmp_path, seam):
     head = f"def {seam.attribute.split('.')[-1]}("
     whole = path.read_text()
     path.write_text(whole.replace(head, "def renamed("))
-    (gone,) = errors(HostRepo(tmp_path))
+    *others, gone = errors(HostRepo(tmp_path))
     assert gone.code == "seam-missing"
+    assert [f.code for f in others] == ["rasterizer-call"] * (seam.role is Role.VIEW)
     assert gone.where.startswith(f"{seam} ({path.relative_to(tmp_path)}:")
     for name in seam.needs:
         changed = [
@@ -101,6 +146,63 @@ def test_names_of_adapters_are_checked_and_either_spelling_is_taken(tmp_path):
         choose(repo, [adapter], "mip-splatting")
     with pytest.raises(UnknownHostError, match="none is installed"):
         choose(repo, [])
+
+
+class Fork(Vanilla3DGS):
+    """Draws and trains as vanilla does, and has a method of its own."""
+
+    name = "fork"
+    descends_from = ("vanilla-3dgs",)
+    seams = (*Vanilla3DGS.seams, Seam(Role.STILL, "scene.gaussian_model", "GaussianModel.fade"))
+
+
+class ForkOfFork(Fork):
+    name = "fork-of-fork"
+    descends_from = ("fork",)
+
+
+class Stranger(Fork):
+    name = "stranger"
+
+
+@pytest.mark.parametrize(
+    ("adapters", "chosen"),
+    [
+        ([Vanilla3DGS(), Fork()], "fork"),
+        ([ForkOfFork(), Vanilla3DGS(), Fork()], "fork-of-fork"),
+        ([Vanilla3DGS(), ForkOfFork()], None),  # the one between is not there to say so
+        ([Vanilla3DGS(), Fork(), Stranger()], None),
+    ],
+)
+def test_where_a_host_and_its_ancestor_fit_it_is_the_host(tmp_path, adapters, chosen):
+    fork = skeleton(tmp_path / "fork", fade="")
+    if chosen:
+        assert choose(fork, adapters).name == chosen
+    else:
+        with pytest.raises(UnknownHostError, match="several adapters fit"):
+            choose(fork, adapters)
+    assert choose(fork, adapters, "vanilla-3dgs").name == "vanilla-3dgs"  # who asks for it has it
+    assert choose(skeleton(tmp_path / "original"), adapters).name == "vanilla-3dgs"
+
+
+def test_ancestors_in_a_circle_are_a_tie(tmp_path):
+    class Hen(Vanilla3DGS):
+        name, descends_from = "hen", ("egg",)
+
+    class Egg(Vanilla3DGS):
+        name, descends_from = "egg", ("hen",)
+
+    repo = skeleton(tmp_path)
+    assert choose(repo, [Hen()]).name == "hen"
+    with pytest.raises(UnknownHostError, match="several adapters fit: hen, egg"):
+        choose(repo, [Hen(), Egg()])
+
+
+def test_an_adapter_that_was_asked_for_in_vain_names_the_one_that_fits(tmp_path):
+    with pytest.raises(UnknownHostError) as caught:
+        choose(skeleton(tmp_path), load_plugins().adapters, "mini-splatting")
+    assert "no ms/train.py" in caught.value.found
+    assert caught.value.remedy == "Choose vanilla-3dgs, which fits."
 
 
 def test_a_tie_is_not_guessed_but_a_plugin_may_break_it(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from fragprune_plugins.hosts.source import HostRepo
@@ -31,16 +32,44 @@ MODEL = {
 STATES = ("mid-July 2023", "late July 2023", "October 2023", "August 2024", "October 2024")
 
 
-def skeleton(root: Path, state: str = "October 2023", **methods: str | None) -> HostRepo:
-    """One public state of vanilla 3DGS; ``methods`` add to the model's, change or (None) drop."""
+GROUPS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+
+
+def skeleton(
+    root: Path,
+    state: str = "October 2023",
+    *,
+    settings: Sequence[str] = (),
+    arguments: Sequence[str] = (),
+    outputs: int | None = None,
+    package: str = "diff_gaussian_rasterization",
+    functions: Sequence[str] = ("render",),
+    groups: Sequence[str] = GROUPS,
+    **methods: str | None,
+) -> HostRepo:
+    """One public state of vanilla 3DGS, or what a host makes of it.
+
+    Args:
+        root: folder to write to.
+        state: whose interface it has.
+        settings: passed to the rasterizer besides vanilla's.
+        arguments: likewise, of the call.
+        outputs: how many values come back; vanilla's by default.
+        package: the rasterizer's.
+        functions: that draw.
+        groups: of parameters, in the optimizer.
+        methods: added to the model's, changed or (None) dropped.
+    """
     late, early = "2024" in state, state in STATES[:2]
     model = MODEL | {"load_ply": "path, use_train_test_exp=False"} if late else MODEL
     model = {name: args for name, args in (model | methods).items() if args is not None}
-    settings = SETTINGS[: -1 if state == "mid-July 2023" else None] + ["antialiasing"] * late
+    passed = SETTINGS[: -1 if state == "mid-July 2023" else None] + ["antialiasing"] * late
     parameters = "viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0"
     if state == "October 2024":
         parameters += ", separate_sh=False"
-    outputs = "image, radii, depth" if late else "image, radii"
+    given = "".join(f", {name}=0" for name in arguments)
+    values = ", ".join(f"value{n}" for n in range(outputs or 2 + late))
+    bodies = {"training_setup": str([{"params": [], "name": name} for name in groups])}
     files = {
         "arguments/__init__.py": "class OptimizationParams:\n"
         "    def __init__(self, parser):\n        self.iterations = 12_345\n"
@@ -48,13 +77,19 @@ def skeleton(root: Path, state: str = "October 2023", **methods: str | None) -> 
         "scene/__init__.py": "class Scene:\n    def __init__(self, args, gaussians): ...\n",
         "scene/gaussian_model.py": "class GaussianModel:\n"
         + "\n".join(
-            f"    def {name}({', '.join(filter(None, ['self', args]))}): ..."
+            f"    def {name}({', '.join(filter(None, ['self', args]))}): {bodies.get(name, '...')}"
             for name, args in model.items()
         ),
-        "gaussian_renderer/__init__.py": f"def render({parameters}, override_color=None):\n"
-        f"    s = GaussianRasterizationSettings({', '.join(f'{n}=0' for n in settings)})\n"
-        "    rasterizer = GaussianRasterizer(raster_settings=s)\n"
-        f"    {outputs} = rasterizer(means3D=1)\n",
+        "gaussian_renderer/__init__.py": f"from {package} import GaussianRasterizationSettings, "
+        "GaussianRasterizer\n\n\n"
+        + "".join(
+            f"def {function}({parameters}, override_color=None):\n"
+            "    s = GaussianRasterizationSettings("
+            f"{', '.join(f'{name}=0' for name in [*passed, *settings])})\n"
+            "    rasterizer = GaussianRasterizer(raster_settings=s)\n"
+            f"    {values} = rasterizer(means3D=1{given})\n"
+            for function in functions
+        ),
         "train.py": "from gaussian_renderer import render\n"
         + ("SparseGaussianAdam\n" if state == "October 2024" else ""),
     }

@@ -1,6 +1,6 @@
 """What all descendants of the 2023 3DGS training code share."""
 
 from fragprune_plugins.hosts.graphdeco.adapter import GraphdecoAdapter, GraphdecoDialect
-from fragprune_plugins.hosts.graphdeco.contract import Contract
+from fragprune_plugins.hosts.graphdeco.call import RasterizerCall
 
-__all__ = ["Contract", "GraphdecoAdapter", "GraphdecoDialect"]
+__all__ = ["GraphdecoAdapter", "GraphdecoDialect", "RasterizerCall"]

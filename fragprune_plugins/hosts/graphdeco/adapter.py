@@ -1,10 +1,10 @@
-"""The lineage's adapter base: model seams, optimizer groups, row order, files, rasterizer call."""
+"""The base of their adapters: model seams, param groups, row order, files, rasterizer call."""
 
 from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -19,9 +19,9 @@ from fragprune_plugins.hosts.adapter import (
     HostCall,
 )
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco.contract import Contract, read_calls
+from fragprune_plugins.hosts.graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.hosts.source import Function, HostRepo
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,6 +32,7 @@ MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 CAMERAS = "utils.camera_utils"
 WIDEST = 1600
 """Pixels: hosts shrink wider images to this width where no size is asked for (-r -1)."""
+OTHER = "Use the adapter of that host."
 
 GROUPS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 """Names and order of the host optimizer's param groups; load_state_dict matches by position."""
@@ -41,12 +42,15 @@ def _model(role: Role, method: str, *needs: str) -> Seam:
     return Seam(role, MODEL, f"GaussianModel.{method}", needs)
 
 
+CLONE = _model(Role.PARENTS, "densify_and_clone", "grads", "grad_threshold", "scene_extent")
+SPLIT = _model(Role.PARENTS, "densify_and_split", "grads", "grad_threshold", "scene_extent", "N")
+
 MODEL_SEAMS: tuple[Seam, ...] = (
     Seam(Role.SCENE, "scene", "Scene.__init__", ("args", "gaussians")),
     _model(Role.ATTACH, "training_setup", "training_args"),
     _model(Role.STEP, "update_learning_rate", "iteration"),
-    _model(Role.PARENTS, "densify_and_clone", "grads", "grad_threshold", "scene_extent"),
-    _model(Role.PARENTS, "densify_and_split", "grads", "grad_threshold", "scene_extent", "N"),
+    CLONE,
+    SPLIT,
     _model(Role.KEEP, "_prune_optimizer", "mask"),
     _model(Role.APPEND, "cat_tensors_to_optimizer", "tensors_dict"),
     _model(Role.STILL, "densify_and_prune"),
@@ -61,7 +65,7 @@ MODEL_SEAMS: tuple[Seam, ...] = (
 
 @dataclass(frozen=True)
 class GraphdecoDialect(Dialect):
-    """The call contract of diff_gaussian_rasterization and its forks.
+    """How diff_gaussian_rasterization and its forks are called.
 
     Attributes:
         package: import name of the rasterizer.
@@ -137,13 +141,18 @@ class GraphdecoDialect(Dialect):
 
 
 class GraphdecoAdapter(HostAdapter):
-    """Base of every adapter of this lineage; a subclass adds name, fingerprint and what differs."""
+    """Base of every such adapter; a subclass adds its name and what its host has otherwise."""
 
     package = "diff_gaussian_rasterization"
     renderer = RENDERER
     """The module of the functions that call the rasterizer."""
-    contracts: tuple[Contract, ...] = (Contract(),)
+    calls: tuple[RasterizerCall, ...] = (RasterizerCall(),)
     """Calls of the rasterizer that the dialect answers; a function may make any one of its own."""
+    groups: tuple[str, ...] = GROUPS
+    """Names of the optimizer's param groups, in order, as ``training_setup`` spells them."""
+    own_names: tuple[str, ...] = ()
+    """ "module:name": what this host's source mentions and that of its ancestors does not."""
+    dialect_type: type[GraphdecoDialect] = GraphdecoDialect
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
     """The host's, by its name in ``torch.optim``."""
@@ -161,36 +170,50 @@ class GraphdecoAdapter(HostAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """What every descendant has: a rasterizer called as the dialect knows it."""
-        functions = dict.fromkeys(contract.function for contract in self.contracts)
-        there = [
-            name for name in functions if repo.function(self.renderer, name)
-        ]  # else a missing seam
-        return [finding for name in there for finding in self._differences(repo, name)]
+        """Scripts, names of its own, param groups, and a rasterizer called as the dialect knows."""
+        missing = [f"no {name}" for name in self.scripts if not (repo.root / name).is_file()]
+        for module, name in (each.split(":") for each in self.own_names):
+            missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
+        return [*self.other_host(repo, missing), *self._groups(repo), *self._calls(repo)]
 
-    def _differences(self, repo: HostRepo, function: str) -> list[Finding]:
-        """What one drawing function does otherwise than any contract of it says."""
-        known = [contract for contract in self.contracts if contract.function == function]
-        calls = read_calls(repo, self.renderer, function)
-        found = [
-            (repo.at(self.renderer, call.line), str(call.contract), "Use the adapter of that host.")
-            for call in calls
-            if call.contract not in known
-        ]
-        if not calls:
-            nothing = "no call of GaussianRasterizationSettings with keywords"
-            remedy = "Check that this is the folder of the training script."
-            found.append((repo.place(self.renderer, function), nothing, remedy))
+    def _groups(self, repo: HostRepo) -> list[Finding]:
+        """An error where param groups are spelled out in the source and are others."""
+        setup = "GaussianModel.training_setup"
+        found = group_names(repo.function(MODEL, setup))
+        if found in ((), self.groups):
+            return []
+        at, expected = f"{MODEL}:{setup} ({repo.place(MODEL, setup)})", ", ".join(self.groups)
+        return [Finding("error", "param-groups", at, ", ".join(found), expected, OTHER)]
+
+    def _calls(self, repo: HostRepo) -> list[Finding]:
+        """An error for each call of the rasterizer that is none of ``calls``."""
+        functions = dict.fromkeys(each.function for each in self.calls)
+        there = [each for each in functions if repo.function(self.renderer, each)]  # or no seam
+        found = []
+        for name in dict.fromkeys([*there, *drawing_functions(repo, self.renderer)]):
+            expected = [str(each) for each in self.calls if each.function == name]
+            calls = read_calls(repo, self.renderer, name)
+            for each in calls:
+                own = each.call.package == self.package
+                call = replace(each.call, package="") if own else each.call
+                if not any(known.answers(call) for known in self.calls):
+                    found.append(
+                        (name, repo.at(self.renderer, each.line), str(call), expected, OTHER)
+                    )
+            if not calls:
+                nothing = "no call of GaussianRasterizationSettings with keywords"
+                remedy = "Check that this is the folder of the training script."
+                found.append((name, repo.place(self.renderer, name), nothing, expected, remedy))
         return [
             Finding(
                 "error",
                 "rasterizer-call",
-                f"{self.renderer}:{function} ({at})",
+                f"{self.renderer}:{name} ({at})",
                 what,
-                " or ".join(map(str, known)),
+                " or ".join(expected) or f"a rasterizer in {', '.join(functions)} alone",
                 remedy,
             )
-            for at, what, remedy in found
+            for name, at, what, expected, remedy in found
         ]
 
     def other_host(self, repo: HostRepo, found: list[str]) -> list[Finding]:
@@ -204,17 +227,17 @@ class GraphdecoAdapter(HostAdapter):
                 str(repo.root),
                 ", ".join(found),
                 f"a {self.info.title} checkout",
-                "Use the adapter of that host.",
+                OTHER,
             )
         ]
 
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
         """Read from the source of ``render``: what it passes and how many values it unpacks."""
         call = next(iter(read_calls(repo, RENDERER, "render")), None)
-        return GraphdecoDialect(
+        return self.dialect_type(
             package=self.package,
             settings=call.settings if call else (),
-            outputs=(call.contract.outputs if call else None) or 2,
+            outputs=(call.call.outputs if call else None) or 2,
             sparse_adam=bool(repo.mentions(["train"], ["SparseGaussianAdam"]))
             or bool(repo.mentions([MODEL], ["SparseGaussianAdam"])),
         )
@@ -407,6 +430,20 @@ class GraphdecoAdapter(HostAdapter):
             if number.isdigit()
         ]
         return [(iteration, path) for _, iteration, _, path in sorted(found)]
+
+
+def group_names(function: Function | None) -> tuple[str, ...]:
+    """Names of the param groups that a function spells out as dicts, in source order."""
+    dicts = [
+        node for node in (ast.walk(function) if function else ()) if isinstance(node, ast.Dict)
+    ]
+    names = [
+        (value.lineno, value.col_offset, str(value.value))
+        for each in dicts
+        for key, value in zip(each.keys, each.values, strict=True)
+        if isinstance(key, ast.Constant) and key.value == "name" and isinstance(value, ast.Constant)
+    ]
+    return tuple(name for _, _, name in sorted(names))
 
 
 def reaches(grads: Tensor, threshold: Any, rows: int) -> Tensor:
