@@ -43,30 +43,46 @@ first answer counts, `None` leaves the answer to the next plugin, and ours comes
 
 def roles() -> str:
     """What happens at a seam."""
-    from fragprune_plugins.hosts.seams import Role
+    from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall
 
     intro = """A *seam* is one function of a host that is wrapped while fragprune is active. An
 adapter lists a host's seams and gives each a role. In every role but RASTERIZE the host's function
 runs unchanged, and fragprune follows. `fragprune check DIR` prints the seams of a checkout with
-file and line."""
-    rows = "\n".join(f"| `{role.name}` | {_sentence(role.value)} |" for role in Role)
-    return _page(
-        "Roles of seams", intro, f"| role | what fragprune does there |\n|---|---|\n{rows}"
-    )
+file and line.
+
+What only the host can say of a call is the seam's `how`, a function that takes the `SeamCall`. It
+is asked before, around, after or instead of the host's function; in brackets stands what holds for
+a seam without one, and where there are no brackets a seam has to have one."""
+    cells = [(role.name, _sentence(role.does), role.how and _sentence(role.how)) for role in Role]
+    rows = "\n".join(f"| `{name}` | {does} | {_fields(how)} |" for name, does, how in cells)
+    table = f"| role | what fragprune does there | `how` |\n|---|---|---|\n{rows}"
+    kinds = map(_class, (Seam, SeamCall, RowTrace))
+    return _page("Roles of seams", intro, table, *kinds)
 
 
 def adapters() -> str:
     """What an adapter may say."""
-    from fragprune_plugins.hosts import adapter
+    from fragprune_plugins import adapting
 
-    intro = """An adapter is a class that describes one host. Required methods have no default. See
-[how to write one](../how-to/write-an-adapter.md)."""
+    head, names, *rest = (inspect.getdoc(adapting) or "").split("\n\n")
+    intro = f"""An adapter is a class that describes one host. Required methods have no default. See
+[how to write one](../how-to/write-an-adapter.md); [roles](roles.md) says what happens at seams.
+
+{_fields(head)}
+
+```text
+{names}
+```
+
+{" ".join(rest)}"""
     kinds = [
-        c
-        for _, c in inspect.getmembers(adapter, inspect.isclass)
-        if c.__module__ == adapter.__name__
+        kind
+        for kind in (getattr(adapting, name) for name in adapting.__all__)
+        if inspect.isclass(kind)
+        and kind.__module__.startswith("fragprune_plugins.hosts")
+        and not kind.__module__.endswith(".seams")
     ]
-    kinds.sort(key=lambda kind: inspect.getsourcelines(kind)[1])
+    kinds.sort(key=lambda kind: (kind.__module__, inspect.getsourcelines(kind)[1]))
     return _page("Adapters", intro, *(_class(kind) for kind in kinds))
 
 

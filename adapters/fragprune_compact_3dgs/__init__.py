@@ -9,23 +9,69 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
-from fragprune_plugins.errors import NotComparedError, UsageError
-from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo, RowTrace
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter
-from fragprune_plugins.hosts.seams import Role, Seam, revised
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from fragprune_plugins.adapting import (
+    GraphdecoAdapter,
+    HostAdapter,
+    HostInfo,
+    HostRepo,
+    NotComparedError,
+    Role,
+    RowTrace,
+    Seam,
+    SeamCall,
+    UsageError,
+    hookimpl,
+    revised,
+)
 
 MODEL = "scene.gaussian_model"
 NETWORK = "network"
 """Our name for the param group of the hash grid and the colour network, which has none."""
-ENDINGS = {"save_npz": (".npz",), "save_npz_pp": ("_pp.npz",), "load_model": ("_pp.npz", ".npz")}
+PP = "_pp.npz"
+"""Ends the name of a file whose attributes are coded further."""
+
+
+def ended(call: SeamCall, by: str) -> Path:
+    """The host leaves endings out."""
+    path = Path(call.first)
+    return path.with_name(path.name + by)
+
+
+def most_compressed(call: SeamCall) -> Path:
+    """The host loads the most compressed file there is."""
+    files = [ended(call, ending) for ending in (PP, ".npz", ".ply")]
+    return next((file for file in files if file.is_file()), files[-1])
+
+
+def optimizers(call: SeamCall) -> list[Any]:
+    """The Gaussians', then the hash grid's and the colour network's."""
+    return [call.model.optimizer, call.model.optimizer_net]
+
+
+@contextmanager
+def tracing(call: SeamCall) -> Iterator[RowTrace]:
+    """Row numbers ride along as a second column of the opacities, which sorting only moves.
+
+    The bits of an integer, not its value: every row number is exact.
+    """
+    import torch
+
+    model, trace = call.model, RowTrace()
+    opacity = model._opacity.detach()
+    numbers = torch.arange(len(opacity), dtype=torch.int32, device=opacity.device)
+    rider = numbers.view(torch.float32)[:, None]
+    model._opacity = torch.nn.Parameter(torch.cat([opacity, rider], dim=1))
+    try:
+        yield trace
+    finally:
+        opacity, rider = (part.contiguous() for part in model._opacity.detach().split(1, 1))
+        model._opacity = torch.nn.Parameter(opacity)
+    trace.origins = rider[:, 0].view(torch.int32).long()
+    trace.fresh = torch.zeros_like(trace.origins, dtype=torch.bool)
 
 
 class Compact3DGS(GraphdecoAdapter):
@@ -45,14 +91,22 @@ class Compact3DGS(GraphdecoAdapter):
         ),
     )
     groups = ("xyz", "opacity", "scaling", "rotation", "mask")
+    appearance = frozenset({NETWORK})
+    inherited = ("rotation", "opacity")
     own_names = tuple(f"{MODEL}:{name}" for name in ("vq_scale", "recolor", "mlp_head"))
     seams = (
-        *revised(GraphdecoAdapter.seams, {"GaussianModel.load_ply": None}),
-        Seam(Role.LOAD, MODEL, "GaussianModel.load_model", ("path",)),
-        Seam(Role.SAVE, MODEL, "GaussianModel.save_npz", ("path",)),
-        Seam(Role.SAVE, MODEL, "GaussianModel.save_npz_pp", ("path",)),
+        *revised(
+            GraphdecoAdapter.seams,
+            {
+                "GaussianModel.training_setup": {"how": optimizers},
+                "GaussianModel.load_ply": None,
+            },
+        ),
+        Seam(Role.LOAD, MODEL, "GaussianModel.load_model", ("path",), how=most_compressed),
+        Seam(Role.SAVE, MODEL, "GaussianModel.save_npz", ("path",), how=partial(ended, by=".npz")),
+        Seam(Role.SAVE, MODEL, "GaussianModel.save_npz_pp", ("path",), how=partial(ended, by=PP)),
         Seam(Role.STILL, MODEL, "GaussianModel.mask_prune"),
-        Seam(Role.REARRANGE, MODEL, "GaussianModel.sort_morton"),
+        Seam(Role.REARRANGE, MODEL, "GaussianModel.sort_morton", how=tracing),
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
@@ -77,18 +131,9 @@ class Compact3DGS(GraphdecoAdapter):
             "Draw and measure with the host's render.py and metrics.py.",
         )
 
-    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
-        """The Gaussians', then the hash grid's and the colour network's."""
-        return [model.optimizer, model.optimizer_net]
-
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
         """The network's group has no name of the host's."""
         return str(group.get("name", NETWORK))
-
-    def trained_groups(self, train: str) -> frozenset[str] | None:
-        """opacity, or with the colours' network; None for all."""
-        groups = {"opacity": {"opacity"}, "appearance": {"opacity", NETWORK}}.get(train)
-        return frozenset(groups) if groups else None
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:
         """Codebooks that are in use learn in the forward pass; they stop, as at the host's end."""
@@ -96,44 +141,6 @@ class Compact3DGS(GraphdecoAdapter):
             for layer in codebooks.layers:
                 if bool(layer._codebook.initted):
                     layer.training = False
-
-    def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
-        """Clones and split children carry their parent's rotation and opacity bit for bit."""
-        import torch
-
-        return torch.equal(tensors["rotation"], model._rotation[parents]) and torch.equal(
-            tensors["opacity"], model._opacity[parents]
-        )
-
-    @contextmanager
-    def tracing(
-        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
-    ) -> Iterator[RowTrace]:
-        """Row numbers ride along as a second column of the opacities, which sorting only moves.
-
-        The bits of an integer, not its value: every row number is exact.
-        """
-        import torch
-
-        opacity, trace = model._opacity.detach(), RowTrace()
-        numbers = torch.arange(len(opacity), dtype=torch.int32, device=opacity.device)
-        rider = numbers.view(torch.float32)[:, None]
-        model._opacity = torch.nn.Parameter(torch.cat([opacity, rider], dim=1))
-        try:
-            yield trace
-        finally:
-            opacity, rider = (part.contiguous() for part in model._opacity.detach().split(1, 1))
-            model._opacity = torch.nn.Parameter(opacity)
-        trace.origins = rider[:, 0].view(torch.int32).long()
-        trace.fresh = torch.zeros_like(trace.origins, dtype=torch.bool)
-
-    def file_at(self, method: str, path: Path) -> Path:
-        """The host leaves endings out; it loads the most compressed file there is."""
-        named = [path.with_name(path.name + ending) for ending in ENDINGS.get(method, ())]
-        if method == "load_model":
-            ply = path.with_name(f"{path.name}.ply")
-            return next((file for file in named if file.is_file()), ply)
-        return named[0] if named else path
 
 
 @hookimpl

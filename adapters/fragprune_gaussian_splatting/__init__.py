@@ -9,24 +9,32 @@ from a PLY and counts its steps from 0 again.
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from fragprune_plugins.errors import (
+from fragprune_plugins.adapting import (
     AlignmentError,
+    CommandLine,
     EngineError,
+    Finding,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    HostRepo,
     NotComparedError,
+    RasterizerCall,
+    Role,
+    RowTrace,
+    Seam,
+    SeamCall,
     SessionError,
+    hookimpl,
 )
-from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo, RowTrace
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -59,10 +67,10 @@ class PackageDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The rasterizer, the neighbour distances and the relocation, inside their packages."""
-        from fragprune_plugins.hosts.graphdeco.stand_ins import compute_relocation
+        from fragprune_plugins.adapting import stand_ins
 
         relocation = ModuleType(RELOCATION, "Stand-in of fragprune.")
-        vars(relocation)["compute_relocation"] = compute_relocation
+        vars(relocation)["compute_relocation"] = stand_ins.compute_relocation
         modules = super().modules(draw)
         rasterizer = modules.pop(self.package)
         nested = {f"{PACKAGE}.{name}": module for name, module in modules.items()}
@@ -88,6 +96,50 @@ class _Unanswered(ModuleType):
         return refuse
 
 
+def optimizers(call: SeamCall) -> list[Any]:
+    """One, the trainer's; cameras that are trained join it as further groups."""
+    return [call.instance.optimizer]
+
+
+def step_alone(call: SeamCall) -> Any:
+    """The opacity reset sits inside a step: the step itself is still to be made."""
+    return call.instance.base_trainer.optim_step()
+
+
+@contextmanager
+def tracing(call: SeamCall) -> Iterator[RowTrace]:
+    """Row numbers ride along as one more coefficient of the colour, which densifiers only copy.
+
+    The bits of an integer, not its value: every row number is exact.
+    """
+    import torch
+
+    trainer, model, trace = call.instance, call.model, RowTrace()
+    densifier, colour = trainer.densifier, model._features_dc
+    numbers = torch.arange(len(colour), dtype=torch.int32, device=colour.device)
+    rider = numbers.view(torch.float32)[:, None, None].expand(-1, 1, colour.shape[2])
+
+    def noting(*args: Any, **kwargs: Any) -> Any:
+        model._features_dc = torch.nn.Parameter(torch.cat([colour.detach(), rider], dim=1))
+        try:
+            instruct = densifier.densify_and_prune(*args, **kwargs)
+        finally:
+            model._features_dc = colour
+        if any(each is not None for each in vars(instruct).values()):
+            trace.origins, trace.fresh = _follow(instruct, numbers)
+        return instruct._replace(
+            new_features_dc=_without_rider(instruct.new_features_dc),
+            replace_features_dc=_without_rider(instruct.replace_features_dc),
+        )
+
+    hook = densifier.after_densify_and_prune_hook
+    trainer.densifier = SimpleNamespace(densify_and_prune=noting, after_densify_and_prune_hook=hook)
+    try:
+        yield trace
+    finally:
+        trainer.densifier = densifier
+
+
 class GaussianSplatting(GraphdecoAdapter):
     """The pip package gaussian-splatting, with gaussian-splatting-mcmc."""
 
@@ -108,7 +160,7 @@ class GaussianSplatting(GraphdecoAdapter):
     scripts = (f"{PACKAGE}/train.py",)
     dialect_type = PackageDialect
     seams = (
-        Seam(Role.ATTACH, f"{TRAINER}.base", "BaseTrainer.__init__", ("model",)),
+        Seam(Role.ATTACH, f"{TRAINER}.base", "BaseTrainer.__init__", ("model",), how=optimizers),
         Seam(Role.STEP, f"{TRAINER}.abc", "AbstractTrainer.update_learning_rate"),
         Seam(Role.VIEW, MODEL, "GaussianModel.render", ("viewpoint_camera",)),
         Seam(
@@ -125,8 +177,9 @@ class GaussianSplatting(GraphdecoAdapter):
             f"{TRAINER}.densifier.trainer",
             "DensificationTrainer.densify_and_prune",
             ("loss", "out", "camera"),
+            how=tracing,
         ),
-        Seam(Role.STILL, f"{TRAINER}.opacity_reset", "OpacityResetter.optim_step"),
+        Seam(Role.STILL, f"{TRAINER}.opacity_reset", "OpacityResetter.optim_step", how=step_alone),
         Seam(Role.STILL, f"{TRAINER}.sh_lift", "SHLifter.oneupSHdegree"),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_ply", ("path",)),
         Seam(Role.LOAD, MODEL, "GaussianModel.load_ply", ("path",)),
@@ -154,7 +207,7 @@ class GaussianSplatting(GraphdecoAdapter):
         ]
 
     def dialect(self, repo: HostRepo) -> PackageDialect:
-        """One contract: what ``GaussianModel.render`` passes and unpacks."""
+        """One call: what ``GaussianModel.render`` passes and unpacks."""
         return PackageDialect(package=RASTERIZER, settings=SETTINGS, outputs=3)
 
     def command_line(self, repo: HostRepo) -> CommandLine:
@@ -190,66 +243,19 @@ class GaussianSplatting(GraphdecoAdapter):
         cameras = Path(known.destination) / "cameras.json" if trained else None
         return script, [*arguments, *(["--load_camera", str(cameras)] if cameras else [])]
 
-    def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
+    def model_of(self, call: SeamCall) -> Any:
         """Trainers hold the model, or are about to when they are made."""
-        model = arguments.get("model", arguments.get("gaussians"))
-        model = getattr(instance, "model", instance) if model is None else model
+        model = call.arguments.get("model", call.arguments.get("gaussians"))
+        model = getattr(call.instance, "model", call.instance) if model is None else model
         if type(model).__module__.startswith(f"{PACKAGE}.models"):
             raise SessionError(
                 f"{type(model).__name__}", "a model of --backend gsplat", "inria", "Change it."
             )
         return model
 
-    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
-        """One, the trainer's; cameras that are trained join it as further groups."""
-        return [arguments["self"].optimizer]
-
     def view(self, camera: Any) -> int:
         """Cameras are tuples, copied to change a background; their matrices stay."""
         return id(camera.world_view_transform)
-
-    def stand_still(self, wrapped: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-        """The opacity reset sits inside a step: the step itself is still to be made."""
-        if wrapped.__name__ == "optim_step":
-            return arguments["self"].base_trainer.optim_step()
-        return None
-
-    @contextmanager
-    def tracing(
-        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
-    ) -> Iterator[RowTrace]:
-        """Row numbers ride along as one more coefficient of the colour, which densifiers only copy.
-
-        The bits of an integer, not its value: every row number is exact.
-        """
-        import torch
-
-        trainer, trace = arguments["self"], RowTrace()
-        densifier, colour = trainer.densifier, model._features_dc
-        numbers = torch.arange(len(colour), dtype=torch.int32, device=colour.device)
-        rider = numbers.view(torch.float32)[:, None, None].expand(-1, 1, colour.shape[2])
-
-        def noting(*args: Any, **kwargs: Any) -> Any:
-            model._features_dc = torch.nn.Parameter(torch.cat([colour.detach(), rider], dim=1))
-            try:
-                instruct = densifier.densify_and_prune(*args, **kwargs)
-            finally:
-                model._features_dc = colour
-            if any(each is not None for each in vars(instruct).values()):
-                trace.origins, trace.fresh = _follow(instruct, numbers)
-            return instruct._replace(
-                new_features_dc=_without_rider(instruct.new_features_dc),
-                replace_features_dc=_without_rider(instruct.replace_features_dc),
-            )
-
-        hook = densifier.after_densify_and_prune_hook
-        trainer.densifier = SimpleNamespace(
-            densify_and_prune=noting, after_densify_and_prune_hook=hook
-        )
-        try:
-            yield trace
-        finally:
-            trainer.densifier = densifier
 
 
 def _without_rider(colour: Tensor | None) -> Tensor | None:

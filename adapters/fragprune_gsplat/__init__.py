@@ -10,12 +10,19 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.errors import SessionError, UsageError
-from fragprune_plugins.hosts.adapter import CommandLine, Dialect, HostAdapter, HostInfo, RowTrace
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.adapting import (
+    Dialect,
+    Finding,
+    HostAdapter,
+    HostInfo,
+    HostRepo,
+    Role,
+    RowTrace,
+    Seam,
+    SeamCall,
+    SessionError,
+    hookimpl,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -36,8 +43,41 @@ GROUPS = {
 """gsplat's keys and what the rest of the field calls them."""
 
 
+def optimizers(call: SeamCall) -> list[Any]:
+    """One for each key."""
+    return list(call.arguments["optimizers"].values())
+
+
+@contextmanager
+def tracing(call: SeamCall) -> Iterator[RowTrace]:
+    """Row numbers ride along as one more key; without an optimizer gsplat takes it for frozen.
+
+    float64 holds every row number exactly.
+    """
+    import torch
+
+    model, trace = call.model, RowTrace()
+    rows = len(model["means"])
+    numbers = torch.arange(rows, dtype=torch.float64, device=model["means"].device)
+    model[ROWS] = torch.nn.Parameter(numbers, requires_grad=False)
+    try:
+        yield trace
+    finally:
+        origins = model.pop(ROWS).detach().long()
+    places = torch.arange(len(origins), device=origins.device)
+    fresh = torch.zeros_like(places, dtype=torch.bool)
+    name = call.seam.attribute
+    if name == "duplicate":
+        fresh = places >= rows
+    elif name == "split":
+        fresh = places >= len(places) - 2 * int(call.arguments["mask"].sum())
+    elif name in ("relocate", "sample_add"):  # parents are made over too
+        fresh = torch.bincount(origins, minlength=rows)[origins] > 1
+    trace.origins, trace.fresh = origins, fresh
+
+
 def _operation(name: str, *needs: str) -> Seam:
-    return Seam(Role.REARRANGE, OPERATIONS, name, ("params", "optimizers", *needs))
+    return Seam(Role.REARRANGE, OPERATIONS, name, ("params", "optimizers", *needs), how=tracing)
 
 
 class Gsplat(HostAdapter):
@@ -57,6 +97,7 @@ class Gsplat(HostAdapter):
     )
     installed = (PACKAGE,)
     steps_by_rendering = True
+    appearance = HostAdapter.appearance | {"colors"}
     seams = (
         Seam(Role.RASTERIZE, RENDERING, "rasterization", ("means", "opacities", "viewmats", "Ks")),
         Seam(Role.VIEW, RENDERING, "rasterization", ("viewmats",)),
@@ -66,6 +107,7 @@ class Gsplat(HostAdapter):
             f"{PACKAGE}.strategy.base",
             "Strategy.check_sanity",
             ("params", "optimizers"),
+            how=optimizers,
         ),
         _operation("duplicate", "mask"),
         _operation("split", "mask"),
@@ -103,24 +145,11 @@ class Gsplat(HostAdapter):
             return GsplatDialect(alpha_max=0.99, floor=0.005)
         return GsplatDialect(alpha_max=0.999, floor=0.0)
 
-    def use(self, repo: HostRepo) -> str:
-        """One line in the user's own script."""
-        return 'fragprune_plugins.activate("gsplat") above the import of gsplat in your own script'
-
-    def command_line(self, repo: HostRepo) -> CommandLine:
-        """There is none: a library is trained by whatever script its user wrote."""
-        raise UsageError(
-            "fragprune run",
-            "gsplat, a library without a training command",
-            self.use(repo),
-            "See the how-to page of gsplat.",
-        )
-
-    def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
+    def model_of(self, call: SeamCall) -> Any:
         """The dict a strategy changes; the means where a call has only them."""
         import torch
 
-        params = arguments.get("params", arguments.get("means"))
+        params = call.arguments.get("params", call.arguments.get("means"))
         if isinstance(params, dict):
             raise SessionError(
                 "params",
@@ -128,30 +157,14 @@ class Gsplat(HostAdapter):
                 "torch.nn.ParameterDict",
                 "Make one of it: params = torch.nn.ParameterDict(params).",
             )
-        if arguments.get("format", "ply") != "ply":
+        if call.arguments.get("format", "ply") != "ply":
             return None  # other formats sort their rows
         return params if isinstance(params, torch.nn.ParameterDict | torch.Tensor) else None
-
-    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
-        """One for each key."""
-        return list(arguments["optimizers"].values())
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
         """By the parameter: users name their groups as they like, or not at all."""
         (parameter,) = group["params"]
         return next((GROUPS.get(key, key) for key, own in model.items() if own is parameter), None)
-
-    def trained_groups(self, train: str) -> frozenset[str] | None:
-        """opacity, or with both SH groups; None for all."""
-        return {
-            "opacity": frozenset({"opacity"}),
-            "appearance": frozenset({"opacity", "f_dc", "f_rest", "colors"}),
-            "all": None,
-        }[train]
-
-    def rows(self, model: Any) -> int:
-        """From the means."""
-        return len(model["means"])
 
     def means(self, model: Any) -> Tensor:
         """The parameter itself."""
@@ -166,34 +179,6 @@ class Gsplat(HostAdapter):
     def view(self, camera: Any) -> int:
         """By the numbers: loaders make a new tensor for every step."""
         return hash(camera.detach().cpu().numpy().tobytes())
-
-    @contextmanager
-    def tracing(
-        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
-    ) -> Iterator[RowTrace]:
-        """Row numbers ride along as one more key; without an optimizer gsplat takes it for frozen.
-
-        float64 holds every row number exactly.
-        """
-        import torch
-
-        rows, trace = len(model["means"]), RowTrace()
-        numbers = torch.arange(rows, dtype=torch.float64, device=model["means"].device)
-        model[ROWS] = torch.nn.Parameter(numbers, requires_grad=False)
-        try:
-            yield trace
-        finally:
-            origins = model.pop(ROWS).detach().long()
-        places = torch.arange(len(origins), device=origins.device)
-        fresh = torch.zeros_like(places, dtype=torch.bool)
-        name = wrapped.__name__
-        if name == "duplicate":
-            fresh = places >= rows
-        elif name == "split":
-            fresh = places >= len(places) - 2 * int(arguments["mask"].sum())
-        elif name in ("relocate", "sample_add"):  # parents are made over too
-            fresh = torch.bincount(origins, minlength=rows)[origins] > 1
-        trace.origins, trace.fresh = origins, fresh
 
 
 @hookimpl

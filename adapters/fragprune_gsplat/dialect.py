@@ -1,4 +1,4 @@
-"""The call contract of gsplat's ``rasterization``: one function, any number of cameras."""
+"""The call of gsplat's ``rasterization``: one function, any number of cameras."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from types import ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from fragprune_gsplat.harmonics import basis
 from fragprune_gsplat.projection import TILE, Projection, Rules, covariances, project
-from fragprune_plugins.errors import InputError
-from fragprune_plugins.hosts.adapter import Dialect, HostCall
-from fragprune_plugins.hosts.graphdeco.harmonics import basis
-from fragprune_plugins.types import Footprints, RasterInputs, View
-
-if TYPE_CHECKING:
-    from fragprune_plugins.types import RasterOutputs
+from fragprune_plugins.adapting import (
+    Dialect,
+    Footprints,
+    HostCall,
+    InputError,
+    RasterInputs,
+    RasterOutputs,
+    View,
+)
 
 BACKEND = "gsplat.cuda._backend"
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -251,14 +254,14 @@ class GsplatDialect(Dialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The two kernels that its strategies call beside ``rasterization``."""
-        from fragprune_plugins.hosts.graphdeco.stand_ins import compute_relocation
+        from fragprune_plugins.adapting import stand_ins
 
         backend = ModuleType(BACKEND, "Stand-in of fragprune for compiled kernels.")
 
         def relocation(
             opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, n_max: int
         ) -> tuple[Tensor, Tensor]:
-            opacity, scale = compute_relocation(
+            opacity, scale = stand_ins.compute_relocation(
                 opacities.reshape(-1), scales, ratios.clamp_max(n_max - 1), binoms, n_max
             )
             return opacity.view_as(opacities), scale.view_as(scales)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import ALPHA_MIN
+from fragprune_plugins.adapting import ALPHA_MIN
 
 TILE = 16
 EXTENT = 3.33

@@ -13,16 +13,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.adapting import (
+    CommandLine,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    HostRepo,
+    RasterInputs,
+    RasterizerCall,
+    RasterOutputs,
+    Role,
+    Seam,
+    hookimpl,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 MODEL = "scene.gaussian_model"
 TRAIN, PRUNE, DISTIL = "train_densify_prune.py", "prune_finetune.py", "distill_train.py"

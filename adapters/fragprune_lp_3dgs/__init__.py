@@ -7,20 +7,28 @@ four values, the last two None unless a setting asks for a score.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from fragprune_plugins.errors import EngineError, UsageError
-from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.plugins.hookspecs import hookimpl
-
-if TYPE_CHECKING:
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.adapting import (
+    EngineError,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    RasterInputs,
+    RasterizerCall,
+    RasterOutputs,
+    Role,
+    Seam,
+    SeamCall,
+    UsageError,
+    hookimpl,
+)
 
 SCORES = ("f_count", "bw_score", "mw_score", "top_K_dT")
 MINI, RAD = "scene.gaussian_model_mini_splatting", "scene.gaussian_model_rad_splat"
@@ -64,6 +72,16 @@ def _nothing(*_: Any, **__: Any) -> None:
     """Records nothing."""
 
 
+def nothing_rendered(call: SeamCall) -> dict[str, float]:
+    """The script ends by rendering and evaluating iteration 30,000, which stage 2 is past."""
+    return dict.fromkeys(("train", "test"), math.nan)
+
+
+def nothing_measured(call: SeamCall) -> dict[str, Any]:
+    """Likewise."""
+    return {path: {"ours_30000": NO_METRICS} for path in call.first}
+
+
 class LP3DGS(GraphdecoAdapter):
     """LP-3DGS."""
 
@@ -92,8 +110,8 @@ class LP3DGS(GraphdecoAdapter):
                 (RAD, "RadSplat", "prune_after_render"),
             )
         ),
-        Seam(Role.STILL, "render", "render_sets"),
-        Seam(Role.STILL, "metrics", "evaluate", ("model_paths",)),
+        Seam(Role.STILL, "render", "render_sets", how=nothing_rendered),
+        Seam(Role.STILL, "metrics", "evaluate", ("model_paths",), how=nothing_measured),
         Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
     )
 
@@ -112,17 +130,9 @@ class LP3DGS(GraphdecoAdapter):
             )
         return script, arguments
 
-    def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
+    def model_of(self, call: SeamCall) -> Any:
         """What the script calls at its end is about no model in particular."""
-        return self if instance is None else instance
-
-    def stand_still(self, wrapped: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-        """The script ends by rendering and evaluating iteration 30,000, which stage 2 is past."""
-        if wrapped.__name__ == "render_sets":
-            return dict.fromkeys(("train", "test"), math.nan)
-        if wrapped.__name__ == "evaluate":
-            return {path: {"ours_30000": NO_METRICS} for path in arguments["model_paths"]}
-        return super().stand_still(wrapped, arguments)
+        return self if call.instance is None else call.instance
 
 
 @hookimpl

@@ -12,16 +12,27 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.adapting import (
+    CommandLine,
+    ConfigFile,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    HostRepo,
+    RasterizerCall,
+    RasterOutputs,
+    Role,
+    Seam,
+    SeamCall,
+    hookimpl,
+    revised,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterOutputs
 
 MODEL = "scene.gaussian_model"
 
@@ -39,12 +50,17 @@ class MCMCDialect(GraphdecoDialect):
         return outputs.image, outputs.radii, (outputs.radii > 0).to(outputs.radii)
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """The lineage's stand-ins; the host imports the relocation from the rasterizer's."""
-        from fragprune_plugins.hosts.graphdeco.stand_ins import compute_relocation
+        """Vanilla's stand-ins; the host imports the relocation from the rasterizer's."""
+        from fragprune_plugins.adapting import stand_ins
 
         modules = super().modules(draw)
-        vars(modules[self.package])["compute_relocation"] = compute_relocation
+        vars(modules[self.package])["compute_relocation"] = stand_ins.compute_relocation
         return modules
+
+
+def no_noise(call: SeamCall) -> float:
+    """No rate, no noise: the host multiplies what it adds to the positions by it."""
+    return 0.0
 
 
 class MCMC(GraphdecoAdapter):
@@ -64,7 +80,7 @@ class MCMC(GraphdecoAdapter):
     own_names = ("utils.reloc_utils:compute_relocation",)
     dialect_type = MCMCDialect
     seams = (
-        *GraphdecoAdapter.seams,
+        *revised(GraphdecoAdapter.seams, {"GaussianModel.update_learning_rate": {"how": no_noise}}),
         Seam(Role.CHOICE, MODEL, "GaussianModel._update_params", ("idxs", "ratio")),
         Seam(Role.COPY, MODEL, "GaussianModel.relocate_gs", ("dead_mask",)),
         Seam(Role.FORGET, MODEL, "GaussianModel.replace_tensors_to_optimizer", ("inds",)),
@@ -72,12 +88,8 @@ class MCMC(GraphdecoAdapter):
     )
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """The lineage's, and a configuration file whose values win over the flags."""
+        """Vanilla's, and a configuration file whose values win over the flags."""
         return replace(super().command_line(repo), config=ConfigFile("--config"))
-
-    def still_rate(self, rate: Any) -> float:
-        """No rate, no noise: the host multiplies what it adds to the positions by it."""
-        return 0.0
 
 
 @hookimpl

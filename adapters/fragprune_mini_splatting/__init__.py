@@ -8,26 +8,35 @@ these scores, so with thresholds active they count what is left after truncation
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.adapting import (
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    RasterInputs,
+    RasterizerCall,
+    RasterOutputs,
+    Role,
+    Seam,
+    SeamCall,
+    graphdeco,
+    hookimpl,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 SCORING = "diff_gaussian_rasterization_ms"
 FORWARD, DEPTH = "GaussianRasterizer.forward", "GaussianRasterizer.render_depth"
-MASKED_SPLIT = "densify_and_split_mask"
 COMPRESSED = "compressed_gs.npz"
 SCRIPTS = ("ms/train.py", "ms_d/train.py", "gs/train.py")
 
@@ -66,15 +75,36 @@ class MiniSplattingDialect(GraphdecoDialect):
         return (*drawn, weights, count, wins.float())
 
     def names(self) -> frozenset[str]:
-        """The lineage's and the scoring rasterizer's."""
+        """Vanilla's and the scoring rasterizer's."""
         return super().names() | {SCORING}
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """The lineage's stand-ins and the scoring rasterizer's."""
-        from fragprune_plugins.hosts.graphdeco import stand_ins
+        """Vanilla's stand-ins and the scoring rasterizer's."""
+        from fragprune_plugins.adapting import stand_ins
 
         scoring = stand_ins.rasterizer(SCORING, self.settings, False, draw, also=("render_depth",))
         return {**super().modules(draw), SCORING: scoring}
+
+
+def masked_splits(call: SeamCall) -> Tensor:
+    """The masked split takes the rows under the mask besides."""
+    mask = call.arguments["mask"].bool()
+    chosen = mask.new_zeros(len(call.model.get_xyz))
+    chosen[: len(mask)] = mask
+    chosen[graphdeco.splits(call, copies=1)] = True
+    rows: Tensor = chosen.nonzero()[:, 0]
+    return rows.repeat(call.arguments["N"])
+
+
+def packed(call: SeamCall) -> tuple[Path, Tensor] | None:
+    """What ms_c compresses: one Gaussian a voxel, sorted by position, positions first."""
+    import torch
+
+    path = Path(str(call.first))
+    if path.name != COMPRESSED:
+        return None
+    given = call.arguments.get("args")
+    return path, torch.from_numpy(given[0] if given else call.result["arr_0"])
 
 
 class MiniSplatting(GraphdecoAdapter):
@@ -106,38 +136,17 @@ class MiniSplatting(GraphdecoAdapter):
         Seam(
             Role.PARENTS,
             MODEL,
-            f"GaussianModel.{MASKED_SPLIT}",
+            "GaussianModel.densify_and_split_mask",
             ("grads", "grad_threshold", "scene_extent", "mask", "N"),
+            how=masked_splits,
         ),
         Seam(Role.STILL, MODEL, "GaussianModel.densify_and_prune_split"),
         Seam(Role.STILL, MODEL, "GaussianModel.prune_points", ("mask",)),
         Seam(Role.STILL, MODEL, "GaussianModel.reinitial_pts", ("pts", "rgb")),
         Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
-        Seam(Role.PACK, "numpy", "savez_compressed", ("file", "args"), external=True),
-        Seam(Role.UNPACK, "numpy", "load", ("file",), external=True),
+        Seam(Role.PACK, "numpy", "savez_compressed", ("file", "args"), external=True, how=packed),
+        Seam(Role.UNPACK, "numpy", "load", ("file",), external=True, how=packed),
     )
-
-    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
-        """The masked split takes the rows under the mask besides."""
-        if method != MASKED_SPLIT:
-            return super().parents(model, method, arguments)
-        mask = arguments["mask"].bool()
-        selected = mask.new_zeros(self.rows(model))
-        selected[: len(mask)] = mask
-        split = {**arguments, "N": 1}
-        selected[super().parents(model, "densify_and_split", split)] = True
-        rows: Tensor = selected.nonzero()[:, 0]
-        return rows.repeat(arguments["N"])
-
-    def packed(self, arguments: Mapping[str, Any], result: Any) -> tuple[Path, Tensor] | None:
-        """What ms_c compresses: one Gaussian a voxel, sorted by position, positions first."""
-        import torch
-
-        path = Path(str(arguments["file"]))
-        if path.name != COMPRESSED:
-            return None
-        positions = arguments["args"][0] if "args" in arguments else result["arr_0"]
-        return path, torch.from_numpy(positions)
 
 
 @hookimpl

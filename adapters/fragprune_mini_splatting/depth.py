@@ -13,13 +13,17 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from fragprune_plugins.errors import InputError
-from fragprune_plugins.types import Splats
+from fragprune_plugins.adapting import (
+    InputError,
+    RasterInputs,
+    RasterOutputs,
+    Splats,
+    View,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs, RasterOutputs, View
 
 TILE = 16
 """Pixels; a Gaussian reaches at most its radius and the rest of a tile."""

@@ -11,23 +11,32 @@ from __future__ import annotations
 from argparse import ArgumentParser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.errors import NotComparedError
-from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.graphdeco.adapter import CLONE, SPLIT, default, reaches
-from fragprune_plugins.hosts.seams import Role, Seam, revised
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.adapting import (
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    HostRepo,
+    NotComparedError,
+    RasterInputs,
+    RasterizerCall,
+    Role,
+    Seam,
+    graphdeco,
+    hookimpl,
+    revised,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.storage.ply import SplatFile
-    from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.adapting import SplatFile
 
 MODEL = "scene.gaussian_model"
 KERNEL_SIZE = 0.1
@@ -58,6 +67,13 @@ ABSOLUTE = ("grads_abs", "grad_abs_threshold")
 """What densification is given besides vanilla's gradients and their threshold."""
 
 
+def either(arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
+    """(rows,) bool: either gradient will do, each with its own threshold."""
+    absolute = flat(arguments["grads_abs"], dim=-1)
+    enough = graphdeco.reaches(absolute, arguments["grad_abs_threshold"], rows)
+    return graphdeco.needy(arguments, rows, flat) | enough
+
+
 class MipSplatting(GraphdecoAdapter):
     """Mip-Splatting."""
 
@@ -80,7 +96,16 @@ class MipSplatting(GraphdecoAdapter):
     seams = (
         *revised(
             GraphdecoAdapter.seams,
-            {seam.attribute: {"needs": (*seam.needs, *ABSOLUTE)} for seam in (CLONE, SPLIT)},
+            {
+                seam.attribute: {
+                    "needs": (*seam.needs, *ABSOLUTE),
+                    "how": partial(parents, needy=either),
+                }
+                for seam, parents in (
+                    (graphdeco.CLONE, graphdeco.clones),
+                    (graphdeco.SPLIT, graphdeco.splits),
+                )
+            },
         ),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_fused_ply", ("path",)),
     )
@@ -90,23 +115,16 @@ class MipSplatting(GraphdecoAdapter):
         opacities: Tensor = model.get_opacity_with_3D_filter
         return opacities.detach().reshape(-1)
 
-    def needy(self, arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
-        """Either gradient will do, each with its own threshold."""
-        absolute = flat(arguments["grads_abs"], dim=-1)
-        return super().needy(arguments, rows, flat) | reaches(
-            absolute, arguments["grad_abs_threshold"], rows
-        )
-
     def read_model(self, ply: Path) -> SplatFile:
         """With the 3D filter, which only this host's own reader asks for."""
-        from fragprune_plugins.storage.ply import read_ply
+        from fragprune_plugins.adapting import read_ply
 
         return read_ply(ply, filtered=True)
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """By the 2D filter of the command, or its default; ``--load_allres`` mixes resolutions."""
         parser = ArgumentParser(add_help=False)
-        size = default(repo, "ModelParams", "_kernel_size", KERNEL_SIZE)
+        size = graphdeco.default(repo, "ModelParams", "_kernel_size", KERNEL_SIZE)
         parser.add_argument("-k", "--kernel_size", type=float, default=size)
         flags, rest = parser.parse_known_args(arguments)
         if "--load_allres" in rest:

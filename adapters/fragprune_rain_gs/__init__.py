@@ -8,24 +8,33 @@ no learning rate before iteration 10,000 and an offset one from there.
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from fragprune_plugins.datasets.photographs import Photographs
-from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.graphdeco.adapter import SPLIT
-from fragprune_plugins.hosts.seams import revised
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.adapting import (
+    CommandLine,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    HostRepo,
+    Photographs,
+    RasterInputs,
+    RasterizerCall,
+    RasterOutputs,
+    SeamCall,
+    graphdeco,
+    hookimpl,
+    revised,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 MODEL = "scene.gaussian_model"
 PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
@@ -61,6 +70,13 @@ class RainDialect(GraphdecoDialect):
         return {"wandb": ModuleType("wandb", "Stand-in of fragprune: empty.")}
 
 
+def far_splits(call: SeamCall) -> Tensor:
+    """A far split appends N - 1 copies of each row before it appends N children."""
+    children = call.arguments["N"]
+    far = call.arguments["abe_split"]
+    return graphdeco.splits(call, copies=2 * children - 1 if far else children)
+
+
 class RainGS(GraphdecoAdapter):
     """RAIN-GS."""
 
@@ -81,14 +97,12 @@ class RainGS(GraphdecoAdapter):
         GraphdecoAdapter.seams,
         {
             "GaussianRasterizer.forward": {"module": PACKAGE},
-            SPLIT.attribute: {"needs": (*SPLIT.needs, "abe_split")},
+            graphdeco.SPLIT.attribute: {
+                "needs": (*graphdeco.SPLIT.needs, "abe_split"),
+                "how": far_splits,
+            },
         },
     )
-
-    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
-        """A far split appends N - 1 copies of each row before it appends N children."""
-        copies = 2 * arguments["N"] - 1 if arguments["abe_split"] else arguments.get("N", 1)
-        return super().parents(model, method, {**arguments, "N": copies})
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """Without its modes, which cannot resume: they replace the points and set no dilation.
@@ -109,12 +123,12 @@ class RainGS(GraphdecoAdapter):
         return script, rest
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """The lineage's, but for its own white; views are always held out."""
+        """Vanilla's, but for its own white; views are always held out."""
         line = super().command_line(repo)
         return replace(line, white_background=("--white_bg",), hold_out=())
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
-        """The lineage's, from the folder that the scene's name stands for."""
+        """Vanilla's, from the folder that the scene's name stands for."""
         read = super().photographs(repo, arguments)
         folders = [folder for name, folder in SMALLER.items() if name in str(read.folder)]
         return replace(read, images=folders[-1]) if folders else read

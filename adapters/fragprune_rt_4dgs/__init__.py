@@ -13,17 +13,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from fragprune_plugins.errors import (
-    AlignmentError,
+from fragprune_plugins.adapting import (
+    CommandLine,
+    GraphdecoAdapter,
+    HostAdapter,
+    HostInfo,
+    HostRepo,
     ModelFileError,
     NotComparedError,
+    RasterizerCall,
+    SeamCall,
     UsageError,
+    hookimpl,
+    revised,
 )
-from fragprune_plugins.hosts.adapter import CommandLine, HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, RasterizerCall
-from fragprune_plugins.hosts.seams import revised
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_rt_4dgs.config import YAMLFile
 from fragprune_rt_4dgs.dialect import ARGUMENTS, OUTPUTS, RASTERIZER, SETTINGS, RT4DGSDialect
 
@@ -31,6 +34,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MODEL = "scene.gaussian_model"
+
+
+def with_its_map(call: SeamCall) -> Any:
+    """Keep the environment map: the training loop replaces it by a new one."""
+    call.model.restored_env_map = call.first[17] if len(call.first) > 17 else None
+    return call.first
 
 
 class RT4DGS(GraphdecoAdapter):
@@ -57,6 +66,7 @@ class RT4DGS(GraphdecoAdapter):
         GraphdecoAdapter.seams,
         {
             "GaussianRasterizer.forward": {"module": RASTERIZER},
+            "GaussianModel.restore": {"how": with_its_map},
             "GaussianModel.save_ply": None,
             "GaussianModel.load_ply": None,
         },
@@ -110,40 +120,9 @@ class RT4DGS(GraphdecoAdapter):
 
     # -- its models ------------------------------------------------------------------------------
 
-    def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
-        """With ``compute_cov3D_python`` the host leaves out who is not there at the moment.
-
-        The same mask, worked out by the host's own function; the opacities of the call, which have
-        the marginal in them, must be those of the rows it keeps.
-        """
-        import torch
-
-        from fragprune_plugins.constants import MARGINAL_MIN
-
-        if call.get("cov3D_precomp") is None or model.gaussian_dim != 4:
-            return None
-        with torch.no_grad():
-            marginal = model.get_marginal_t(call.settings.timestamp)
-            rows: Tensor = (marginal[:, 0] > MARGINAL_MIN).nonzero()[:, 0]
-            expected = (model.get_opacity * marginal)[rows]
-        if not torch.equal(expected, call["opacities"]):
-            raise AlignmentError(
-                f"{self.name}: compute_cov3D_python",
-                f"{len(call['opacities'])} Gaussians",
-                f"the {len(rows)} of {self.rows(model)} that are there at "
-                f"{float(call.settings.timestamp):g}, with their opacities",
-                "Report this with the host's commit, or leave compute_cov3D_python off.",
-            )
-        return rows
-
     def elsewhere(self, model: Any) -> list[Tensor]:
         """The environment map, whose optimizer is a local of the training loop."""
         return [model.env_map] if getattr(model.env_map, "requires_grad", False) else []
-
-    def before_restore(self, model: Any, capture: Any) -> Any:
-        """Keep the environment map: the training loop replaces it by a new one."""
-        model.restored_env_map = capture[17] if len(capture) > 17 else None
-        return capture
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:
         """Bring the environment map back, where a new one, all black, has taken its place."""

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.hosts.adapter import ConfigFile
+from fragprune_plugins.adapting import ConfigFile
 
 
 class YAMLFile(ConfigFile):

@@ -7,13 +7,22 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.hosts.adapter import HostCall
-from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
+from fragprune_plugins.adapting import (
+    MARGINAL_MIN,
+    AlignmentError,
+    GraphdecoDialect,
+    HostCall,
+    Moment,
+    RasterInputs,
+    RasterOutputs,
+    Sliced,
+    SpacetimeSplats,
+    Splats,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import RasterInputs, RasterOutputs, Sliced
 
 RASTERIZER = "gaussian_renderer.diff_gaussian_rasterization"
 """A file of the host, compiled when it is imported."""
@@ -57,11 +66,34 @@ class RT4DGSDialect(GraphdecoDialect):
         features = torch.cat([depths, flow], dim=1)
         return replace(inputs, splats=replace(inputs.splats, features=features))
 
+    def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
+        """With ``compute_cov3D_python`` the host leaves out who is not there at the moment.
+
+        The same mask, worked out by the host's own function; the opacities of the call, which have
+        the marginal in them, must be those of the rows it keeps.
+        """
+        import torch
+
+        if call.get("cov3D_precomp") is None or model.gaussian_dim != 4:
+            return None
+        with torch.no_grad():
+            marginal = model.get_marginal_t(call.settings.timestamp)
+            rows: Tensor = (marginal[:, 0] > MARGINAL_MIN).nonzero()[:, 0]
+            expected = (model.get_opacity * marginal)[rows]
+        if not torch.equal(expected, call["opacities"]):
+            raise AlignmentError(
+                "rt-4dgs: compute_cov3D_python",
+                f"{len(call['opacities'])} Gaussians",
+                f"the {len(rows)} of {len(marginal)} that are there at "
+                f"{float(call.settings.timestamp):g}, with their opacities",
+                "Report this with the host's commit, or leave compute_cov3D_python off.",
+            )
+        return rows
+
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
     ) -> tuple[Tensor, ...]:
         """What ``pack`` gives, and covs_com (P, 6): the covariances drawn, without gradients."""
-        from fragprune_plugins.types import Splats
 
         drawn = self.pack(draw(inputs), call)
         assert isinstance(inputs.splats, Splats)  # unpack made them
@@ -75,7 +107,7 @@ class RT4DGSDialect(GraphdecoDialect):
         return outputs.image, outputs.radii, features[:1], outputs.alpha, features[1:]
 
     def names(self) -> frozenset[str]:
-        """The lineage's and that of the neighbours."""
+        """Vanilla's and that of the neighbours."""
         return super().names() | {"pointops2_cuda"}
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
@@ -87,7 +119,7 @@ class RT4DGSDialect(GraphdecoDialect):
 
 def at_moment(call: HostCall) -> Sliced:
     """The Gaussians of a call as 3D Gaussians, by whichever of the host's paths it asks for."""
-    from fragprune_plugins import Moment, SpacetimeSplats, slice_at
+    from fragprune_plugins.adapting import slice_at
 
     s, given = call.settings, {}
     in_time = s.gaussian_dim == 4 or s.rot_4d

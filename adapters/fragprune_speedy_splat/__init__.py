@@ -11,16 +11,22 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from fragprune_plugins.errors import EngineError
-from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, HostInfo
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.plugins.hookspecs import hookimpl
-
-if TYPE_CHECKING:
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.adapting import (
+    EngineError,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    RasterInputs,
+    RasterizerCall,
+    RasterOutputs,
+    Role,
+    Seam,
+    hookimpl,
+)
 
 UNTIL = "--prune_until_iter"
 

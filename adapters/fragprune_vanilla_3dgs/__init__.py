@@ -13,12 +13,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, RasterizerCall
-from fragprune_plugins.hosts.graphdeco.adapter import MODEL
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.adapting import (
+    Finding,
+    GraphdecoAdapter,
+    HostAdapter,
+    HostInfo,
+    HostRepo,
+    RasterizerCall,
+    graphdeco,
+    hookimpl,
+)
 
 OUTPUTS = 3
 """Colour, radii and, since August 2024, inverse depth."""
@@ -47,13 +51,13 @@ class Vanilla3DGS(GraphdecoAdapter):
     def _state(self, repo: HostRepo) -> Finding:
         """The revision, for people; an error where it has no checkpoints to resume."""
         names = ("training_setup", "capture", "restore")
-        there = [name for name in names if repo.function(MODEL, f"GaussianModel.{name}")]
+        there = [name for name in names if repo.function(graphdeco.MODEL, f"GaussianModel.{name}")]
         if there != ["training_setup"]:
             return Finding("info", "revision", str(repo.root), self.revision(repo))
         return Finding(
             "error",
             "revision",
-            repo.place(MODEL, "GaussianModel"),
+            repo.place(graphdeco.MODEL, "GaussianModel"),
             "neither capture nor restore, as vanilla 3DGS was until 14 July 2023",
             "checkpoints, which stage 2 resumes",
             "Bring the fork to a later state, or give its PLY to fragprune finetune.",

@@ -82,13 +82,12 @@ def _scripts(adapter: HostAdapter) -> tuple[str, ...]:
 
     They do not depend on the revision.
     """
-    from fragprune_plugins.errors import UsageError
+    from fragprune_plugins.hosts.adapter import ScriptAdapter
     from fragprune_plugins.hosts.source import HostRepo
 
-    try:
-        return adapter.command_line(HostRepo(Path("/nonexistent"))).scripts
-    except UsageError:
+    if not isinstance(adapter, ScriptAdapter):
         return ()
+    return adapter.command_line(HostRepo(Path("/nonexistent"))).scripts
 
 
 _SUPPORT = Template("""# What is supported

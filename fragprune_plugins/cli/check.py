@@ -145,14 +145,12 @@ def _as_dict(tried: Tried) -> dict[str, Any]:
 
 def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
     """What the training scripts import and is not here; a host without scripts is its user's."""
-    from fragprune_plugins.errors import UsageError
+    from fragprune_plugins.hosts.adapter import ScriptAdapter
     from fragprune_plugins.hosts.preflight import missing_imports
 
-    try:
-        scripts = adapter.command_line(repo).scripts
-    except UsageError:
+    if not isinstance(adapter, ScriptAdapter):
         return []
-    dialect = adapter.dialect(repo)
+    scripts, dialect = adapter.command_line(repo).scripts, adapter.dialect(repo)
     answered = {*dialect.names(), *dialect.spares()}
     return missing_imports(repo, [repo.root / name for name in scripts], answered)
 

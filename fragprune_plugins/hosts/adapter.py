@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import inspect
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,14 +16,13 @@ from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import NotComparedError, UsageError
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.flags import Flags
-from fragprune_plugins.hosts.seams import Seam
+from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo, check_seams
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from fragprune_plugins.engines import Engine
-    from fragprune_plugins.storage.ply import SplatFile
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 CHECKPOINT_KEY = "fragprune"
@@ -66,19 +63,11 @@ class HostCall:
     engine: str | Engine = "auto"
 
     @classmethod
-    def bind(
-        cls,
-        function: Callable[..., Any],
-        settings: Any,
-        args: Sequence[Any],
-        kwargs: dict[str, Any],
-        entry: str = "",
-    ) -> HostCall:
-        """Name every argument by the function's signature; what it takes as ``**more`` as given."""
-        bound = inspect.signature(function).bind(*args, **kwargs)
-        bound.apply_defaults()
-        named = bound.arguments
-        return cls(settings, named | named.get("more", {}), entry)
+    def of(cls, call: SeamCall) -> HostCall:
+        """The call of a rasterizer's seam; what it takes as ``**more`` as given."""
+        settings = getattr(call.instance, "raster_settings", None)
+        named = call.arguments
+        return cls(settings, named | named.get("more", {}), str(call.seam))
 
     def get(self, name: str) -> Tensor | None:
         """A tensor argument; None when it is absent, None or empty (hosts pass all three)."""
@@ -90,22 +79,8 @@ class HostCall:
         return value
 
 
-@dataclass
-class RowTrace:
-    """Where rows came from, once a host has rearranged them.
-
-    Attributes:
-        origins: (M,) int64, for each row of the model as it is now, the row it was or was copied
-            from; None where nothing happened.
-        fresh: (M,) bool, True for rows that are new Gaussians or were made over.
-    """
-
-    origins: Tensor | None = None
-    fresh: Tensor | None = None
-
-
 class Dialect(ABC):
-    """A host's rasterizer call contract, for one revision of the host."""
+    """How one revision of a host calls its rasterizer, and what it expects back."""
 
     means: ClassVar[str] = "means3D"
     """What the call names the (N, 3) means."""
@@ -113,6 +88,14 @@ class Dialect(ABC):
     @abstractmethod
     def unpack(self, call: HostCall) -> RasterInputs:
         """The host's call as core values."""
+
+    def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
+        """Rows (M,) int64 of the model that a call draws, in its order; None for all.
+
+        Raises:
+            AlignmentError: the call's Gaussians cannot be told to be those rows.
+        """
+        return None
 
     @abstractmethod
     def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
@@ -279,21 +262,36 @@ class CommandLine:
 class HostAdapter(ABC):
     """Describes one host: what identifies it, where to wrap, how its tensors are named.
 
-    Subclasses are stateless; what depends on the revision comes from a ``HostRepo``.
+    Subclasses are stateless; what depends on the revision comes from a ``HostRepo``. A host with
+    training scripts has a ``ScriptAdapter``.
+
+    Attributes:
+        name: of the adapter, as ``--adapter`` takes it.
+        info: who the host is, for people.
+        seams: where to wrap.
+        descends_from: names of adapters whose hosts this one was made from: where they fit too,
+            they step back.
+        installed: import names of the packages that are the host, where it is installed, not
+            checked out.
+        steps_by_rendering: the host does not call the STEP seam in every iteration: where it did
+            not, the first view that it draws with gradients begins the step.
+        appearance: param groups that hold the colour: ``--train appearance`` trains them besides.
+        inherited: param groups that children have from their parents bit for bit, which is checked.
+        gradients_read: param groups whose gradient the host reads in every iteration: frozen, they
+            get zeros.
     """
 
     name: str
     info: HostInfo
     seams: tuple[Seam, ...]
     descends_from: tuple[str, ...] = ()
-    """Names of adapters whose hosts this one was made from: where they fit too, they step back."""
     installed: tuple[str, ...] = ()
-    """Import names of the packages that are the host, where it is installed, not checked out."""
     steps_by_rendering = False
-    """The host does not call the STEP seam in every iteration: where it did not, the first view
-    that it draws with gradients begins the step."""
+    appearance: frozenset[str] = frozenset({"f_dc", "f_rest"})
+    inherited: tuple[str, ...] = ()
     gradients_read: frozenset[str] = frozenset()
-    """Param groups whose gradient the host reads in every iteration: frozen, they get zeros."""
+
+    # -- the source ------------------------------------------------------------------------------
 
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
         """The seams of this revision; all of ``seams`` unless a host says otherwise."""
@@ -323,7 +321,63 @@ class HostAdapter(ABC):
 
     @abstractmethod
     def dialect(self, repo: HostRepo) -> Dialect:
-        """The rasterizer's call contract in this revision."""
+        """How this revision calls its rasterizer."""
+
+    def use(self, repo: HostRepo) -> str:
+        """What a user of this host types, for people to read."""
+        package = self.installed[0] if self.installed else "the host"
+        call = f'fragprune_plugins.activate("{self.name}")'
+        return f"{call} above the import of {package} in your own script"
+
+    # -- its models ------------------------------------------------------------------------------
+
+    @abstractmethod
+    def means(self, model: Any) -> Tensor:
+        """(N, 3) the tensor the host hands its rasterizer: identifies the model."""
+
+    @abstractmethod
+    def opacities(self, model: Any) -> Tensor:
+        """(N,) activated opacities."""
+
+    def rows(self, model: Any) -> int:
+        """How many Gaussians the model holds."""
+        return len(self.means(model))
+
+    def view(self, camera: Any) -> int:
+        """Tells training views apart; by the object, unless a host draws through copies."""
+        return id(camera)
+
+    def model_of(self, call: SeamCall) -> Any:
+        """The model that a seam's call is about: what the method was called on, unless a host has
+        trainers, or functions, that change models.
+
+        The tensor of its means will do where a call has no more; None where it is of no concern.
+        """
+        return call.instance
+
+    def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
+        """What a param group is called in ``trained_groups``; None for one without a name."""
+        return group.get("name")
+
+    def trained_groups(self, train: str) -> frozenset[str] | None:
+        """Names of param groups that stage 2 trains for ``--train``; None for all of them."""
+        opacity = frozenset({"opacity"})
+        return {"opacity": opacity, "appearance": opacity | self.appearance, "all": None}[train]
+
+    def elsewhere(self, model: Any) -> list[Tensor]:
+        """Parameters of an optimizer that is out of our reach, moved by what is drawn alone."""
+        return []
+
+    def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
+        """A chance to bring back state that the host's own resume loses."""
+
+    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
+        """The dict inside the host's checkpoint tuple that tolerates a key of ours."""
+        raise NotImplementedError(f"{self.name}: CAPTURE and RESTORE seams need checkpoint_state")
+
+
+class ScriptAdapter(HostAdapter):
+    """An adapter of a host with training scripts, which ``fragprune run`` drives."""
 
     @abstractmethod
     def command_line(self, repo: HostRepo) -> CommandLine:
@@ -365,138 +419,6 @@ class HostAdapter(ABC):
         """
         return {}
 
-    def read_model(self, ply: Path) -> SplatFile:
-        """The host's own PLY."""
-        from fragprune_plugins.storage.ply import read_ply
-
-        return read_ply(ply)
-
-    def view(self, camera: Any) -> int:
-        """Tells training views apart; by the object, unless a host draws through copies."""
-        return id(camera)
-
-    @abstractmethod
-    def rows(self, model: Any) -> int:
-        """How many Gaussians the model holds."""
-
-    @abstractmethod
-    def means(self, model: Any) -> Tensor:
-        """(N, 3) the tensor the host hands its rasterizer: identifies the model."""
-
-    @abstractmethod
-    def opacities(self, model: Any) -> Tensor:
-        """(N,) activated opacities."""
-
-    def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
-        """Rows (M,) int64 of the model that a rasterizer call draws, in its order; None for all.
-
-        Raises:
-            AlignmentError: the call's Gaussians cannot be told to be those rows.
-        """
-        return None
-
-    def model_of(self, instance: Any, arguments: Mapping[str, Any]) -> Any:
-        """The model that a seam's call is about: what the method was called on, unless a host has
-        trainers, or functions, that change models.
-
-        The tensor of its means will do where a call has no more; None where it is of no concern.
-        """
-        return instance
-
-    @abstractmethod
-    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
-        """The host's optimizers of a model, the main one first.
-
-        Args:
-            model: that is trained.
-            arguments: of the ATTACH seam's call, which is over, "self" among them.
-        """
-
-    def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
-        """What a param group is called in ``trained_groups``; None for one without a name."""
-        return group.get("name")
-
-    @abstractmethod
-    def trained_groups(self, train: str) -> frozenset[str] | None:
-        """Names of param groups that stage 2 trains for ``--train``; None for all of them."""
-
-    def elsewhere(self, model: Any) -> list[Tensor]:
-        """Parameters of an optimizer that is out of our reach, moved by what is drawn alone."""
-        return []
-
-    def _lacks(self, method: str, reason: str) -> NotImplementedError:
-        return NotImplementedError(f"{type(self).__name__}.{method}: needed for {reason}")
-
-    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
-        """Rows that a densify method is about to copy, one per row it will append, in order."""
-        raise self._lacks("parents", "PARENTS seams")
-
-    def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
-        """Whether appended rows are copies of those parents; asked before they are appended."""
-        raise self._lacks("check_children", "PARENTS and COPY seams")
-
-    def stand_still(self, wrapped: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-        """What a STILL seam returns in stage 2 in place of the host's call, which is not made."""
-        return None
-
-    @contextmanager
-    def tracing(
-        self, model: Any, wrapped: Callable[..., Any], arguments: Mapping[str, Any]
-    ) -> Iterator[RowTrace]:
-        """Around the call of a REARRANGE seam: have the host's own code carry row numbers along.
-
-        Args:
-            model: whose rows change.
-            wrapped: the host's function.
-            arguments: of the call.
-
-        Yields:
-            The trace; it must be complete once the block is left.
-        """
-        raise self._lacks("tracing", "a REARRANGE seam")
-        yield
-
-    def file_at(self, method: str, path: Path) -> Path:
-        """The file that a SAVE or LOAD seam's path stands for: some hosts leave endings out.
-
-        Args:
-            method: the seam's function, without its class.
-            path: as the host passed it.
-        """
-        return path
-
-    def packed(self, arguments: Mapping[str, Any], result: Any) -> tuple[Path, Tensor] | None:
-        """The file that a PACK seam's call has written or an UNPACK seam's has read.
-
-        Args:
-            arguments: of the call, by name.
-            result: that it returned.
-
-        Returns:
-            The path and the means (M, 3) that are in it, in its order and bit for bit the model's;
-            None where the call was about something else.
-        """
-        return None
-
-    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
-        """The dict inside the host's checkpoint tuple that tolerates ``CHECKPOINT_KEY``."""
-        raise self._lacks("checkpoint_state", "CAPTURE and RESTORE seams")
-
-    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
-        """Write a checkpoint the host can resume from, made from its PLY."""
-        raise self._lacks("checkpoint_from_ply", "checkpoints")
-
-    def before_restore(self, model: Any, capture: Any) -> Any:
-        """A chance to complete a checkpoint that lacks something; returns it."""
-        return capture
-
-    def still_rate(self, rate: Any) -> Any:
-        """What the STEP seam tells the host in stage 2; a host that makes noise of it gets none."""
-        return rate
-
-    def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
-        """A chance to bring back state that the host's own resume loses."""
-
     def save_model(self, model: Any, output: Path, iteration: int) -> Path:
         """Have the host save its model as it would at this iteration; returns the file."""
         path = self.model_file(output, iteration)
@@ -504,10 +426,14 @@ class HostAdapter(ABC):
         model.save_ply(str(path))
         return path
 
+    @abstractmethod
     def model_file(self, output: Path, iteration: int) -> Path:
         """Where the host saves its model at an iteration."""
-        raise self._lacks("model_file", "a training script")
 
+    @abstractmethod
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
         """Resumable files of an output folder, (iteration, checkpoint or PLY), newest last."""
-        raise self._lacks("saved_iterations", "a training script")
+
+    @abstractmethod
+    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
+        """Write a checkpoint the host can resume from, made from its PLY."""

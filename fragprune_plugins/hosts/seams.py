@@ -6,36 +6,70 @@ undone; a procedure cannot.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
+from functools import cached_property
+from inspect import signature
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class Role(Enum):
-    """What the session does at a seam. A closed set; the session owns each one's meaning."""
+    """What the session does at a seam. A closed set; the session owns each one's meaning.
+
+    Attributes:
+        does: that.
+        how: what the seam's ``how`` gives for a call, and when it is asked; "" where it is not.
+    """
 
     SCENE = "learn where the host writes its output"
-    ATTACH = "give the model its threshold store"
-    STEP = "count one training step"
+    ATTACH = "give the model its threshold store", "after: its optimizers, the main one first"
+    STEP = "count one training step", "in stage 2, after: what the host is told (the call's result)"
     VIEW = "remember which model is being rendered"
     RASTERIZE = "draw with thresholds"
     LOSS = "note the host's loss when it goes backward"
     METRIC = "evaluate a picture; NaN where the weights it downloads are not to be had"
-    PARENTS = "work out the parents of the rows about to be appended"
+    PARENTS = (
+        "work out the parents of the rows about to be appended",
+        "before: rows (n,) int64 that will be copied, one per row appended, in order",
+    )
     KEEP = "keep the surviving rows"
     APPEND = "append rows"
     CHOICE = "note the rows the host has drawn as parents of what it appends or overwrites next"
     COPY = "overwrite rows with copies of others; stands still in stage 2"
-    REARRANGE = "keep, copy and append rows in one call; stands still in stage 2"
+    REARRANGE = (
+        "keep, copy and append rows in one call; stands still in stage 2",
+        "around: a context manager in which the host's own code carries row numbers along; it "
+        "yields a ``RowTrace``, complete once it is left",
+    )
     FORGET = "drop the moments of rows"
-    STILL = "stand still in stage 2: what would change frozen parameters or rows"
-    SAVE = "write the sidecar beside the model's file"
-    LOAD = "read the sidecar beside the model's file"
-    PACK = "write the sidecar of a file that holds the model's Gaussians in an order of its own"
-    UNPACK = "read that sidecar for the model that will be made of the file"
+    STILL = (
+        "stand still in stage 2: what would change frozen parameters or rows",
+        "instead: what the call, which is not made, returns (None)",
+    )
+    SAVE = "write the sidecar beside the model's file", "after: the file (the path as passed)"
+    LOAD = "read the sidecar beside the model's file", "after: the file (the path as passed)"
+    PACK = (
+        "write the sidecar of a file that holds the model's Gaussians in an order of its own",
+        "after: its path, and the means (M, 3) in it, in its order and bit for bit the model's; "
+        "None where the call was about something else",
+    )
+    UNPACK = "read that sidecar for the model that will be made of the file", "after: as PACK"
     CAPTURE = "put thresholds into the host's checkpoint"
-    RESTORE = "take thresholds out of the host's checkpoint"
+    RESTORE = (
+        "take thresholds out of the host's checkpoint",
+        "before: the checkpoint, completed where it lacks something (as passed)",
+    )
+
+    def __init__(self, does: str, how: str = "") -> None:
+        self.does, self.how = does, how
+
+
+NEEDS_HOW = frozenset({Role.ATTACH, Role.PARENTS, Role.REARRANGE, Role.PACK, Role.UNPACK})
+"""Roles in which only the host's adapter can say."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +80,11 @@ class Seam:
         role: what the session does there.
         module: dotted import name.
         attribute: dotted path inside it, such as "GaussianModel.training_setup".
-        needs: parameter names the function must have; the session reads its arguments by them.
+        needs: parameter names the function must have; the session reads its arguments by them, the
+            first one for itself.
         external: the module is not part of the host's folder (a compiled package), so only the
             import can check it.
+        how: what the host does there in a way of its own; see the role.
     """
 
     role: Role
@@ -56,9 +92,81 @@ class Seam:
     attribute: str
     needs: tuple[str, ...] = ()
     external: bool = False
+    how: Callable[[SeamCall], Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.role in NEEDS_HOW and self.how is None:
+            raise ValueError(f"{self}: a seam of role {self.role.name} says how")
 
     def __str__(self) -> str:
         return f"{self.module}:{self.attribute}"
+
+
+@dataclass
+class SeamCall:
+    """A call of the host's function at a seam.
+
+    Attributes:
+        seam: where.
+        function: the host's own.
+        instance: what the method was called on; None for a function.
+        args: as passed.
+        kwargs: as passed.
+        model: that the call is about.
+        result: what the host's function returned; None until it was called.
+    """
+
+    seam: Seam
+    function: Callable[..., Any]
+    instance: Any
+    args: tuple[Any, ...]
+    kwargs: dict[str, Any]
+    model: Any = None
+    result: Any = None
+
+    @cached_property
+    def arguments(self) -> dict[str, Any]:
+        """By name, those left out included."""
+        bound = signature(self.function).bind(*self.args, **self.kwargs)
+        bound.apply_defaults()
+        return bound.arguments
+
+    @property
+    def first(self) -> Any:
+        """The argument that the seam needs first."""
+        return self.arguments[self.seam.needs[0]]
+
+    def run(self, **changed: Any) -> Any:
+        """Call the host's function.
+
+        Args:
+            changed: arguments by name, in place of the host's.
+        """
+        if changed:
+            bound = signature(self.function).bind(*self.args, **self.kwargs)
+            bound.arguments.update(changed)
+            self.result = self.function(*bound.args, **bound.kwargs)
+        else:
+            self.result = self.function(*self.args, **self.kwargs)
+        return self.result
+
+    def how(self, otherwise: Any = None) -> Any:
+        """What the seam's ``how`` says of this call; ``otherwise`` where it has none."""
+        return otherwise if self.seam.how is None else self.seam.how(self)
+
+
+@dataclass
+class RowTrace:
+    """Where rows came from, once a host has rearranged them.
+
+    Attributes:
+        origins: (M,) int64, for each row of the model as it is now, the row it was or was copied
+            from; None where nothing happened.
+        fresh: (M,) bool, True for rows that are new Gaussians or were made over.
+    """
+
+    origins: Tensor | None = None
+    fresh: Tensor | None = None
 
 
 def revised(

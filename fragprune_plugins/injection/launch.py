@@ -37,7 +37,7 @@ from fragprune_plugins.hosts.adapter import (
     CHECKPOINT_KEY,
     CommandLine,
     ConfigFile,
-    HostAdapter,
+    ScriptAdapter,
     read_config,
 )
 from fragprune_plugins.hosts.choosing import choose, locate
@@ -194,6 +194,13 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
     else:
         repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
+    if not isinstance(adapter, ScriptAdapter):
+        raise UsageError(
+            "fragprune run",
+            f"{adapter.info.title}, a library without a training command",
+            adapter.use(repo),
+            f"See the how-to page of {adapter.name}.",
+        )
     host = _parse(script, arguments, adapter.command_line(repo), module)
     device = _device(options.device, options.engine)
     if options.engine != "auto":
@@ -224,7 +231,7 @@ class _Runner:
         self,
         host: _Invocation,
         repo: HostRepo,
-        adapter: HostAdapter,
+        adapter: ScriptAdapter,
         plugins: Any,
         options: RunOptions,
         device: str,

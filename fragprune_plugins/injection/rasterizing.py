@@ -14,9 +14,9 @@ from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.adapter import HostCall
-from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.saving import adopt
-from fragprune_plugins.injection.state import ModelState, named
+from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.injection.stepping import (
     asking_for_no_gradient,
     begin_step,
@@ -45,25 +45,21 @@ class _AddToLoss(torch.autograd.Function):
         return grad, torch.ones(ctx.term_shape, dtype=grad.dtype, device=grad.device)
 
 
-def on_view(
-    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
-) -> Any:
+def on_view(session: Session, call: SeamCall) -> Any:
     """Remember which model is drawn for which camera while the host's function runs."""
-    arguments = named(wrapped, args, kwargs)
-    camera = arguments[seam.needs[0]]
-    own = len(seam.needs) > 1  # a function's; a method's is what it was called on
-    model = arguments[seam.needs[1]] if own else session.model_of(instance, arguments)
+    own = len(call.seam.needs) > 1  # a function's; a method's is what it was called on
+    model = call.arguments[call.seam.needs[1]] if own else session.model_of(call)
     if model is None:
         if session.learn and torch.is_grad_enabled():
-            warn_unknown(session, seam)
-        return wrapped(*args, **kwargs)
+            warn_unknown(session, call.seam)
+        return call.run()
     if session.unpacked is not None and model not in session.models:
         adopt(session, model, *session.unpacked)
-    state, view = session.models.get(model), session.adapter.view(camera)
+    state, view = session.models.get(model), session.adapter.view(call.first)
     begins = session.adapter.steps_by_rendering and session.learn and torch.is_grad_enabled()
     if begins and state is not None and not state.begun:
         begin_step(session, model, state)
-    again = partial(draw_view, session, wrapped, model, view, args, kwargs)
+    again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
     measured = session.settings.target_speedup is not None  # keeps the model alive: only if needed
     learns = state is not None and state.stage is not None and state.stage.plan is not None
     if measured and state is not None and learns and torch.is_grad_enabled():
@@ -88,22 +84,18 @@ def draw_view(session: Session, render: Any, model: Any, view: int, args: Any, k
         session.rendering.reset(token)
 
 
-def on_rasterize(
-    session: Session, seam: Seam, wrapped: Any, rasterizer: Any, args: Any, kwargs: Any
-) -> Any:
+def on_rasterize(session: Session, call: SeamCall) -> Any:
     """Draw with thresholds, or leave it to the host while there are none."""
     rendering = session.rendering.get()
     state = session.models.get(rendering[0]) if rendering else None
-    settings = getattr(rasterizer, "raster_settings", None)
-    call = HostCall.bind(wrapped, settings, args, kwargs, str(seam))
-    if session.dialect.stands_in(call):
-        wrapped, args, kwargs = session.draw, (call,), {}
+    drawn = HostCall.of(call)
+    by_host = partial(session.draw, drawn) if session.dialect.stands_in(drawn) else call.run
     if rendering is None or state is None or session.pausing.get():
-        return wrapped(*args, **kwargs)
-    rows = session.adapter.rows_drawn(rendering[0], call)
+        return by_host()
+    rows = session.dialect.rows_drawn(rendering[0], drawn)
     if rows is not None:
         session.expect_rows(rendering[0], state, f"{session.adapter.name}: rasterizer call")
-    means, expected = call[session.dialect.means], len(state.store if rows is None else rows)
+    means, expected = drawn[session.dialect.means], len(state.store if rows is None else rows)
     if len(means) != expected:
         raise AlignmentError(
             f"{session.adapter.name}: rasterizer call",
@@ -112,17 +104,17 @@ def on_rasterize(
             "Report this with the host's commit.",
         )
     if state.store.neutral:
-        return wrapped(*args, **kwargs)
-    inputs, engine = session.unpack(call)
+        return by_host()
+    inputs, engine = session.unpack(drawn)
     stage = state.stage
     thresholds = (
         session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
     )
     if thresholds is None:
-        return wrapped(*args, **kwargs)
+        return by_host()
     thresholds = thresholds if rows is None else thresholds[rows]
     draw = partial(rasterize, engine, state, rendering[1], thresholds)
-    return session.dialect.answer(call, inputs, draw)
+    return session.dialect.answer(drawn, inputs, draw)
 
 
 def rasterize(
@@ -143,26 +135,24 @@ def rasterize(
     return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure))  # type: ignore[no-untyped-call]
 
 
-def on_loss(session: Session, seam: Seam, wrapped: Any, tensor: Any, args: Any, kwargs: Any) -> Any:
+def on_loss(session: Session, call: SeamCall) -> Any:
     """Keep the host's own loss for the curves."""
     state = session.last_state
-    if state is not None and tensor.numel() == 1:
+    if state is not None and call.instance.numel() == 1:
         state.begun = False
         if state.stage is not None:
-            state.stage.lost(tensor)
-    return wrapped(*args, **kwargs)
+            state.stage.lost(call.instance)
+    return call.run()
 
 
-def on_metric(
-    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
-) -> Any:
+def on_metric(session: Session, call: SeamCall) -> Any:
     """A metric whose weights cannot be had is NaN, not the end of the run."""
-    if seam not in session.absent:
+    if call.seam not in session.absent:
         try:
-            return wrapped(*args, **kwargs)
+            return call.run()
         except OSError as error:  # the download failed; a run of hours should not end on it
-            log.warning("%s: its weights cannot be had (%s); NaN stands for it", seam, error)
-            session.absent.add(seam)
+            log.warning("%s: its weights cannot be had (%s); NaN stands for it", call.seam, error)
+            session.absent.add(call.seam)
     return torch.tensor(math.nan)
 
 

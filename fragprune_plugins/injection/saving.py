@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import weakref
 from collections.abc import Callable
-from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +14,8 @@ from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.injection.state import ModelState, named
+from fragprune_plugins.hosts.seams import Role, SeamCall
+from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.storage import sidecar
@@ -27,13 +26,12 @@ if TYPE_CHECKING:
 log = logging.getLogger("fragprune")
 
 
-def on_save(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+def on_save(session: Session, call: SeamCall) -> Any:
     """Thresholds beside the file that the host wrote; nothing is written that is not finite."""
-    check_learned(session, model)
-    result = wrapped(*args, **kwargs)
-    path = named(wrapped, args, kwargs)[seam.needs[0]]
-    if model in session.models and path is not None:
-        session.save(model, file_at(session, seam, path))
+    check_learned(session, call.model)
+    result = call.run()
+    if call.model in session.models and call.first is not None:
+        session.save(call.model, Path(call.how(call.first)))
     return result
 
 
@@ -44,34 +42,27 @@ def check_learned(session: Session, model: Any) -> None:
         state.stage.check()
 
 
-def file_at(session: Session, seam: Seam, path: Any) -> Path:
-    """The file that a path of the host stands for."""
-    return session.adapter.file_at(seam.attribute.split(".")[-1], Path(path))
-
-
-def on_load(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+def on_load(session: Session, call: SeamCall) -> Any:
     """Thresholds from beside the file that the host read."""
-    result = wrapped(*args, **kwargs)
-    path = file_at(session, seam, named(wrapped, args, kwargs)[seam.needs[0]])
+    result = call.run()
+    path = Path(call.how(call.first))
     if sidecar.lies_beside(path):
-        session.load(model, path)
+        session.load(call.model, path)
     else:
-        session.models.pop(model, None)  # another population: what we knew is not about it
+        session.models.pop(call.model, None)  # another population: what we knew is not about it
     return result
 
 
-def on_pack(
-    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
-) -> Any:
+def on_pack(session: Session, call: SeamCall) -> Any:
     """Thresholds beside a file that holds the Gaussians in an order of its own."""
-    result = wrapped(*args, **kwargs)
-    packed = session.adapter.packed(named(wrapped, args, kwargs), result)
+    result = call.run()
+    packed = call.how()
     model = session.last() if session.last else None
     state = session.models.get(model) if model is not None else None
     if packed is None or state is None or state.store.neutral:
         return result
     path, means = packed
-    rows = rows_of(means, session.adapter.means(model), str(seam))
+    rows = rows_of(means, session.adapter.means(model), str(call.seam))
     store = ThresholdStore(0)
     store.load_state_dict(state.store.state_dict())
     store.rearrange(rows, torch.zeros(len(rows), dtype=torch.bool))
@@ -79,12 +70,10 @@ def on_pack(
     return result
 
 
-def on_unpack(
-    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
-) -> Any:
+def on_unpack(session: Session, call: SeamCall) -> Any:
     """Keep the thresholds of an unpacked file for the model that will be made of it."""
-    result = wrapped(*args, **kwargs)
-    packed = session.adapter.packed(named(wrapped, args, kwargs), result)
+    result = call.run()
+    packed = call.how()
     if packed is not None and sidecar.path_beside(packed[0]).exists():
         file, means = packed
         session.unpacked = means, sidecar.load(file, ThresholdStore(len(means)))[0]
@@ -109,28 +98,23 @@ def adopt(session: Session, model: Any, expected: Tensor, store: ThresholdStore)
     session.unpacked = None
 
 
-def on_capture(
-    session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any
-) -> Any:
+def on_capture(session: Session, call: SeamCall) -> Any:
     """Thresholds inside the host's checkpoint; in stage 2 always, so that it is known for one."""
+    model = call.model
     check_learned(session, model)
-    result = wrapped(*args, **kwargs)
+    result = call.run()
     state = session.models.get(model)
     if state is not None and (session.standing_still(model) or not state.store.neutral):
-        session.expect_rows(model, state, str(seam))
+        session.expect_rows(model, state, str(call.seam))
         session.adapter.checkpoint_state(result)[CHECKPOINT_KEY] = state.store.state_dict()
     return result
 
 
-def on_restore(
-    session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any
-) -> Any:
+def on_restore(session: Session, call: SeamCall) -> Any:
     """Thresholds out of the host's checkpoint."""
-    bound = signature(wrapped).bind(*args, **kwargs)
-    capture = session.adapter.before_restore(model, bound.arguments[seam.needs[0]])
-    bound.arguments[seam.needs[0]] = capture
+    model, capture = call.model, call.how(call.first)
     saved = session.adapter.checkpoint_state(capture).pop(CHECKPOINT_KEY, None)
-    result = wrapped(*bound.args, **bound.kwargs)
+    result = call.run(**{call.seam.needs[0]: capture})
     revive(session, model)
     state = session.models.get(model)
     if saved is not None:
@@ -138,7 +122,7 @@ def on_restore(
             device = session.adapter.means(model).device
             state = session.models[model] = ModelState(ThresholdStore(0, device))
         state.store.load_state_dict(saved)
-        session.expect_rows(model, state, str(seam))
+        session.expect_rows(model, state, str(call.seam))
     return result
 
 

@@ -24,13 +24,13 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, LateImportError, SessionError
-from fragprune_plugins.hosts.adapter import HostAdapter, HostCall
+from fragprune_plugins.hosts.adapter import HostAdapter, HostCall, ScriptAdapter
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.seams import Seam
+from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import aligning, rasterizing, saving, stepping
 from fragprune_plugins.injection.patching import PatchLedger
-from fragprune_plugins.injection.state import ModelState, named
+from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.learning.events import PopulationChange, StepStats, Summary
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Stage2
@@ -231,7 +231,7 @@ class Session:
     def save_interrupted(self) -> Path | None:
         """After Ctrl-C: have the host save its model, with what was learned beside it."""
         model = self.last() if self.last else None
-        if model is None or self.output is None:
+        if model is None or self.output is None or not isinstance(self.adapter, ScriptAdapter):
             return None
         state = self.models[model]
         if state.store.neutral:
@@ -305,18 +305,17 @@ class Session:
 
     # -- roles -----------------------------------------------------------------------------------
 
-    def _enter(self, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
+    def _enter(self, seam: Seam, function: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         """Hand a call to the handler of its role: as it is, or with the model it is about."""
+        call = SeamCall(seam, function, instance, args, kwargs)
         if seam.role in _OF_CALLS:
-            return _OF_CALLS[seam.role](self, seam, wrapped, instance, args, kwargs)
-        model = self.model_of(instance, named(wrapped, args, kwargs))
-        if model is None:
-            return wrapped(*args, **kwargs)
-        return _OF_MODELS[seam.role](self, seam, wrapped, model, args, kwargs)
+            return _OF_CALLS[seam.role](self, call)
+        call.model = self.model_of(call)
+        return call.run() if call.model is None else _OF_MODELS[seam.role](self, call)
 
-    def model_of(self, instance: Any, arguments: dict[str, Any]) -> Any:
+    def model_of(self, call: SeamCall) -> Any:
         """The model a call is about, by its means where the adapter knows no more; or None."""
-        found = self.adapter.model_of(instance, arguments)
+        found = self.adapter.model_of(call)
         if not isinstance(found, Tensor):
             return found
         known = ((model, self.adapter.means(model)) for model in self.models)

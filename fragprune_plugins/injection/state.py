@@ -5,7 +5,6 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from inspect import signature
 from typing import Any
 
 from torch import Tensor
@@ -36,10 +35,3 @@ class ModelState:
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
     lent: list[list[tuple[dict[str, Any], float]]] = field(default_factory=list)  # the host's rates
-
-
-def named(function: Any, args: Any, kwargs: Any) -> dict[str, Any]:
-    """The arguments of a call by name, those left out included; "self" is what it was called on."""
-    bound = signature(function).bind(*args, **kwargs)
-    bound.apply_defaults()
-    return {"self": getattr(function, "__self__", None), **bound.arguments}

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.injection.state import ModelState, named
+from fragprune_plugins.hosts.seams import Role, SeamCall
+from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 
@@ -21,25 +21,21 @@ if TYPE_CHECKING:
     from fragprune_plugins.injection.session import Session
 
 
-def on_scene(
-    session: Session, seam: Seam, wrapped: Any, instance: Any, args: Any, kwargs: Any
-) -> Any:
+def on_scene(session: Session, call: SeamCall) -> Any:
     """Note where the host writes."""
-    result = wrapped(*args, **kwargs)
-    if getattr(instance, "model_path", None):
-        session.output = Path(instance.model_path)
+    result = call.run()
+    if getattr(call.instance, "model_path", None):
+        session.output = Path(call.instance.model_path)
     return result
 
 
-def on_attach(
-    session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any
-) -> Any:
+def on_attach(session: Session, call: SeamCall) -> Any:
     """A new optimizer: thresholds for a model that has none, else the same rows or new ones."""
+    model = call.model
     state = session.models.get(model)
     kept = state is not None and is_followed(session, model, state)  # before a new optimizer
-    result = wrapped(*args, **kwargs)
-    optimizers = session.adapter.optimizers(model, named(wrapped, args, kwargs))
-    session.optimizers[model] = [weakref.ref(optimizer) for optimizer in optimizers]
+    result = call.run()
+    session.optimizers[model] = [weakref.ref(optimizer) for optimizer in call.how()]
     groups = session.groups(model)
     session.rates[model] = {name: group["lr"] for name, group in groups if name}
     rows = session.adapter.rows(model)
@@ -123,15 +119,15 @@ def after_step(session: Session, reference: Any, *_: Any) -> None:
         state.stage.end()
 
 
-def on_step(session: Session, seam: Seam, wrapped: Any, model: Any, args: Any, kwargs: Any) -> Any:
+def on_step(session: Session, call: SeamCall) -> Any:
     """The host's clock ticks: plan the step and let nothing move that shall not."""
-    result = wrapped(*args, **kwargs)
-    state = session.models.get(model)
+    result = call.run()
+    state = session.models.get(call.model)
     if state is None or not session.learn:
         return result
     if not (session.adapter.steps_by_rendering and state.begun):
-        begin_step(session, model, state)
-    return session.adapter.still_rate(result) if session.standing_still(model) else result
+        begin_step(session, call.model, state)
+    return call.how(result) if session.standing_still(call.model) else result
 
 
 def begin_step(session: Session, model: Any, state: ModelState) -> None:

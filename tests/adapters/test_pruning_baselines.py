@@ -19,6 +19,7 @@ from plyfile import PlyData
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_lp_3dgs import LP3DGS
 from fragprune_plugins.errors import EngineError, UsageError
+from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import HostFailed, RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
@@ -199,8 +200,9 @@ def test_compact_is_not_resumed():
 def test_compacts_files_are_found_as_the_host_finds_them(tmp_path, there, method, file):
     for name in there:
         (tmp_path / name).touch()
-    assert Compact3DGS().file_at(method, tmp_path / "point_cloud") == tmp_path / file
-    assert Compact3DGS().file_at("save_ply", tmp_path / "a.ply") == tmp_path / "a.ply"
+    (seam,) = (s for s in Compact3DGS.seams if s.attribute == f"GaussianModel.{method}")
+    call = SeamCall(seam, lambda path: None, None, (str(tmp_path / "point_cloud"),), {})
+    assert call.how() == tmp_path / file
 
 
 @pytest.mark.parametrize("used", [True, False])

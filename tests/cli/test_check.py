@@ -100,7 +100,7 @@ def test_packages_that_it_imports_and_that_are_not_here_are_listed(host):
     assert "  pip install cv2_of_tests icecream_of_tests\n" in run("check", host).stdout
 
 
-CLONE = Seam(Role.PARENTS, "scene.gaussian_model", "GaussianModel.densify_and_clone")
+CLONE = Seam(Role.STILL, "scene.gaussian_model", "GaussianModel.densify_and_clone")
 RENDER = Seam(Role.VIEW, "gaussian_renderer", "render")
 
 

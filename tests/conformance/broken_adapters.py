@@ -9,6 +9,7 @@ import torch
 
 from fragprune_plugins.hosts.findings import Match
 from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
+from fragprune_plugins.hosts.seams import Role
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
@@ -38,11 +39,13 @@ class TakesRandomNumbers(Vanilla3DGS):
 class MixesUpParents(Vanilla3DGS):
     """Gives children the thresholds of others, and says they are right."""
 
-    def parents(self, model: Any, method: str, arguments: Any) -> Any:
-        return super().parents(model, method, arguments).flip(0)
-
-    def check_children(self, model: Any, tensors: Any, parents: Any) -> bool:
-        return True
+    seams = tuple(
+        replace(seam, how=lambda call, how=seam.how: how(call).flip(0))
+        if seam.role is Role.PARENTS
+        else seam
+        for seam in Vanilla3DGS.seams
+    )
+    inherited = ()
 
 
 class LosesTheCheckpoint(Vanilla3DGS):

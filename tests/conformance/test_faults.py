@@ -12,12 +12,13 @@ from miniatures.compact_3dgs import CompactHost
 from miniatures.light_gaussian import LightGaussianHost
 from miniatures.mcmc import MCMCHost
 
+import fragprune_gsplat
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_gsplat import ROWS, Gsplat
 from fragprune_light_gaussian import LightGaussian
 from fragprune_mcmc import MCMC
-from fragprune_plugins.hosts.adapter import RowTrace
+from fragprune_plugins.hosts.seams import Role, RowTrace, revised
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.testing import invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, fresh
@@ -25,14 +26,19 @@ from fragprune_plugins.testing.fresh import FreshProcessError, fresh
 
 def but(kind, attribute):
     """An adapter's seams without those at an attribute."""
-    return tuple(seam for seam in kind.seams if seam.attribute != attribute)
+    return revised(kind.seams, {attribute: None})
+
+
+def tracing(kind, how):
+    """An adapter's seams with rows followed in another way."""
+    seams = {seam.attribute for seam in kind.seams if seam.role is Role.REARRANGE}
+    return revised(kind.seams, dict.fromkeys(seams, {"how": how}))
 
 
 class Shaking(MCMC):
     """Leaves the host the rate that its noise is made of."""
 
-    def still_rate(self, rate):
-        return rate
+    seams = revised(MCMC.seams, {"GaussianModel.update_learning_rate": {"how": None}})
 
 
 class Growing(MCMC):
@@ -65,24 +71,31 @@ class Resetting(Gsplat):
     seams = but(Gsplat, "reset_opa")
 
 
+@contextmanager
+def inherited(call):
+    with fragprune_gsplat.tracing(call) as trace:
+        yield trace
+    trace.fresh = torch.zeros_like(trace.fresh)
+
+
 class Inheriting(Gsplat):
     """Gives children their parents' moments."""
 
-    @contextmanager
-    def tracing(self, *given):
-        with super().tracing(*given) as trace:
-            yield trace
-        trace.fresh = torch.zeros_like(trace.fresh)
+    seams = tracing(Gsplat, inherited)
+
+
+@contextmanager
+def littered(call):
+    with fragprune_gsplat.tracing(call) as trace:
+        yield trace
+    rows = torch.zeros(len(call.model["means"]))
+    call.model[ROWS] = torch.nn.Parameter(rows, requires_grad=False)
 
 
 class Littering(Gsplat):
     """Leaves its row numbers in the user's model."""
 
-    @contextmanager
-    def tracing(self, model, *given):
-        with super().tracing(model, *given) as trace:
-            yield trace
-        model[ROWS] = torch.nn.Parameter(torch.zeros(len(model["means"])), requires_grad=False)
+    seams = tracing(Gsplat, littered)
 
 
 class Unexported(Gsplat):
@@ -94,16 +107,18 @@ class Unexported(Gsplat):
 class Skipping(GaussianSplatting):
     """Holds back the step in which opacities would be reset."""
 
-    def stand_still(self, wrapped, arguments):
-        return None
+    seams = revised(GaussianSplatting.seams, {"OpacityResetter.optim_step": {"how": None}})
+
+
+@contextmanager
+def untraced(call):
+    yield RowTrace()
 
 
 class Untraced(GaussianSplatting):
     """Thinks that densifiers leave rows where they were."""
 
-    @contextmanager
-    def tracing(self, *given):
-        yield RowTrace()
+    seams = tracing(GaussianSplatting, untraced)
 
 
 class Misread(GaussianSplatting):

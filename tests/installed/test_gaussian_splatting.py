@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -56,7 +57,7 @@ def test_steps_that_draw_nothing_with_thresholds_are_an_error(session_on):
 def test_another_backend_is_refused_by_name():
     model = type("GsplatGaussianModel", (), {"__module__": "gaussian_splatting.models.gsplat"})()
     with pytest.raises(SessionError, match="--backend"):
-        GaussianSplatting().model_of(object(), {"model": model})
+        GaussianSplatting().model_of(SimpleNamespace(instance=None, arguments={"model": model}))
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from fragprune_gsplat import Gsplat
 from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import InputError, SessionError, SidecarError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
@@ -159,9 +161,9 @@ def test_what_we_do_not_draw_is_refused_by_name(session_on, options):
 
 def test_a_plain_dict_is_refused_and_there_is_no_command_to_run():
     with pytest.raises(SessionError, match="ParameterDict"):
-        Gsplat().model_of(None, {"params": {}})
+        Gsplat().model_of(SimpleNamespace(instance=None, arguments={"params": {}}))
     with pytest.raises(UsageError, match="activate"):
-        Gsplat().command_line(HostRepo.installed("gsplat"))
+        run(["-m", "gsplat.rendering"], RunOptions(device="cpu"))
     assert Gsplat().match(HostRepo.installed("gsplat")).fits
     assert not Gsplat().match(HostRepo.installed("numpy")).fits
 

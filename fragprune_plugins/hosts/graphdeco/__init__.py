@@ -1,6 +1,32 @@
-"""What all descendants of the 2023 3DGS training code share."""
+"""What all descendants of the 2023 3DGS training code share.
 
-from fragprune_plugins.hosts.graphdeco.adapter import GraphdecoAdapter, GraphdecoDialect
+call          the rasterizer's call as their source has it
+adapter       the base of their adapters: seams, names, files
+densifying    whom their densify methods copy
+stand_ins     modules of ours for their compiled packages; imports torch
+"""
+
+from fragprune_plugins.hosts.graphdeco.adapter import (
+    CLONE,
+    MODEL,
+    SPLIT,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    default,
+)
 from fragprune_plugins.hosts.graphdeco.call import RasterizerCall
+from fragprune_plugins.hosts.graphdeco.densifying import clones, needy, reaches, splits
 
-__all__ = ["GraphdecoAdapter", "GraphdecoDialect", "RasterizerCall"]
+__all__ = [
+    "CLONE",
+    "MODEL",
+    "SPLIT",
+    "GraphdecoAdapter",
+    "GraphdecoDialect",
+    "RasterizerCall",
+    "clones",
+    "default",
+    "needy",
+    "reaches",
+    "splits",
+]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -15,17 +15,19 @@ from fragprune_plugins.hosts.adapter import (
     CHECKPOINT_KEY,
     CommandLine,
     Dialect,
-    HostAdapter,
     HostCall,
+    ScriptAdapter,
 )
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco.call import RasterizerCall, drawing_functions, read_calls
-from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.graphdeco.densifying import clones, splits
+from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import Function, HostRepo
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from fragprune_plugins.storage.ply import SplatFile
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
@@ -38,16 +40,31 @@ GROUPS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 """Names and order of the host optimizer's param groups; load_state_dict matches by position."""
 
 
-def _model(role: Role, method: str, *needs: str) -> Seam:
-    return Seam(role, MODEL, f"GaussianModel.{method}", needs)
+def optimizers(call: SeamCall) -> list[Any]:
+    """The main one, and the exposures' where the revision has it."""
+    extra = getattr(call.model, "exposure_optimizer", None)
+    return [call.model.optimizer, *([extra] if extra is not None else [])]
 
 
-CLONE = _model(Role.PARENTS, "densify_and_clone", "grads", "grad_threshold", "scene_extent")
-SPLIT = _model(Role.PARENTS, "densify_and_split", "grads", "grad_threshold", "scene_extent", "N")
+def completed(call: SeamCall) -> Any:
+    """A checkpoint made from a PLY lacks the scene's extent; the fresh model knows it."""
+    *rest, spatial_lr_scale = call.first
+    return (*rest, spatial_lr_scale or call.model.spatial_lr_scale)
+
+
+def _model(
+    role: Role, method: str, *needs: str, how: Callable[[SeamCall], Any] | None = None
+) -> Seam:
+    return Seam(role, MODEL, f"GaussianModel.{method}", needs, how=how)
+
+
+_GIVEN = ("grads", "grad_threshold", "scene_extent")
+CLONE = _model(Role.PARENTS, "densify_and_clone", *_GIVEN, how=clones)
+SPLIT = _model(Role.PARENTS, "densify_and_split", *_GIVEN, "N", how=splits)
 
 MODEL_SEAMS: tuple[Seam, ...] = (
     Seam(Role.SCENE, "scene", "Scene.__init__", ("args", "gaussians")),
-    _model(Role.ATTACH, "training_setup", "training_args"),
+    _model(Role.ATTACH, "training_setup", "training_args", how=optimizers),
     _model(Role.STEP, "update_learning_rate", "iteration"),
     CLONE,
     SPLIT,
@@ -59,7 +76,7 @@ MODEL_SEAMS: tuple[Seam, ...] = (
     _model(Role.SAVE, "save_ply", "path"),
     _model(Role.LOAD, "load_ply", "path"),
     _model(Role.CAPTURE, "capture"),
-    _model(Role.RESTORE, "restore", "model_args", "training_args"),
+    _model(Role.RESTORE, "restore", "model_args", "training_args", how=completed),
 )
 
 
@@ -140,22 +157,29 @@ class GraphdecoDialect(Dialect):
         return {self.package: rasterizer, **stand_ins.simple_knn()}
 
 
-class GraphdecoAdapter(HostAdapter):
-    """Base of every such adapter; a subclass adds its name and what its host has otherwise."""
+class GraphdecoAdapter(ScriptAdapter):
+    """Base of every such adapter; a subclass adds its name and what its host has otherwise.
+
+    Attributes:
+        package: import name of the rasterizer.
+        calls: of the rasterizer that the dialect answers; a function may make any one of its own.
+        dialect_type: that answers them.
+        groups: names of the optimizer's param groups, in order, as ``training_setup`` spells them.
+        own_names: "module:name" of what this host's source mentions and its ancestors' does not.
+        scripts: that train, by their paths in the checkout, the usual one first.
+        optimizer: the host's, by its name in ``torch.optim``.
+    """
 
     package = "diff_gaussian_rasterization"
     renderer = RENDERER
     """The module of the functions that call the rasterizer."""
     calls: tuple[RasterizerCall, ...] = (RasterizerCall(),)
-    """Calls of the rasterizer that the dialect answers; a function may make any one of its own."""
-    groups: tuple[str, ...] = GROUPS
-    """Names of the optimizer's param groups, in order, as ``training_setup`` spells them."""
-    own_names: tuple[str, ...] = ()
-    """ "module:name": what this host's source mentions and that of its ancestors does not."""
     dialect_type: type[GraphdecoDialect] = GraphdecoDialect
+    groups: tuple[str, ...] = GROUPS
+    own_names: tuple[str, ...] = ()
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
-    """The host's, by its name in ``torch.optim``."""
+    inherited = ("f_dc", "rotation")
     seams = (
         *MODEL_SEAMS,
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
@@ -262,10 +286,6 @@ class GraphdecoAdapter(HostAdapter):
             hold_out=("--eval",),
         )
 
-    def rows(self, model: Any) -> int:
-        """From the means."""
-        return len(model.get_xyz)
-
     def means(self, model: Any) -> Tensor:
         """``get_xyz`` returns the parameter object itself."""
         means: Tensor = model.get_xyz
@@ -275,50 +295,6 @@ class GraphdecoAdapter(HostAdapter):
         """(N,) after the sigmoid."""
         opacities: Tensor = model.get_opacity
         return opacities.detach().reshape(-1)
-
-    def optimizers(self, model: Any, arguments: Mapping[str, Any]) -> list[Any]:
-        """The main one, and the exposures' where the revision has it."""
-        extra = getattr(model, "exposure_optimizer", None)
-        return [model.optimizer, *([extra] if extra is not None else [])]
-
-    def trained_groups(self, train: str) -> frozenset[str] | None:
-        """opacity, or with both SH groups; None for all."""
-        return {
-            "opacity": frozenset({"opacity"}),
-            "appearance": frozenset({"opacity", "f_dc", "f_rest"}),
-            "all": None,
-        }[train]
-
-    def parents(self, model: Any, method: str, arguments: Mapping[str, Any]) -> Tensor:
-        """The masks of densify_and_clone and densify_and_split, worked out before they draw."""
-        import torch
-
-        size = model.get_scaling.detach().max(dim=1).values
-        limit = model.percent_dense * arguments["scene_extent"]
-        clones = method == "densify_and_clone"
-        grown = self.needy(arguments, len(size), torch.norm if clones else torch.squeeze)
-        selected = grown & (size <= limit if clones else size > limit)
-        rows: Tensor = selected.nonzero()[:, 0]
-        return rows.repeat(arguments.get("N", 1))
-
-    def needy(self, arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
-        """(rows,) bool: whose gradient on the screen asks a densify method for more Gaussians.
-
-        Args:
-            arguments: the method's.
-            rows: of the model now.
-            flat: (n, 1) -> (n,), as the method itself does it: rounded alike, whatever is equal to
-                the threshold for the host is so for us.
-        """
-        return reaches(flat(arguments["grads"], dim=-1), arguments["grad_threshold"], rows)
-
-    def check_children(self, model: Any, tensors: Mapping[str, Tensor], parents: Tensor) -> bool:
-        """Clones and split children carry their parent's colour and rotation bit for bit."""
-        import torch
-
-        return torch.equal(tensors["f_dc"], model._features_dc[parents]) and torch.equal(
-            tensors["rotation"], model._rotation[parents]
-        )
 
     def checkpoint_state(self, capture: Any) -> dict[str, Any]:
         """The optimizer's state dict: load_state_dict ignores keys it does not know."""
@@ -333,10 +309,11 @@ class GraphdecoAdapter(HostAdapter):
             "Name another, or a PLY.",
         )
 
-    def before_restore(self, model: Any, capture: Any) -> Any:
-        """A checkpoint made from a PLY lacks the scene's extent; the fresh model knows it."""
-        *rest, spatial_lr_scale = capture
-        return (*rest, spatial_lr_scale or model.spatial_lr_scale)
+    def read_model(self, ply: Path) -> SplatFile:
+        """The host's own PLY."""
+        from fragprune_plugins.storage.ply import read_ply
+
+        return read_ply(ply)
 
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
         """The 12-tuple of ``capture``, fresh moments, and the thresholds of the PLY's sidecar."""
@@ -444,14 +421,6 @@ def group_names(function: Function | None) -> tuple[str, ...]:
         if isinstance(key, ast.Constant) and key.value == "name" and isinstance(value, ast.Constant)
     ]
     return tuple(name for _, _, name in sorted(names))
-
-
-def reaches(grads: Tensor, threshold: Any, rows: int) -> Tensor:
-    """(rows,) bool: gradients (n,) at or above it; rows appended just now have none."""
-    padded = grads.new_zeros(rows)
-    padded[: len(grads)] = grads
-    reached: Tensor = padded >= threshold
-    return reached
 
 
 def resolution(repo: HostRepo, asked: int | None) -> Resolution:

@@ -1,7 +1,7 @@
-"""Modules of ours under the import names of the lineage's compiled packages.
+"""Modules of ours under the import names of the hosts' compiled packages.
 
-They answer where the compiled package cannot be imported, or the run has no GPU; same call
-contract, our engine.
+They answer where the compiled package cannot be imported, or the run has no GPU; the same call, our
+engine.
 """
 
 from __future__ import annotations

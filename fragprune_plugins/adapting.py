@@ -1,0 +1,120 @@
+"""All that an adapter imports: ``from fragprune_plugins.adapting import ...``.
+
+a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo, Finding
+its seams   Seam, Role, SeamCall, RowTrace, revised
+drawing     Dialect, HostCall; RasterInputs and what it is made of, RasterOutputs, slice_at
+its script  CommandLine, ConfigFile, Photographs
+of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
+            share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages
+files       SplatFile, read_ply
+a plugin    hookimpl
+errors      with where, found, expected and remedy
+
+Importing this module imports no torch. SplatFile, read_ply, slice_at and stand_ins load it when
+they are first used: import them inside functions, or under TYPE_CHECKING.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.constants import ALPHA_MIN, MARGINAL_MIN
+from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.errors import (
+    AlignmentError,
+    EngineError,
+    InputError,
+    ModelFileError,
+    NotComparedError,
+    SessionError,
+    UsageError,
+)
+from fragprune_plugins.hosts import graphdeco
+from fragprune_plugins.hosts.adapter import (
+    CommandLine,
+    ConfigFile,
+    Dialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    ScriptAdapter,
+)
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall, revised
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.types import (
+    Footprints,
+    Moment,
+    RasterInputs,
+    RasterOutputs,
+    Sliced,
+    SpacetimeSplats,
+    Splats,
+    View,
+)
+
+if TYPE_CHECKING:
+    from fragprune_plugins.engines import slice_at
+    from fragprune_plugins.hosts.graphdeco import stand_ins
+    from fragprune_plugins.storage.ply import SplatFile, read_ply
+
+_WITH_TORCH = {
+    "SplatFile": "storage.ply",
+    "read_ply": "storage.ply",
+    "slice_at": "engines",
+    "stand_ins": "hosts.graphdeco.stand_ins",
+}
+
+__all__ = [
+    "ALPHA_MIN",
+    "MARGINAL_MIN",
+    "AlignmentError",
+    "CommandLine",
+    "ConfigFile",
+    "Dialect",
+    "EngineError",
+    "Finding",
+    "Footprints",
+    "GraphdecoAdapter",
+    "GraphdecoDialect",
+    "HostAdapter",
+    "HostCall",
+    "HostInfo",
+    "HostRepo",
+    "InputError",
+    "ModelFileError",
+    "Moment",
+    "NotComparedError",
+    "Photographs",
+    "RasterInputs",
+    "RasterOutputs",
+    "RasterizerCall",
+    "Role",
+    "RowTrace",
+    "ScriptAdapter",
+    "Seam",
+    "SeamCall",
+    "SessionError",
+    "Sliced",
+    "SpacetimeSplats",
+    "SplatFile",
+    "Splats",
+    "UsageError",
+    "View",
+    "graphdeco",
+    "hookimpl",
+    "read_ply",
+    "revised",
+    "slice_at",
+    "stand_ins",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WITH_TORCH:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = import_module(f"fragprune_plugins.{_WITH_TORCH[name]}")
+    return getattr(home, name, home)  # a module stands for itself
