@@ -31,8 +31,8 @@ def but(kind, attribute):
 
 def tracing(kind, how):
     """An adapter's seams with rows followed in another way."""
-    seams = {seam.attribute for seam in kind.seams if seam.role is Role.REARRANGE}
-    return revised(kind.seams, dict.fromkeys(seams, {"how": how}))
+    seams = (seam.attribute for seam in kind.seams if seam.role is Role.REARRANGE)
+    return revised(kind.seams, {attribute: {"how": how} for attribute in seams})
 
 
 class Shaking(MCMC):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,66 +19,71 @@ from fragprune_plugins.demo.scene import SceneSettings, make_scene
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "write-an-adapter.md"
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
-FILES = {
-    text.splitlines()[0].removeprefix("# "): text for kind, text in BLOCKS if kind != "console"
-}
-COMMANDS = [
-    (block.splitlines()[0], block.splitlines()[1:])
-    for kind, text in BLOCKS
-    if kind == "console"
-    for block in text.split("$ ")[1:]
-]
 INSTALL = "pip install -e ."
+CHECK = ["fragprune", "check"]
+
+
+def files() -> list[tuple[str, str]]:
+    """Names and texts in the order of the page, which may write a file twice."""
+    texts = [text for kind, text in BLOCKS if kind != "console"]
+    return [(text.splitlines()[0].removeprefix("# "), text) for text in texts]
+
+
+def commands(text: str) -> list[tuple[str, list[str]]]:
+    """The commands of a block, each with the lines that it prints."""
+    lines = [block.splitlines() for block in text.split("$ ")[1:]]
+    return [(first, expected) for first, *expected in lines]
 
 
 def install(folder: Path) -> None:
-    """What pip would do with the page's pyproject.toml: metadata beside the module."""
-    project = FILES["pyproject.toml"]
-    (entry,) = re.findall(r"^\[project\.entry-points\.fragprune\]\n(.*)", project, re.MULTILINE)
+    """What pip would do with the page's pyproject.toml: metadata beside the modules."""
+    project = (folder / "pyproject.toml").read_text()
+    _, _, entries = project.partition("[project.entry-points.fragprune]\n")
     name, version = (
         re.search(rf'^{key} = "(.*)"', project, re.M)[1] for key in ("name", "version")
     )
+    for earlier in folder.glob("*.dist-info"):
+        shutil.rmtree(earlier)
     info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    (info / "entry_points.txt").write_text(f"[fragprune]\n{entry.replace(chr(34), '')}\n")
+    (info / "entry_points.txt").write_text(f"[fragprune]\n{entries.replace(chr(34), '')}")
 
 
 def test_the_page_has_every_file_and_command():
-    assert list(FILES) == [
-        "pyproject.toml",
-        "fragprune_soft_3dgs.py",
-        "soft_3dgs_host.py",
-        "conftest.py",
-        "test_soft_3dgs.py",
+    assert [name for name, _ in files()] == [
+        *("pyproject.toml", "fragprune_soft_3dgs.py"),
+        *("soft_3dgs_host.py", "conftest.py", "test_soft_3dgs.py"),
+        *("fragprune_blurred_3dgs.py", "pyproject.toml"),
+        *("blurred_3dgs_host.py", "test_blurred_3dgs.py"),
     ]
-    words = [command.split(" ")[:2] for command, _ in COMMANDS]
-    check = ["fragprune", "check"]
-    assert words == [
-        check,
-        check,
-        ["pip", "install"],
-        check,
-        ["pytest", "test_soft_3dgs.py"],
-        ["fragprune", "run"],
+    said = [each for kind, text in BLOCKS if kind == "console" for each in commands(text)]
+    pip = ["pip", "install"]
+    assert [command.split(" ")[:2] for command, _ in said] == [
+        *(CHECK, pip, CHECK, ["pytest", "test_soft_3dgs.py"], ["fragprune", "run"]),
+        *(CHECK, pip, CHECK, ["pytest", "test_blurred_3dgs.py"]),
     ]
-    assert all(expected for command, expected in COMMANDS if command != INSTALL)
+    assert all(expected for command, expected in said if command != INSTALL)
 
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
-    """Where the reader sits: their checkout and their data beside nothing else."""
+    """Where the reader sits: their checkouts and their data beside nothing else."""
     folder = tmp_path_factory.mktemp("reader")
-    for name, text in FILES.items():
-        (folder / name).write_text(text)
     make_scene(
         folder / "scene", SceneSettings(views=9, width=40, height=30, supersample=1, points=150)
     )
-    run(
-        folder,
-        f"{sys.executable} -c 'from soft_3dgs_host import SoftHost; from pathlib import Path;"
-        ' SoftHost().write(Path("soft-3dgs"))\'',
-    )
+    hosts = [(name, text) for name, text in files() if name.endswith("_host.py")]
+    for name, text in hosts:
+        (folder / name).write_text(text)
+    for name, kind in (("soft", "Soft"), ("blurred", "Blurred")):
+        code = (
+            f"from {name}_3dgs_host import {kind}Host; from pathlib import Path; "
+            f"{kind}Host().write(Path('{name}-3dgs'))"
+        )
+        run(folder, shlex.join([sys.executable, "-c", code]))
+    for name, _ in hosts:
+        (folder / name).unlink()
     return folder
 
 
@@ -103,13 +109,23 @@ def run(folder: Path, command: str) -> str:
 
 @pytest.mark.timeout(900)  # a suite of its own inside: half a minute, more on a busy machine
 def test_following_the_page(workplace):
-    for command, expected in COMMANDS:
-        if command == INSTALL:
-            install(workplace)
+    page = iter(files())
+    for kind, text in BLOCKS:
+        if kind != "console":
+            name, content = next(page)
+            (workplace / name).write_text(content)
             continue
-        said = " ".join(run(workplace, command).split())
-        at = 0
-        for line in expected:
-            wanted = " ".join(line.split())
-            at = said.find(wanted, at)
-            assert at >= 0, f"$ {command}\nexpected {wanted!r} in:\n{said}"
+        for command, expected in commands(text):
+            if command == INSTALL:
+                install(workplace)
+            else:
+                expect(command, expected, run(workplace, command))
+
+
+def expect(command: str, expected: list[str], printed: str) -> None:
+    """The lines, in this order; what is between them and how wide gaps are does not matter."""
+    said, at = " ".join(printed.split()), 0
+    for line in expected:
+        wanted = " ".join(line.split())
+        at = said.find(wanted, at)
+        assert at >= 0, f"$ {command}\nexpected {wanted!r} in:\n{said}"
