@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.seams import Role, SeamCall
-
-if TYPE_CHECKING:
-    from fragprune_plugins.injection.session import Session
+from fragprune_plugins.injection.state import SessionState
 
 
-def on_parents(session: Session, call: SeamCall) -> Any:
+def on_parents(session: SessionState, call: SeamCall) -> Any:
     """Know the parents before the host copies them."""
     state = session.models.get(call.model)
     if state is None:
@@ -30,7 +28,7 @@ def on_parents(session: Session, call: SeamCall) -> Any:
         state.pending_parents = None
 
 
-def on_append(session: Session, call: SeamCall) -> Any:
+def on_append(session: SessionState, call: SeamCall) -> Any:
     """New rows take their parents' thresholds, or start neutral."""
     state = session.models.get(call.model)
     if state is None:
@@ -62,14 +60,14 @@ def expect_children(call: SeamCall, found: str, right: bool) -> None:
 
 
 def are_copies(
-    session: Session, model: Any, tensors: Mapping[str, Tensor], parents: Tensor
+    session: SessionState, model: Any, tensors: Mapping[str, Tensor], parents: Tensor
 ) -> bool:
     """Whether new rows, by param group, have the bits of their parents that children inherit."""
     known = {name: group["params"][0] for name, group in session.groups(model)}
     return all(torch.equal(tensors[n], known[n][parents]) for n in session.adapter.inherited)
 
 
-def on_choice(session: Session, call: SeamCall) -> Any:
+def on_choice(session: SessionState, call: SeamCall) -> Any:
     """Keep the rows that the host drew as parents."""
     result = call.run()
     state = session.models.get(call.model)
@@ -79,7 +77,7 @@ def on_choice(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_copy(session: Session, call: SeamCall) -> Any:
+def on_copy(session: SessionState, call: SeamCall) -> Any:
     """Rows overwritten by others take those rows' thresholds; not in stage 2."""
     if session.standing_still(call.model):
         return None
@@ -109,7 +107,7 @@ def on_copy(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_forget(session: Session, call: SeamCall) -> Any:
+def on_forget(session: SessionState, call: SeamCall) -> Any:
     """Zero the moments of rows whose moments the host zeroed."""
     result = call.run()
     state = session.models.get(call.model)
@@ -118,7 +116,7 @@ def on_forget(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_keep(session: Session, call: SeamCall) -> Any:
+def on_keep(session: SessionState, call: SeamCall) -> Any:
     """Remove what the host removed."""
     result = call.run()
     state = session.models.get(call.model)
@@ -130,7 +128,7 @@ def on_keep(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_rearrange(session: Session, call: SeamCall) -> Any:
+def on_rearrange(session: SessionState, call: SeamCall) -> Any:
     """Follow rows through an operation that keeps, copies and appends at once."""
     if session.standing_still(call.model):
         return None
@@ -148,7 +146,7 @@ def on_rearrange(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_still(session: Session, call: SeamCall) -> Any:
+def on_still(session: SessionState, call: SeamCall) -> Any:
     """Operations that would move a frozen model do not run in stage 2."""
     if session.standing_still(call.model):
         return call.how()

@@ -7,26 +7,23 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.adapter import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.saving import adopt
-from fragprune_plugins.injection.state import ModelState
+from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.injection.stepping import (
     asking_for_no_gradient,
     begin_step,
     frozen_parameters,
 )
 from fragprune_plugins.types import RasterInputs, RasterOutputs
-
-if TYPE_CHECKING:
-    from fragprune_plugins.engines import Engine
-    from fragprune_plugins.injection.session import Session
 
 log = logging.getLogger("fragprune")
 
@@ -45,7 +42,7 @@ class _AddToLoss(torch.autograd.Function):
         return grad, torch.ones(ctx.term_shape, dtype=grad.dtype, device=grad.device)
 
 
-def on_view(session: Session, call: SeamCall) -> Any:
+def on_view(session: SessionState, call: SeamCall) -> Any:
     """Remember which model is drawn for which camera while the host's function runs."""
     own = len(call.seam.needs) > 1  # a function's; a method's is what it was called on
     model = call.arguments[call.seam.needs[1]] if own else session.model_of(call)
@@ -67,14 +64,16 @@ def on_view(session: Session, call: SeamCall) -> Any:
     return again()
 
 
-def warn_unknown(session: Session, seam: Seam) -> None:
+def warn_unknown(session: SessionState, seam: Seam) -> None:
     """Say once that a view is drawn without thresholds."""
     if not session.warned:
         session.warned = True
         log.warning("%s draws Gaussians that no seam attached: without thresholds", seam)
 
 
-def draw_view(session: Session, render: Any, model: Any, view: int, args: Any, kwargs: Any) -> Any:
+def draw_view(
+    session: SessionState, render: Any, model: Any, view: int, args: Any, kwargs: Any
+) -> Any:
     """The host's function, with its model and view known to the rasterizer's seam."""
     token = session.rendering.set((model, view))
     try:
@@ -84,12 +83,12 @@ def draw_view(session: Session, render: Any, model: Any, view: int, args: Any, k
         session.rendering.reset(token)
 
 
-def on_rasterize(session: Session, call: SeamCall) -> Any:
+def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     """Draw with thresholds, or leave it to the host while there are none."""
     rendering = session.rendering.get()
     state = session.models.get(rendering[0]) if rendering else None
     drawn = HostCall.of(call)
-    by_host = partial(session.draw, drawn) if session.dialect.stands_in(drawn) else call.run
+    by_host = partial(draw, session, drawn) if session.dialect.stands_in(drawn) else call.run
     if rendering is None or state is None or session.pausing.get():
         return by_host()
     rows = session.dialect.rows_drawn(rendering[0], drawn)
@@ -105,7 +104,7 @@ def on_rasterize(session: Session, call: SeamCall) -> Any:
         )
     if state.store.neutral:
         return by_host()
-    inputs, engine = session.unpack(drawn)
+    inputs, engine = unpack(session, drawn)
     stage = state.stage
     thresholds = (
         session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
@@ -113,8 +112,20 @@ def on_rasterize(session: Session, call: SeamCall) -> Any:
     if thresholds is None:
         return by_host()
     thresholds = thresholds if rows is None else thresholds[rows]
-    draw = partial(rasterize, engine, state, rendering[1], thresholds)
-    return session.dialect.answer(drawn, inputs, draw)
+    truncated = partial(rasterize, engine, state, rendering[1], thresholds)
+    return session.dialect.answer(drawn, inputs, truncated)
+
+
+def draw(session: SessionState, call: HostCall) -> Any:
+    """The host's picture without thresholds, from our engine."""
+    inputs, engine = unpack(session, call)
+    return session.dialect.answer(call, inputs, lambda each, _=0: engine.rasterize(each, None))
+
+
+def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Engine]:
+    """The host's call as core values, and the engine that draws them."""
+    engine = session.engine(call[session.dialect.means].device)
+    return session.dialect.unpack(replace(call, engine=engine)), engine
 
 
 def rasterize(
@@ -135,7 +146,7 @@ def rasterize(
     return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure))  # type: ignore[no-untyped-call]
 
 
-def on_loss(session: Session, call: SeamCall) -> Any:
+def on_loss(session: SessionState, call: SeamCall) -> Any:
     """Keep the host's own loss for the curves."""
     state = session.last_state
     if state is not None and call.instance.numel() == 1:
@@ -145,7 +156,7 @@ def on_loss(session: Session, call: SeamCall) -> Any:
     return call.run()
 
 
-def on_metric(session: Session, call: SeamCall) -> Any:
+def on_metric(session: SessionState, call: SeamCall) -> Any:
     """A metric whose weights cannot be had is NaN, not the end of the run."""
     if call.seam not in session.absent:
         try:

@@ -6,7 +6,7 @@ import logging
 import weakref
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,18 +15,15 @@ from torch import Tensor
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
 from fragprune_plugins.hosts.seams import Role, SeamCall
-from fragprune_plugins.injection.state import ModelState
+from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.storage import sidecar
 
-if TYPE_CHECKING:
-    from fragprune_plugins.injection.session import Session
-
 log = logging.getLogger("fragprune")
 
 
-def on_save(session: Session, call: SeamCall) -> Any:
+def on_save(session: SessionState, call: SeamCall) -> Any:
     """Thresholds beside the file that the host wrote; nothing is written that is not finite."""
     check_learned(session, call.model)
     result = call.run()
@@ -35,14 +32,14 @@ def on_save(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def check_learned(session: Session, model: Any) -> None:
+def check_learned(session: SessionState, model: Any) -> None:
     """Raise DivergedError where a model that learns is not finite: its host is about to save."""
     state = session.models.get(model)
     if state is not None and state.stage is not None and state.stage.plan is not None:
         state.stage.check()
 
 
-def on_load(session: Session, call: SeamCall) -> Any:
+def on_load(session: SessionState, call: SeamCall) -> Any:
     """Thresholds from beside the file that the host read."""
     result = call.run()
     path = Path(call.how(call.first))
@@ -53,7 +50,7 @@ def on_load(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_pack(session: Session, call: SeamCall) -> Any:
+def on_pack(session: SessionState, call: SeamCall) -> Any:
     """Thresholds beside a file that holds the Gaussians in an order of its own."""
     result = call.run()
     packed = call.how()
@@ -70,7 +67,7 @@ def on_pack(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_unpack(session: Session, call: SeamCall) -> Any:
+def on_unpack(session: SessionState, call: SeamCall) -> Any:
     """Keep the thresholds of an unpacked file for the model that will be made of it."""
     result = call.run()
     packed = call.how()
@@ -80,7 +77,7 @@ def on_unpack(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def adopt(session: Session, model: Any, expected: Tensor, store: ThresholdStore) -> None:
+def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdStore) -> None:
     """Thresholds of an unpacked file go to the model made of it, which is drawn next."""
     means = session.adapter.means(model)
     if not torch.equal(means.detach().cpu(), expected):
@@ -98,7 +95,7 @@ def adopt(session: Session, model: Any, expected: Tensor, store: ThresholdStore)
     session.unpacked = None
 
 
-def on_capture(session: Session, call: SeamCall) -> Any:
+def on_capture(session: SessionState, call: SeamCall) -> Any:
     """Thresholds inside the host's checkpoint; in stage 2 always, so that it is known for one."""
     model = call.model
     check_learned(session, model)
@@ -110,7 +107,7 @@ def on_capture(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_restore(session: Session, call: SeamCall) -> Any:
+def on_restore(session: SessionState, call: SeamCall) -> Any:
     """Thresholds out of the host's checkpoint."""
     model, capture = call.model, call.how(call.first)
     saved = session.adapter.checkpoint_state(capture).pop(CHECKPOINT_KEY, None)
@@ -126,7 +123,7 @@ def on_restore(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def revive(session: Session, model: Any) -> None:
+def revive(session: SessionState, model: Any) -> None:
     """Let a restored model train as the host sets it up, where its checkpoint would not.
 
     What version 0.1 froze it left frozen, in its checkpoints too, and at the rates of stage 2. A

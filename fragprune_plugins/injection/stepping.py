@@ -5,23 +5,23 @@ from __future__ import annotations
 import contextlib
 import weakref
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.hosts.seams import Role, SeamCall
-from fragprune_plugins.injection.state import ModelState
+from fragprune_plugins.injection.state import ModelState, SessionState
+from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 
-if TYPE_CHECKING:
-    from fragprune_plugins.injection.session import Session
 
-
-def on_scene(session: Session, call: SeamCall) -> Any:
+def on_scene(session: SessionState, call: SeamCall) -> Any:
     """Note where the host writes."""
     result = call.run()
     if getattr(call.instance, "model_path", None):
@@ -29,7 +29,7 @@ def on_scene(session: Session, call: SeamCall) -> Any:
     return result
 
 
-def on_attach(session: Session, call: SeamCall) -> Any:
+def on_attach(session: SessionState, call: SeamCall) -> Any:
     """A new optimizer: thresholds for a model that has none, else the same rows or new ones."""
     model = call.model
     state = session.models.get(model)
@@ -51,14 +51,42 @@ def on_attach(session: Session, call: SeamCall) -> Any:
         )
         state = session.models[model] = ModelState(store)
     if state.stage is None:
-        state.stage = session.stage2(model, state)
+        state.stage = stage2(session, model, state)
     session.follow(model, state)
     hook_optimizers(session, model, state)
     session.plugins.tell(hookspecs.fragprune_attached, model=model, store=state.store)
     return result
 
 
-def is_followed(session: Session, model: Any, state: ModelState) -> bool:
+def stage2(session: SessionState, model: Any, state: ModelState) -> Stage2:
+    """Learning for a model's thresholds, as the plugins have it."""
+    reference = weakref.ref(model)
+
+    def parameters() -> dict[str, Tensor]:
+        return {
+            name or f"group {number}": parameter
+            for number, (name, group) in enumerate(session.groups(reference()))
+            for parameter in group["params"]
+        }
+
+    return Stage2(
+        state.store,
+        session.settings,
+        session.schedule,
+        truncate=session.truncate,
+        views=state.views,
+        watch=partial(report, session),
+        parameters=parameters,
+    )
+
+
+def report(session: SessionState, stats: StepStats) -> None:
+    """Tell observers of a step that is over."""
+    session.curves.append(asdict(stats))
+    session.plugins.tell(hookspecs.fragprune_step, stats=stats)
+
+
+def is_followed(session: SessionState, model: Any, state: ModelState) -> bool:
     """Whether the means are the very tensor that was loaded, or trained until now."""
     means = session.adapter.means(model)
     known = [state.loaded() if state.loaded else None]
@@ -66,7 +94,7 @@ def is_followed(session: Session, model: Any, state: ModelState) -> bool:
     return any(each is means for each in known)
 
 
-def hook_optimizers(session: Session, model: Any, state: ModelState) -> None:
+def hook_optimizers(session: SessionState, model: Any, state: ModelState) -> None:
     """See every step of a model's optimizers, before and after."""
     reference = weakref.ref(model)
     for optimizer in (each() for each in session.optimizers[model]):
@@ -79,7 +107,7 @@ def hook_optimizers(session: Session, model: Any, state: ModelState) -> None:
         state.hooks.append(optimizer.register_step_post_hook(after))
 
 
-def before_step(session: Session, reference: Any, optimizer: Any, *_: Any) -> None:
+def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) -> None:
     """Stage 2: parameters that do not train get no gradient, so no optimizer touches them.
 
     Those that do are lent the rates of stage 2 for the step: the host pickles rates, too.
@@ -104,7 +132,7 @@ def before_step(session: Session, reference: Any, optimizer: Any, *_: Any) -> No
             group["lr"] = stage.rate(name, rates[name])
 
 
-def after_step(session: Session, reference: Any, *_: Any) -> None:
+def after_step(session: SessionState, reference: Any, *_: Any) -> None:
     """The store steps once per counted step, however many optimizers the host steps."""
     model = reference()
     state = session.models.get(model) if model is not None else None
@@ -119,7 +147,7 @@ def after_step(session: Session, reference: Any, *_: Any) -> None:
         state.stage.end()
 
 
-def on_step(session: Session, call: SeamCall) -> Any:
+def on_step(session: SessionState, call: SeamCall) -> Any:
     """The host's clock ticks: plan the step and let nothing move that shall not."""
     result = call.run()
     state = session.models.get(call.model)
@@ -130,7 +158,7 @@ def on_step(session: Session, call: SeamCall) -> Any:
     return call.how(result) if session.standing_still(call.model) else result
 
 
-def begin_step(session: Session, model: Any, state: ModelState) -> None:
+def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
     """Count a step of the host, and let stage 2 begin its own."""
     if state.stage is not None:
         state.stage.close()  # before the count: whoever watches may end the run here
@@ -145,7 +173,7 @@ def begin_step(session: Session, model: Any, state: ModelState) -> None:
         state.stage.begin(lambda: session.adapter.opacities(model))
 
 
-def frozen_parameters(session: Session, model: Any) -> list[Tensor]:
+def frozen_parameters(session: SessionState, model: Any) -> list[Tensor]:
     """Parameters of a model that do not train now."""
     trained = session.adapter.trained_groups(session.settings.train)
     if trained is None or not session.standing_still(model):
@@ -197,7 +225,7 @@ def depends_only_on(known: set[int], value: Any) -> bool:
     return leaves > 0
 
 
-def fill_gradients_read(session: Session, model: Any) -> None:
+def fill_gradients_read(session: SessionState, model: Any) -> None:
     """Zeros where the host reads a gradient of what stands still: drawing leaves none."""
     trained = session.adapter.trained_groups(session.settings.train)
     for name, group in session.groups(model):

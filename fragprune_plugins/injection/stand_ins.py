@@ -1,0 +1,96 @@
+"""Our stand-ins for a host's compiled packages, placed where its imports find them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from fragprune_plugins.errors import LateImportError
+from fragprune_plugins.hosts.adapter import Dialect, HostCall
+
+log = logging.getLogger("fragprune")
+
+
+class StandIns:
+    """A host's compiled packages as its dialect makes them.
+
+    Args:
+        dialect: the host's.
+        draw: answers their calls.
+        drop_in: place them: True, False, or None for those that cannot be imported.
+    """
+
+    def __init__(
+        self, dialect: Dialect, draw: Callable[[HostCall], Any], drop_in: bool | None
+    ) -> None:
+        self._dialect, self._draw, self._drop_in = dialect, draw, drop_in
+        self._made: dict[str, ModuleType] = {}  # once: a host keeps what it imported
+        self._placed: dict[str, ModuleType] = {}
+
+    def place(self) -> None:
+        """Put them into ``sys.modules``.
+
+        Raises:
+            LateImportError: the host has imported one of its own.
+        """
+        self._made = self._made or self._dialect.modules(self._draw)
+        for name, module in self._made.items():
+            package = name.split(".")[0]
+            wanted = self._drop_in
+            if wanted is None:
+                wanted = package in self._placed or not self._dialect.present(package)
+            if not wanted:
+                continue
+            if name in sys.modules:
+                raise LateImportError(
+                    name,
+                    "already imported",
+                    "activation before the host imports its rasterizer",
+                    "Start the host with fragprune run, or call activate() above those imports.",
+                )
+            sys.modules[name] = self._placed[name] = module
+        for name, module in self._dialect.spares().items() if self._drop_in else ():
+            if name not in sys.modules and find_spec(name) is None:
+                log.warning("%s is not installed: the host imports an empty stand-in", name)
+                sys.modules[name] = self._placed[name] = module
+
+    def take_back(self) -> None:
+        """Take them out of ``sys.modules``."""
+        for name, module in self._placed.items():
+            if sys.modules.get(name) is module:
+                del sys.modules[name]
+        self._placed.clear()
+
+    def refuse_leftovers(self, root: Path) -> None:
+        """A host imported under an earlier session holds its classes, and draws with them.
+
+        Args:
+            root: of the host.
+
+        Raises:
+            LateImportError: one of its modules does.
+        """
+        inside = f"{root}{os.sep}"
+        hosts = [
+            module
+            for module in list(sys.modules.values())
+            if str(getattr(module, "__file__", "")).startswith(inside)
+        ]
+        for name, stand_in in self._placed.items():
+            for member, ours in vars(stand_in).items():
+                maker = getattr(ours, "__module__", None)
+                for module in hosts:
+                    held = vars(module).get(member, ours)
+                    if held is not ours and maker and getattr(held, "__module__", None) == maker:
+                        raise LateImportError(
+                            f"{name}.{member}",
+                            f"bound in {module.__name__} since an earlier session",
+                            "a host that is imported under this one",
+                            "Activate that session again, or start a fresh process.",
+                        )
