@@ -51,8 +51,8 @@ def command(
     """
     # Read when torch loads: idle threads sleep instead of spinning against other programs' work.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from fragprune_plugins.demo.demo import DemoSettings, quotable, run_demo
-    from fragprune_plugins.measure.wording import describe
+    from fragprune_plugins.demo.demo import DemoSettings, run_demo
+    from fragprune_plugins.measure.wording import describe, outcome
 
     _, where = open_engine(engine, device, threads)
     settings = DemoSettings(
@@ -61,7 +61,7 @@ def command(
     report = run_demo(out, settings, lambda line: click.echo(line, err=True))
     table = describe({"before": report["before"], "after": report["after"]})
     text = (
-        f"\n{table}\n\n{quotable(report)}\n"
+        f"\n{table}\n\n{outcome('run', report, report['control'])}\n"
         f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures."
     )
     return Report(report, text)

@@ -123,19 +123,14 @@ def run_demo(
         report = _measure(scene, summary, control, settings)
     with clock.part("pictures"), claiming(out, "pictures", "index.html"):
         say("5/5  Drawing the pictures")
-        report["files"] = write_page(out, report, scene, summary, settings)
+        report["files"] = write_page(
+            out, report, scene, summary.curves, settings.engine, settings.device
+        )
     report["seconds_by_part"] = clock.seconds
     report["seconds"] = sum(clock.seconds.values())
     with claiming(out, REPORT), replacing(out / REPORT) as path:
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
-
-
-def quotable(report: dict[str, Any]) -> str:
-    """The outcome in a line or two, the control's included."""
-    from fragprune_plugins.measure.wording import outcome
-
-    return outcome("run", report, report["control"])
 
 
 def _photograph(folder: Path, settings: DemoSettings) -> None:

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fragprune_plugins.storage.atomic import replacing
-
-if TYPE_CHECKING:
-    from fragprune_plugins.demo.demo import DemoSettings
-    from fragprune_plugins.injection.launch import RunSummary
 
 _INTRODUCTION = """A small training repository learned this room from ray-traced photographs. Then
 every Gaussian learned how far it reaches; what lies beyond is neither sorted nor blended. No line
@@ -21,33 +17,44 @@ fragprune finetune point_cloud.ply --data scene --out pruned.ply"""
 
 
 def write_page(
-    out: Path, report: dict[str, Any], scene: Path, summary: RunSummary, settings: DemoSettings
+    out: Path,
+    report: dict[str, Any],
+    scene: Path,
+    curves: list[dict[str, float]],
+    engine: str,
+    device: str,
 ) -> list[str]:
-    """Write ``pictures/`` and ``index.html``; returns the files, relative to ``out``."""
+    """Write ``pictures/`` and ``index.html``; returns the files, relative to ``out``.
+
+    Args:
+        out: the demo's folder.
+        report: as measured.
+        scene: the photographs.
+        curves: of the run.
+        engine: what draws.
+        device: where.
+    """
     from fragprune_plugins.datasets.dataset import load_dataset
-    from fragprune_plugins.demo.demo import quotable
     from fragprune_plugins.measure import Candidate, report_page
-    from fragprune_plugins.measure.wording import describe
+    from fragprune_plugins.measure.wording import describe, outcome
     from fragprune_plugins.plugins.hooks import engine_for
     from fragprune_plugins.storage.models import load_model
 
-    assert summary.model_before is not None
-    assert summary.model_after is not None
     pictures = out / "pictures"
-    models = (summary.model_before, summary.model_after)
-    (one, _), (other, store) = (load_model(path, device=settings.device) for path in models)
+    models = (Path(report["model_before"]), Path(report["model_after"]))
+    (one, _), (other, store) = (load_model(path, device=device) for path in models)
     before, after = Candidate(one), Candidate(other, store)
-    engine = engine_for(settings.engine, settings.device)
-    views = report_page.draw_views(pictures, before, after, load_dataset(scene).test, engine)
+    test, rasterizer = load_dataset(scene).test, engine_for(engine, device)
+    views = report_page.draw_views(pictures, before, after, test, rasterizer)
     files = [file for names in views.values() for file in names]
     learning = []
-    if summary.curves and store is not None:
-        report_page.save_learning(pictures / report_page.LEARNING, summary.curves, store.values)
+    if curves and store is not None:
+        report_page.save_learning(pictures / report_page.LEARNING, curves, store.values)
         learning = [("How it learned", report_page.LEARNING)]
         files.append(report_page.LEARNING)
     text = report_page.compose(
         title="The same picture from fewer fragments",
-        quote=quotable(report),
+        quote=outcome("run", report, report["control"]),
         text=[
             report_page.paragraph(_INTRODUCTION),
             report_page.preformatted(

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from fragprune_plugins.demo import folder
-from fragprune_plugins.demo.demo import DemoSettings, host_command, quotable, run_demo
+from fragprune_plugins.demo.demo import DemoSettings, host_command, run_demo
 from fragprune_plugins.errors import OutputError
+from fragprune_plugins.measure.wording import outcome
 
 TINY = """
 import json, sys
@@ -72,7 +73,7 @@ def test_control_shows_what_opacities_alone_would_have_given(demo):
     assert gain != 0
     assert report["control_psnr_change"] == pytest.approx(gain)
     assert report["control"]["gaussians"] == report["before"]["gaussians"]
-    assert f"{gain:+.2f} dB: pruning itself makes" in quotable(report)
+    assert f"{gain:+.2f} dB: pruning itself makes" in outcome("run", report, report["control"])
 
 
 def test_pictures_and_page_are_there(demo):
