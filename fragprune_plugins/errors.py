@@ -72,6 +72,12 @@ class HostNeedsError(FragpruneError):
     code = "host-needs"
 
 
+class HostFailed(FragpruneError):  # noqa: N818 - the host's failure, reported
+    """The host's script raised, or ended with a non-zero exit code."""
+
+    code = "host-failed"
+
+
 class SeamError(FragpruneError):
     """A host lacks a function we wrap, or has it with other parameters."""
 

@@ -87,7 +87,8 @@ def command(
     if alternate is not None and stage != "joint":
         raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Add or drop it.")
 
-    from fragprune_plugins.injection.launch import RunOptions, current_gpu, run
+    from fragprune_plugins.injection.launch import RunOptions, run
+    from fragprune_plugins.injection.process import current_gpu
 
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     options = RunOptions(

@@ -19,9 +19,9 @@ from miniatures.vanilla_3dgs import (
 )
 
 from fragprune_mcmc import MCMC
-from fragprune_plugins.errors import AlignmentError, UsageError
+from fragprune_plugins.errors import AlignmentError, HostFailed, UsageError
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection.launch import HostFailed, run
+from fragprune_plugins.injection.launch import run
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 

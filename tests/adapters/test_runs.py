@@ -25,7 +25,8 @@ from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import Interrupted, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
-from fragprune_plugins.injection.launch import RunOptions, _forget_modules, _host_process, run
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.process import forget_modules, host_process
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -58,7 +59,7 @@ def host_run(scene, out, wrapped):
     )
     script, *arguments = command(scene, out, 25, "--checkpoint_iterations", 25)
     known = set(sys.modules)
-    with _host_process(HOST / "train.py", arguments, "cpu"):
+    with host_process(HOST / "train.py", arguments, "cpu"):
         try:
             if wrapped:
                 session.activate()
@@ -67,7 +68,7 @@ def host_run(scene, out, wrapped):
             runpy.run_path(script, run_name="__main__")
         finally:
             session.deactivate()
-            _forget_modules(HOST, known)
+            forget_modules(HOST, known)
     (capture, _) = torch.load(out / "chkpnt25.pth", weights_only=False)
     ply = out / "point_cloud" / "iteration_25" / "point_cloud.ply"
     streams = random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state()

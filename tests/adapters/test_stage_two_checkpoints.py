@@ -15,7 +15,8 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection.launch import RunOptions, _forget_modules, _host_process, run
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.process import forget_modules, host_process
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.loading import load_plugins
@@ -36,13 +37,13 @@ def alone(words):
     """The host without fragprune, but for what stands in for its compiled packages."""
     session = Session(Vanilla3DGS(), HostRepo(HOST), load_plugins(), drop_in=True)
     known = set(sys.modules)
-    with _host_process(Path(words[0]), words[1:], "cpu"):
+    with host_process(Path(words[0]), words[1:], "cpu"):
         try:
             session.install_stand_ins()
             runpy.run_path(words[0], run_name="__main__")
         finally:
             session.deactivate()
-            _forget_modules(HOST, known)
+            forget_modules(HOST, known)
 
 
 def parameters(checkpoint):

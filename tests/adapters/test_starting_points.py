@@ -12,8 +12,8 @@ import torch
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
-from fragprune_plugins.errors import ModelFileError, SidecarError, UsageError
-from fragprune_plugins.injection.launch import HostFailed, RunOptions, run
+from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
+from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import records, sidecar
 

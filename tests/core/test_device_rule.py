@@ -11,7 +11,7 @@ from miniatures.skeletons import skeleton
 
 from fragprune_plugins import engines
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.injection import launch
+from fragprune_plugins.injection import launch, process
 from fragprune_plugins.injection.launch import RunOptions
 
 
@@ -103,7 +103,7 @@ def test_a_device_that_is_not_there_is_usage(tmp_path):
 def test_a_host_gets_any_gpu_there_is(gpus, count, usable, wanted, device):
     """Its own rasterizer may draw where our engine may not."""
     gpus(count, usable)
-    assert launch._device(wanted, "auto") == device
+    assert process.host_device(wanted, "auto") == device
 
 
 def test_a_host_stays_on_the_gpu_that_was_named(gpus, tmp_path, monkeypatch):

@@ -11,15 +11,16 @@ from types import ModuleType
 import pytest
 from miniatures.skeletons import skeleton
 
-from fragprune_plugins.errors import HostNeedsError, Interrupted, UnknownHostError, UsageError
-from fragprune_plugins.injection.launch import (
+from fragprune_plugins.errors import (
     HostFailed,
-    RunOptions,
-    _forget_modules,
-    _parse,
-    _split,
-    run,
+    HostNeedsError,
+    Interrupted,
+    UnknownHostError,
+    UsageError,
 )
+from fragprune_plugins.injection.command import HostCommand, split
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.process import forget_modules
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 CPU = RunOptions(stage="off", device="cpu")
@@ -40,13 +41,13 @@ def host(tmp_path):
 
 def parsed(repo, *arguments):
     line = Vanilla3DGS().command_line(repo)
-    return _parse(Path("train.py"), list(map(str, arguments)), line)
+    return HostCommand.read(Path("train.py"), list(map(str, arguments)), line)
 
 
 @pytest.mark.parametrize("interpreter", [[], ["python"], ["python3.11"], ["/usr/bin/python3"]])
 def test_an_interpreter_in_front_may_be_left_out(host, interpreter):
     script = host("")
-    assert _split([*interpreter, script, "-s", "x"]) == (Path(script), ["-s", "x"], "")
+    assert split([*interpreter, script, "-s", "x"]) == (Path(script), ["-s", "x"], "")
 
 
 def test_a_module_is_found_without_importing_its_package(tmp_path, monkeypatch):
@@ -55,10 +56,11 @@ def test_a_module_is_found_without_importing_its_package(tmp_path, monkeypatch):
     (package / "__init__.py").write_text("raise RuntimeError('imported')")
     (package / "train.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
-    split = _split(["python", "-m", "toyhost_of_tests.train", "-i", "3"])
-    assert split == (package / "train.py", ["-i", "3"], "toyhost_of_tests.train")
+    words = ["python", "-m", "toyhost_of_tests.train", "-i", "3"]
+    found = (package / "train.py", ["-i", "3"], "toyhost_of_tests.train")
+    assert split(words) == found
     with pytest.raises(UsageError, match="no such module"):
-        _split(["python", "-m", "toyhost_of_tests.evaluate"])
+        split(["python", "-m", "toyhost_of_tests.evaluate"])
 
 
 def test_modules_of_an_installed_host_are_forgotten_and_its_compiled_ones_kept(
@@ -70,7 +72,7 @@ def test_modules_of_an_installed_host_are_forgotten_and_its_compiled_ones_kept(
         module = ModuleType(name)
         module.__file__ = str(root / file)
         monkeypatch.setitem(sys.modules, name, module)
-    _forget_modules(root, sys.modules.keys() - {*files, "other"}, ("toy",))
+    forget_modules(root, sys.modules.keys() - {*files, "other"}, ("toy",))
     assert {"toy", "toy.train"} & sys.modules.keys() == set()
     assert {"toy._C", "other"} <= sys.modules.keys()
 
@@ -81,7 +83,7 @@ def test_any_spelling_of_a_flag_is_read_and_the_last_is_written(tmp_path):
         iterations=("-i", "--iteration"),
         resume=("-l", "--load_ply"),
     )
-    host = _parse(Path("train.py"), ["-i", "7", "-l", "a.ply"], line)
+    host = HostCommand.read(Path("train.py"), ["-i", "7", "-l", "a.ply"], line)
     assert (host.flags.iterations, host.flags.resume) == (7, "a.ply")
     written = [line.spellings(field)[-1] for field in ("iterations", "output", "resume")]
     assert written == ["--iteration", "--model_path", "--load_ply"]
@@ -92,7 +94,7 @@ def test_any_spelling_of_a_flag_is_read_and_the_last_is_written(tmp_path):
 )
 def test_a_command_without_a_script_is_a_usage_error(command):
     with pytest.raises(UsageError):
-        _split(command)
+        split(command)
 
 
 @pytest.mark.parametrize(

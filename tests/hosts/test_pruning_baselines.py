@@ -59,7 +59,7 @@ def test_speedys_own_pruning_is_refused_before_anything_is_lost(host, dataset, t
 
 TRAINED = """
     from contextlib import suppress
-    from fragprune_plugins.injection.launch import HostFailed
+    from fragprune_plugins.errors import HostFailed
     train = [*words, "--checkpoint_iterations", "30"]
     with suppress(HostFailed):  # the host looks for iteration 30,000 when it has saved everything
         run(train, replace(options, stage="off"))

@@ -1,0 +1,155 @@
+"""This process as a host's script expects to find it, and as it was before once the script ends."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import runpy
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from fragprune_plugins.errors import FragpruneError, HostFailed
+from fragprune_plugins.hosts import preflight
+from fragprune_plugins.hosts.source import HostRepo
+
+_OURS = Path(__file__).parents[1]
+
+
+@contextlib.contextmanager
+def telling(script: Path, root: Path) -> Iterator[None]:
+    """What a host raises is told in a line; the whole traceback goes to stderr, for who needs it.
+
+    Args:
+        script: that runs.
+        root: of the host.
+    """
+    try:
+        yield
+    except FragpruneError:
+        raise
+    except Exception as error:
+        traceback.print_exc()
+        frames = traceback.extract_tb(error.__traceback__)
+        inside = [frame for frame in frames if Path(frame.filename).is_relative_to(root)]
+        where = script.name
+        if inside:
+            file = Path(inside[-1].filename).relative_to(root)
+            where = f"{file}:{inside[-1].lineno} in {inside[-1].name}"
+        message = "".join(str(error).strip().splitlines()[:1])
+        remedy = "Read the traceback above."
+        lacking = (error.name or "").split(".")[0] if isinstance(error, ImportError) else ""
+        if isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
+            remedy = f"Run: {preflight.install([preflight.Missing(lacking, where)])}"
+        elif Path(frames[-1].filename).is_relative_to(_OURS):
+            remedy = "It came up in fragprune: report it with the traceback above."
+        raise HostFailed(
+            where,
+            f"{type(error).__name__}{f': {message}' if message else ''}",
+            f"{script.name} to come to its end",
+            remedy,
+        ) from error
+
+
+@contextlib.contextmanager
+def host_process(
+    script: Path, arguments: list[str], device: str, folder: Path | None = None
+) -> Iterator[None]:
+    """What a fresh interpreter would give the script, put back afterwards."""
+    from fragprune_plugins.injection.cpu_only import cpu_only
+
+    saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
+    sys.argv = [str(script), *arguments]
+    sys.path.insert(0, str(folder or script.parent))
+    try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(host_checkpoints())
+            stack.enter_context(_host_pictures())
+            if device == "cpu":
+                stack.enter_context(cpu_only())
+            else:
+                stack.enter_context(current_gpu(device))
+            yield
+    finally:
+        sys.argv, sys.path[:], sys.stdout, sys.stderr = saved
+
+
+def run_main(script: Path, module: str = "") -> None:
+    """Run a script, or the module that it is, as ``__main__``."""
+    if module:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    else:
+        runpy.run_path(str(script), run_name="__main__")
+
+
+def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) -> None:
+    """Drop the host's own modules, so that its script runs again as if for the first time.
+
+    Args:
+        root: of a checkout, which may hold an environment with packages that are not its own.
+        known: names of modules that were there before the host ran.
+        packages: that are the host, where it is installed; their compiled modules stay.
+    """
+    for name in sys.modules.keys() - known:
+        file = getattr(sys.modules[name], "__file__", None) or ""
+        if name.split(".")[0] in packages:
+            own = not file or file.endswith(".py")
+        else:
+            own = file != "" and Path(file).is_relative_to(root) and "site-packages" not in file
+        if own:
+            del sys.modules[name]
+    gc.collect()  # closes what module globals held, the viewer's socket among them
+
+
+def host_device(wanted: str, engine: str) -> str:
+    """Where the host runs: it was written for a GPU, so "auto" gives it any that there is."""
+    import torch
+
+    from fragprune_plugins.engines import device_for
+
+    if wanted == "auto" and torch.cuda.is_available():
+        return "cuda"
+    return str(device_for(wanted, engine))
+
+
+@contextlib.contextmanager
+def current_gpu(device: str) -> Iterator[None]:
+    """Where a GPU is named by its number, inside it is "cuda", whichever a host would choose."""
+    import torch
+
+    if not device.startswith("cuda:"):
+        yield
+        return
+    with torch.cuda.device(device), mock.patch.object(torch.cuda, "set_device"):
+        yield
+
+
+@contextlib.contextmanager
+def host_checkpoints() -> Iterator[None]:
+    """Let torch's safe loader read the hosts' checkpoints: they hold NumPy scalars, no more."""
+    import numpy as np
+    import torch
+
+    scalar: Any = np.float64(0).__reduce__()[0]
+    kinds: list[Any] = [type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8")]
+    with torch.serialization.safe_globals([scalar, np.dtype, *kinds]):
+        yield
+
+
+@contextlib.contextmanager
+def _host_pictures() -> Iterator[None]:
+    """Let Pillow take signed bytes, as hosts that read Blender scenes give it; it used to."""
+    import numpy as np
+    from PIL import Image
+
+    fromarray = Image.fromarray
+
+    def from_bytes(array: Any, mode: str | None = None) -> Any:
+        signed = isinstance(array, np.ndarray) and array.dtype == np.int8
+        return fromarray(array.view(np.uint8) if signed else array, mode)
+
+    with mock.patch.object(Image, "fromarray", from_bytes):
+        yield
