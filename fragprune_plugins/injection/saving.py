@@ -73,7 +73,7 @@ def on_unpack(session: SessionState, call: SeamCall) -> Any:
     packed = call.how()
     if packed is not None and sidecar.path_beside(packed[0]).exists():
         file, means = packed
-        session.unpacked = means, sidecar.load(file, ThresholdStore(len(means)))[0]
+        session.unpacked = means, sidecar.load(file, len(means))[0]
     return result
 
 

@@ -205,10 +205,9 @@ class SessionState:
         Raises:
             SidecarError: there are none, or they belong to another file.
         """
-        store = ThresholdStore(self.adapter.rows(model), self.adapter.means(model).device)
-        sidecar.load(path, store)
-        means = weakref.ref(self.adapter.means(model))
-        state = self.models[model] = ModelState(store, loaded=means)
+        means = self.adapter.means(model)
+        store, _ = sidecar.load(path, self.adapter.rows(model), means.device)
+        state = self.models[model] = ModelState(store, loaded=weakref.ref(means))
         self.follow(model, state)
         self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)
 

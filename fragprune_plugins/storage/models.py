@@ -29,7 +29,7 @@ def load_model(
 
     Raises:
         ModelFileError: the model cannot be read.
-    SidecarError: the sidecar beside it is lost, broken, another model's, or has other rows.
+        SidecarError: the sidecar beside it is lost, broken, another model's, or has other rows.
     """
     import torch
 
@@ -40,7 +40,7 @@ def load_model(
     model = read_ply(path, filtered=filtered).to(device)
     store = ThresholdStore(len(model), device)
     if truncation and sidecar.lies_beside(path):
-        sidecar.load(path, store)
+        store, _ = sidecar.load(path, len(model), device)
     elif truncation and model.thresholds is not None:
         store.place(torch.logit(model.thresholds))
     return model, None if store.neutral else store

@@ -110,17 +110,20 @@ def save(
     return target
 
 
-def load(model: Path, store: ThresholdStore | None = None) -> tuple[ThresholdStore, SidecarInfo]:
+def load(
+    model: Path, rows: int | None = None, device: torch.device | str = "cpu"
+) -> tuple[ThresholdStore, SidecarInfo]:
     """Read the sidecar of a model file.
 
     Args:
         model: the file.
-        store: filled in; whoever has the model passes one of its rows, and other rows are refused.
-            None makes one on the CPU of as many rows as the sidecar says that the model has.
+        rows: of the model, from whoever has it; others are refused. None takes as many as the
+            sidecar says that it has.
+        device: where the store is to live.
 
     Raises:
         SidecarError: missing, unreadable, not finite, written for another model file, or of other
-            rows than the store. The store stays as it was.
+            rows than the model.
     """
     state, info = _read(model)
     shape, wanted = tuple(state["logits"].shape), digest(model)
@@ -131,15 +134,14 @@ def load(model: Path, store: ThresholdStore | None = None) -> tuple[ThresholdSto
             f"those of {Path(model).name} (sha256 {wanted[:12]})",
             _remedy(model),
         )
-    if store is None:
-        store = ThresholdStore(info.rows)
-    elif len(store) != info.rows:
+    if rows not in (None, info.rows):
         raise SidecarError(
             str(path_beside(model)),
             f"thresholds of {info.rows} Gaussian(s)",
-            f"{len(store)}, one for each in {Path(model).name}",
+            f"{rows}, one for each in {Path(model).name}",
             _remedy(model),
         )
+    store = ThresholdStore(info.rows, device)
     store.load_state_dict(state)
     return store, info
 

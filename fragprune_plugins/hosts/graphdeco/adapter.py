@@ -319,7 +319,6 @@ class GraphdecoAdapter(ScriptAdapter):
         """The 12-tuple of ``capture``, fresh moments, and the thresholds of the PLY's sidecar."""
         import torch
 
-        from fragprune_plugins.learning.thresholds import ThresholdStore
         from fragprune_plugins.storage import sidecar
         from fragprune_plugins.storage.atomic import replacing
 
@@ -340,7 +339,7 @@ class GraphdecoAdapter(ScriptAdapter):
         )
         state: dict[str, Any] = optimizer.state_dict()
         if sidecar.lies_beside(ply):
-            state[CHECKPOINT_KEY] = sidecar.load(ply, ThresholdStore(rows))[0].state_dict()
+            state[CHECKPOINT_KEY] = sidecar.load(ply, rows)[0].state_dict()
         capture = (
             m.sh_degree,
             parameters["xyz"],
