@@ -124,12 +124,28 @@ stdout, progress on stderr. Exit codes are listed in [errors](errors.md)."""
     return _page("Command line", intro, *parts)
 
 
+def errors() -> str:
+    """Every stated failure."""
+    from fragprune_plugins import errors
+
+    intro = """Every stated failure prints `[code] where: found; expected. remedy` and leaves
+existing files as they were. Exit codes: 1 for a stated failure, 2 for usage, 130 for Ctrl-C, 143
+for SIGTERM while something learned. With `--json` the parts come as
+`{"error": {"code", "where", "found", "expected", "remedy"}}`."""
+    base = errors.FragpruneError
+    kinds = [kind for kind in vars(errors).values() if inspect.isclass(kind) and kind is not base]
+    rows = [f"| `{kind.code}` | `{kind.__name__}` | {inspect.getdoc(kind)} |" for kind in kinds]
+    table = "\n".join(["| code | exception | when |", "|---|---|---|", *rows])
+    return _page("Errors", intro, table)
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "hooks.md": hooks,
     "roles.md": roles,
     "adapters.md": adapters,
     "python.md": python,
     "command-line.md": command_line,
+    "errors.md": errors,
 }
 
 
