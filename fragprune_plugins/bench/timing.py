@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.measure.clock import synchronize, timed
+from fragprune_plugins.engines.clock import synchronize, timed
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 
 Pass = Literal["forward", "forward_backward"]

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Shot
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.measure.clock import timed
 from fragprune_plugins.measure.metrics import psnr, ssim
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.storage.ply import SplatFile

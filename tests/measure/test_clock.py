@@ -11,8 +11,8 @@ from finetune import tiny
 from fragprune_plugins.bench import timing
 from fragprune_plugins.bench.scene import make_scene, make_view
 from fragprune_plugins.bench.timing import Case
-from fragprune_plugins.engines import create_engine
-from fragprune_plugins.measure import Candidate, clock, measure
+from fragprune_plugins.engines import clock, create_engine
+from fragprune_plugins.measure import Candidate, measure
 
 
 class Notes:
