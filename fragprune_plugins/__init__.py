@@ -1,5 +1,11 @@
 """fragprune: learned fragment pruning for every Gaussian-splatting codebase.
 
+A picture of a splat, truncated by the thresholds beside it::
+
+    import fragprune_plugins as fp
+    model = fp.load("model.ply")
+    fp.render_view(model).save("view.png")
+
 Importing this package imports neither torch nor any host; names load when they are first used.
 """
 
@@ -9,12 +15,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fragprune_plugins.datasets.cameras import load_cameras
+    from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.engines import slice_at
-    from fragprune_plugins.finetuning import finetune
+    from fragprune_plugins.finetuning import FinetuneResult, finetune
     from fragprune_plugins.injection.api import activate, deactivate, paused
-    from fragprune_plugins.learning.schedule import Settings
+    from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
+    from fragprune_plugins.measure.viewing import overview, render_view
     from fragprune_plugins.plugins.hooks import rasterize
+    from fragprune_plugins.storage.models import Model, load, save
+    from fragprune_plugins.storage.ply import SplatFile
     from fragprune_plugins.types import (
         Footprints,
         Moment,
@@ -29,41 +40,63 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "FinetuneResult": "finetuning",
     "Footprints": "types",
+    "Model": "storage.models",
     "Moment": "types",
     "RasterInputs": "types",
     "RasterOutputs": "types",
+    "Schedule": "learning.schedule",
     "Settings": "learning.schedule",
     "Sliced": "types",
     "SpacetimeSplats": "types",
+    "SplatFile": "storage.ply",
     "Splats": "types",
+    "StepPlan": "learning.schedule",
     "ThresholdStore": "learning.thresholds",
     "View": "types",
     "activate": "injection.api",
     "deactivate": "injection.api",
     "finetune": "finetuning",
+    "load": "storage.models",
+    "load_cameras": "datasets.cameras",
+    "load_dataset": "datasets.dataset",
+    "overview": "measure.viewing",
     "paused": "injection.api",
     "rasterize": "plugins.hooks",
+    "render_view": "measure.viewing",
+    "save": "storage.models",
     "slice_at": "engines",
 }
 
 __all__ = [
+    "FinetuneResult",
     "Footprints",
+    "Model",
     "Moment",
     "RasterInputs",
     "RasterOutputs",
+    "Schedule",
     "Settings",
     "Sliced",
     "SpacetimeSplats",
+    "SplatFile",
     "Splats",
+    "StepPlan",
     "ThresholdStore",
     "View",
     "__version__",
     "activate",
     "deactivate",
     "finetune",
+    "load",
+    "load_cameras",
+    "load_dataset",
+    "overview",
     "paused",
     "rasterize",
+    "render_view",
+    "save",
     "slice_at",
 ]
 

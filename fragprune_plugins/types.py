@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -14,8 +15,11 @@ from fragprune_plugins.constants import (
     NEAR,
 )
 from fragprune_plugins.errors import InputError
+from fragprune_plugins.reprs import one_line
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import torch
     from torch import Tensor
 
@@ -59,6 +63,12 @@ def _is_whole(dtype: torch.dtype) -> bool:
     import torch
 
     return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
+
+
+def _check_size(width: int, height: int) -> None:
+    """Raise InputError unless the picture has a pixel."""
+    if width < 1 or height < 1:
+        raise InputError("View", f"{width}x{height} pixels", "at least 1x1", "Check the camera.")
 
 
 def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
@@ -119,11 +129,10 @@ class View:
     campos: Tensor
     background: Tensor
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise InputError(
-                "View", f"{self.width}x{self.height} pixels", "at least 1x1", "Check the camera."
-            )
+        _check_size(self.width, self.height)
         _check("View.viewmatrix", self.viewmatrix, 4, 4)
         _check("View.projmatrix", self.projmatrix, 4, 4)
         _check("View.campos", self.campos, 3)
@@ -168,6 +177,7 @@ class View:
         """
         import torch
 
+        _check_size(width, height)
         tan_x, tan_y = width / (2 * fx), height / (2 * fy)
         view = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
         view[:3, :3] = rotation.T
@@ -191,6 +201,60 @@ class View:
             projmatrix=view @ clip,
             campos=-rotation.T @ translation,
             background=view.new_zeros(3) if background is None else background,
+        )
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Sequence[float] | Tensor,
+        target: Sequence[float] | Tensor,
+        up: Sequence[float] | Tensor = (0.0, -1.0, 0.0),
+        *,
+        width: int = 960,
+        height: int = 720,
+        fov_y: float = 50.0,
+        background: Tensor | None = None,
+    ) -> View:
+        """A camera at a place that looks at another; on the CPU, float32.
+
+        Args:
+            eye: (3,) camera centre in the world.
+            target: (3,) what is in the middle of the picture.
+            up: (3,) what is up in the picture, of any length; COLMAP's worlds have y down.
+            width: pixels.
+            height: pixels.
+            fov_y: vertical field of view, degrees in (0, 180).
+            background: (3,) RGB; black when None.
+
+        Raises:
+            InputError: it looks nowhere, or straight up or down, or its field of view is none.
+        """
+        import torch
+
+        at, to, over = (torch.as_tensor(p, dtype=torch.float64).cpu() for p in (eye, target, up))
+        for name, point in (("eye", at), ("target", to), ("up", over)):
+            _check(f"View.look_at {name}", point, 3)
+        forward = torch.nn.functional.normalize(to - at, dim=0)
+        right = torch.linalg.cross(forward, over)
+        straight = float(right.norm()) > 1e-6 * float(over.norm())  # False for NaN, too
+        if not straight or not 0 < fov_y < 180:
+            raise InputError(
+                "View.look_at",
+                f"eye {at.tolist()}, target {to.tolist()}, up {over.tolist()}, fov_y {fov_y:g}",
+                "a target apart from the eye, up not along the way there, and fov_y in (0, 180)",
+                "Move one of them.",
+            )
+        right = torch.nn.functional.normalize(right, dim=0)
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        focal = height / (2 * math.tan(math.radians(fov_y) / 2))
+        return cls.pinhole(
+            rotation.float(),
+            (-rotation @ at).float(),
+            width=width,
+            height=height,
+            fx=focal,
+            fy=focal,
+            background=background,
         )
 
 
@@ -219,6 +283,8 @@ class Splats:
     colors: Tensor | None = None
     sh_degree: int = 0
     features: Tensor | None = None
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         _check("Splats.means", self.means, None, 3)
@@ -289,6 +355,8 @@ class SpacetimeSplats:
     sh: Tensor | None = None
     sh_degree: int = 0
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
         _check("SpacetimeSplats.means", self.means, None, 3)
         n = len(self.means)
@@ -352,6 +420,8 @@ class Moment:
     prefilter_var: float = -1.0
     scale_modifier: float = 1.0
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
         _check("Moment.campos", self.campos, 3)
         checks = (
@@ -387,6 +457,8 @@ class Sliced:
     present: Tensor
     colors: Tensor | None = None
 
+    __repr__ = one_line
+
 
 @dataclass(frozen=True)
 class Footprints:
@@ -412,6 +484,8 @@ class Footprints:
     colors: Tensor
     tiles: Tensor
     features: Tensor | None = None
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         _check("Footprints.means2d", self.means2d, None, 2)
@@ -473,6 +547,8 @@ class RasterInputs:
     scores: bool = False
     alpha_max: float = ALPHA_MAX
     cap_gradient: bool = True
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         _check("RasterInputs.means2d_hook", self.means2d_hook, len(self.splats), None)
@@ -552,3 +628,5 @@ class RasterOutputs:
     weights_per_gaussian: Tensor | None = None
     wins_per_gaussian: Tensor | None = None
     winners: Tensor | None = None
+
+    __repr__ = one_line

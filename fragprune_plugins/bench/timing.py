@@ -13,6 +13,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.clock import synchronize, timed
+from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 
 Pass = Literal["forward", "forward_backward"]
@@ -35,6 +36,8 @@ class Case:
     splats: Splats
     kind: Pass
     thresholds: Tensor | None = None
+
+    __repr__ = one_line
 
     @property
     def device(self) -> torch.device:

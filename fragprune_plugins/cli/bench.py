@@ -135,9 +135,9 @@ def _scenes(
 
     if model is not None and cameras is not None:
         from fragprune_plugins.datasets.cameras import load_cameras
-        from fragprune_plugins.storage.models import load_model
+        from fragprune_plugins.storage import models
 
-        splat, store = load_model(model, device=device)
+        splat, store = models.load(model, device=device)
         view = load_cameras(cameras)[0][1].to(device)
         return [
             (model.stem, splat.splats(), replace(view, width=w, height=h), store)

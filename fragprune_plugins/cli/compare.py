@@ -21,7 +21,7 @@ from fragprune_plugins.cli.common import (
     views_option,
 )
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage import models
 
 if TYPE_CHECKING:
     from fragprune_plugins.datasets.photographs import Photographs
@@ -85,7 +85,7 @@ def command(
     columns = {}
     for label, path in (("A", a), ("B", b)):
         how = known.get(path, {"filtered": False, "drawing": {}})
-        model = load_model(
+        model = models.load(
             path, truncation=not no_truncation, filtered=how["filtered"], device=where
         )
         columns[label] = Candidate(*model, how["drawing"])

@@ -16,7 +16,7 @@ from fragprune_plugins.cli.common import (
     require_place,
 )
 from fragprune_plugins.errors import SidecarError
-from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage import models
 
 
 @click.command("export", cls=Command)
@@ -44,7 +44,7 @@ def command(model: Path, out: Path, drop: bool) -> Report:
     from fragprune_plugins.storage.ply import THRESHOLD_COLUMN, write_ply
 
     require_place(out, model)
-    splat, store = load_model(model)
+    splat, store = models.load(model)
     if store is None:
         raise SidecarError(
             str(sidecar.path_beside(model)),

@@ -23,7 +23,7 @@ from fragprune_plugins.cli.common import (
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.learning.interruption import EXIT_CODE, sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage import models
 
 if TYPE_CHECKING:
     from fragprune_plugins.finetuning import FinetuneResult
@@ -89,7 +89,7 @@ def command(
 
     rasterizer, where = open_engine(engine, device, threads)
     truncation = settings.truncate and not no_truncation
-    splat, store = load_model(model, truncation=truncation, device=where)
+    splat, store = models.load(model, truncation=truncation, device=where)
     dataset = load_dataset(data, resolution=resolution, white_background=white_background)
     start = Candidate(splat, deepcopy(store))  # the store itself learns
 

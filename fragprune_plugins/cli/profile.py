@@ -18,7 +18,7 @@ from fragprune_plugins.cli.common import (
     truncation_option,
     views_option,
 )
-from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage import models
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -67,7 +67,7 @@ def command(
     rasterizer, where = open_engine(engine, device, threads)
     if out is not None:
         writable_folder(out)
-    splat, store = load_model(model, truncation=not no_truncation, device=where)
+    splat, store = models.load(model, truncation=not no_truncation, device=where)
     shots = load_shots(
         data, views, resolution=resolution, white_background=white_background, device=where
     )

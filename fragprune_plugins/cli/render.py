@@ -18,7 +18,7 @@ from fragprune_plugins.cli.common import (
     views_option,
 )
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage import models
 
 
 @click.command("render", cls=Command)
@@ -68,7 +68,7 @@ def command(
 
     rasterizer, where = open_engine(engine, device, threads)
     writable_folder(out)
-    splat, store = load_model(model, truncation=not no_truncation, device=where)
+    splat, store = models.load(model, truncation=not no_truncation, device=where)
     if data is not None:
         shots = load_shots(data, views, resolution=resolution, white_background=white_background)
         named = [(shot.name, shot.view) for shot in shots]

@@ -20,7 +20,7 @@ from fragprune_plugins.cli.common import (
     engine_options,
     open_engine,
 )
-from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage import models
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -200,7 +200,7 @@ def _draw(
     learning: list[tuple[str, str]] = []
     try:
         (one, before_store), (other, store) = (
-            load_model(Path(path), filtered=drawn["filtered"], device=device)
+            models.load(Path(path), filtered=drawn["filtered"], device=device)
             for path in drawn["models"]
         )
         before = Candidate(one, before_store, drawn["drawing"])

@@ -166,12 +166,12 @@ def _measure(
     from fragprune_plugins.datasets.dataset import load_photographs
     from fragprune_plugins.datasets.photographs import Photographs
     from fragprune_plugins.measure import Candidate, measure
-    from fragprune_plugins.storage.models import load_model
+    from fragprune_plugins.storage import models
 
     rasterizer, where = open_engine(engine, "cpu" if device == "cpu" else "auto", None)
     dataset = load_photographs(Photographs.from_dict(photographs))
-    models = [load_model(Path(path), filtered=True, device=where) for path in photographs["models"]]
-    candidates = [Candidate(*model, photographs["drawing"]) for model in models]
+    both = [models.load(Path(path), filtered=True, device=where) for path in photographs["models"]]
+    candidates = [Candidate(*model, photographs["drawing"]) for model in both]
     return measure(candidates, dataset.test, engine=rasterizer)
 
 

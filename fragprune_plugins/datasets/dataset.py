@@ -16,6 +16,7 @@ from fragprune_plugins.datasets.images import image_size, unreadable
 from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import View
 
 _ASPECT_TOLERANCE = 0.01
@@ -35,6 +36,8 @@ class Shot:
     name: str
     view: View
     path: Path
+
+    __repr__ = one_line
 
     @property
     def image(self) -> Tensor:
@@ -74,6 +77,8 @@ class Dataset:
 
     train: Sequence[Shot]
     test: Sequence[Shot]
+
+    __repr__ = one_line
 
     @property
     def extent(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import View
 
 
@@ -33,6 +34,8 @@ class Camera:
     fy: float
     cx: float
     cy: float
+
+    __repr__ = one_line
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with another number of pixels."""

@@ -160,10 +160,10 @@ def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> SplatF
     from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.finetuning.loop import finetune
     from fragprune_plugins.learning.schedule import Settings
-    from fragprune_plugins.storage.models import load_model
+    from fragprune_plugins.storage import models
 
     assert summary.model_before is not None  # the host saves at its last iteration
-    model, _ = load_model(summary.model_before, device=settings.device)
+    model, _ = models.load(summary.model_before, device=settings.device)
     learning = Settings(iterations=settings.finetune, truncate=False, seed=settings.seed)
     data = load_dataset(scene)
     return finetune(model, data, learning, engine=settings.engine, progress=True).model
@@ -174,13 +174,13 @@ def _measure(
 ) -> dict[str, Any]:
     from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.measure import Candidate, measure
-    from fragprune_plugins.storage.models import load_model
+    from fragprune_plugins.storage import models
 
     assert summary.model_before is not None
     assert summary.model_after is not None
     candidates = [
         *(
-            Candidate(*load_model(path, device=settings.device))
+            Candidate(*models.load(path, device=settings.device))
             for path in (summary.model_before, summary.model_after)
         ),
         Candidate(control, None),

@@ -38,11 +38,11 @@ def write_page(
     from fragprune_plugins.measure import Candidate, report_page
     from fragprune_plugins.measure.wording import describe, outcome
     from fragprune_plugins.plugins.hooks import engine_for
-    from fragprune_plugins.storage.models import load_model
+    from fragprune_plugins.storage import models
 
     pictures = out / "pictures"
-    models = (Path(report["model_before"]), Path(report["model_after"]))
-    (one, _), (other, store) = (load_model(path, device=device) for path in models)
+    paths = (Path(report["model_before"]), Path(report["model_after"]))
+    (one, _), (other, store) = (models.load(path, device=device) for path in paths)
     before, after = Candidate(one), Candidate(other, store)
     test, rasterizer = load_dataset(scene).test, engine_for(engine, device)
     views = report_page.draw_views(pictures, before, after, test, rasterizer)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import random
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,9 +22,10 @@ from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Progress, Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.atomic import replacing, writable_folder
-from fragprune_plugins.storage.ply import SplatFile, write_ply
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.storage import models
+from fragprune_plugins.storage.models import Model
+from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions
@@ -62,6 +61,8 @@ class FinetuneResult:
     engine: str
     interrupted: bool
     terminated: bool
+
+    __repr__ = one_line
 
     @property
     def thresholds(self) -> Tensor | None:
@@ -157,17 +158,8 @@ def save(path: Path, result: FinetuneResult) -> Path:
     Raises:
         OutputError: the place cannot be written; existing files stay as they were.
     """
-    path = Path(path)
-    folder = writable_folder(path.parent)
-    target = sidecar.path_beside(path)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".fragprune-") as scratch:
-        model = Path(scratch) / path.name
-        write_ply(model, result.model, marked=not result.store.neutral)
-        beside = sidecar.save(model, result.store, settings=result.settings.as_dict())
-        with replacing(target) as new_sidecar, replacing(path) as new_model:
-            os.replace(beside, new_sidecar)
-            os.replace(model, new_model)
-    return target
+    model = Model(result.model, result.store)
+    return models.save(path, model, settings=result.settings.as_dict())
 
 
 class _Run:

@@ -13,6 +13,8 @@ from functools import cached_property
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
+from fragprune_plugins.reprs import one_line
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -167,6 +169,8 @@ class RowTrace:
 
     origins: Tensor | None = None
     fresh: Tensor | None = None
+
+    __repr__ = one_line
 
 
 def revised(

@@ -29,6 +29,7 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
 from fragprune_plugins.plugins.loading import Plugins
+from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.types import RasterInputs
 
@@ -57,6 +58,8 @@ class ModelState:
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
     lent: list[list[tuple[dict[str, Any], float]]] = field(default_factory=list)  # the host's rates
+
+    __repr__ = one_line
 
 
 class SessionState:

@@ -79,7 +79,10 @@ class StepPlan:
     """What one step does.
 
     Attributes:
-        learn: thresholds are learned and applied.
+        learn: thresholds move, and drawn fragments press on the loss. When False they stay as they
+            are and truncate as they are; before the first step that learns they are neutral, and
+            nothing is truncated. What else trains goes on, at the rates below. Without truncation
+            at all, ``Settings.truncate``, it makes no difference.
         threshold_lr: learning rate of their logits.
         opacity_lr: learning rate the opacity group gets, None to leave the host's.
         progress: share of the learning that is over, 0 to 1.

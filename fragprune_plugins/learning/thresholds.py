@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import ALPHA_MIN, LOGIT_MAX, LOGIT_MIN, NEUTRAL_LOGIT
-from fragprune_plugins.errors import AlignmentError, SidecarError
+from fragprune_plugins.errors import AlignmentError, InputError, SidecarError
+from fragprune_plugins.reprs import short
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99
@@ -42,6 +43,55 @@ class ThresholdStore:
 
     def __len__(self) -> int:
         return len(self.logits)
+
+    def __repr__(self) -> str:
+        return f"ThresholdStore(logits={short(self.logits)}, steps={self.steps})"
+
+    @classmethod
+    def from_falloff(cls, thresholds: Tensor, lr: float = 0.05) -> ThresholdStore:
+        """A store that holds given thresholds, on their device.
+
+        Args:
+            thresholds: (N,) falloff in (0, 1): fragments with exp(-q / 2) below it are not drawn, q
+                being the squared Mahalanobis distance.
+            lr: initial learning rate on the logits.
+
+        Raises:
+            InputError: they are not (N,) floating-point numbers in (0, 1).
+        """
+        inside = thresholds.ndim == 1 and thresholds.is_floating_point()
+        if not inside or not bool(((thresholds > 0) & (thresholds < 1)).all()):
+            raise InputError(
+                "thresholds",
+                short(thresholds) + (", some outside (0, 1)" if inside else ""),
+                "(N,) falloff in (0, 1)",
+                "Correct them; ThresholdStore.from_alpha takes a limit of alpha.",
+            )
+        store = cls(len(thresholds), thresholds.device, lr)
+        store.place(torch.logit(thresholds.detach()))
+        return store
+
+    @classmethod
+    def from_alpha(cls, alpha: float, opacities: Tensor, lr: float = 0.05) -> ThresholdStore:
+        """A store that draws no fragment whose alpha is below a limit, one for all Gaussians.
+
+        In falloff a Gaussian's threshold is the limit over its opacity. Of a Gaussian that is not
+        as opaque as the limit no more than its very centre is left.
+
+        Args:
+            alpha: in (0, 1); nothing changes up to the hosts' own 1/255.
+            opacities: (N,) or (N, 1), activated.
+            lr: initial learning rate on the logits.
+
+        Raises:
+            InputError: the limit is not in (0, 1).
+        """
+        if not 0 < alpha < 1:
+            raise InputError("alpha", f"{alpha:g}", "in (0, 1)", "Choose one, such as 4 / 255.")
+        opacities = opacities.detach().reshape(-1)
+        store = cls(len(opacities), opacities.device, lr)
+        store.place(torch.logit((alpha / opacities).clamp_max(1.0)))
+        return store
 
     @property
     def values(self) -> Tensor:

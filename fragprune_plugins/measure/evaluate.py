@@ -17,6 +17,7 @@ from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.measure.metrics import psnr, ssim
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
+from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 
@@ -37,6 +38,8 @@ class Candidate:
     model: SplatFile
     thresholds: Tensor | ThresholdStore | None = None
     drawing: Mapping[str, Any] = field(default_factory=dict)
+
+    __repr__ = one_line
 
     def inputs(self, view: View, splats: Splats) -> RasterInputs:
         """One view of the activated model."""

@@ -13,6 +13,7 @@ from fragprune_plugins.storage.atomic import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from PIL.Image import Image
 
 
 COLOURS = "inferno"
@@ -25,10 +26,15 @@ def save_image(path: Path, image: Tensor) -> None:
     Raises:
         OutputError: the place cannot be written; so for every function here.
     """
+    with replacing(path) as temporary:
+        picture(image).save(temporary, format="PNG")
+
+
+def picture(image: Tensor) -> Image:
+    """An image (3, H, W), clamped to [0, 1], with 8 bits a channel."""
     from PIL import Image
 
-    with replacing(path) as temporary:
-        Image.fromarray(_bytes(image)).save(temporary, format="PNG")
+    return Image.fromarray(_bytes(image))
 
 
 def save_heatmap(path: Path, fragments: Tensor, limit: float) -> None:

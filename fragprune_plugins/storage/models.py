@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     import torch
@@ -12,35 +14,93 @@ if TYPE_CHECKING:
     from fragprune_plugins.storage.ply import SplatFile
 
 
-def load_model(
-    path: Path,
+class Model(NamedTuple):
+    """A trained splat and how far each of its Gaussians reaches.
+
+    Attributes:
+        splat: the N Gaussians, as their file holds them.
+        thresholds: one for each; None where nothing is truncated.
+    """
+
+    splat: SplatFile
+    thresholds: ThresholdStore | None = None
+
+
+def load(
+    path: str | Path,
     *,
     truncation: bool = True,
     filtered: bool = False,
     device: torch.device | str = "cpu",
-) -> tuple[SplatFile, ThresholdStore | None]:
-    """A model and its thresholds: the sidecar's, else the file's own column, else None.
+) -> Model:
+    """Read a model and its thresholds: the sidecar's, else the file's own column, else None.
 
     Args:
-        path: of the model.
+        path: of the PLY.
         truncation: False leaves the thresholds out.
-        filtered: as in ``read_ply``.
+        filtered: accept a Mip-Splatting model that has its 3D filter; the caller draws it by
+            Mip-Splatting's rules.
         device: where both are to live.
 
     Raises:
         ModelFileError: the model cannot be read.
         SidecarError: the sidecar beside it is lost, broken, another model's, or has other rows.
     """
-    import torch
-
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.storage import sidecar
     from fragprune_plugins.storage.ply import read_ply
 
-    model = read_ply(path, filtered=filtered).to(device)
-    store = ThresholdStore(len(model), device)
+    path = Path(path)
+    splat = read_ply(path, filtered=filtered).to(device)
+    store = ThresholdStore(len(splat), device)
     if truncation and sidecar.lies_beside(path):
-        store, _ = sidecar.load(path, len(model), device)
-    elif truncation and model.thresholds is not None:
-        store.place(torch.logit(model.thresholds))
-    return model, None if store.neutral else store
+        store, _ = sidecar.load(path, len(splat), device)
+    elif truncation and splat.thresholds is not None:
+        store = ThresholdStore.from_falloff(splat.thresholds)
+    return Model(splat, None if store.neutral else store)
+
+
+def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = None) -> Path:
+    """Write a model and its sidecar, both complete or neither, as ``fragprune finetune`` does.
+
+    Args:
+        path: of the PLY; the sidecar goes beside it, into ``NAME.fragprune.safetensors``.
+        model: what to write.
+        settings: recorded in the sidecar, such as ``Settings.as_dict`` gives.
+
+    Returns:
+        The sidecar's path.
+
+    Raises:
+        OutputError: the place cannot be written, or is not named as a PLY is; existing files stay
+            as they were.
+        AlignmentError: splat and thresholds differ in length.
+        DivergedError: what was learned is not finite.
+    """
+    from fragprune_plugins.errors import AlignmentError, OutputError
+    from fragprune_plugins.learning.thresholds import ThresholdStore
+    from fragprune_plugins.storage import sidecar
+    from fragprune_plugins.storage.atomic import replacing, writable_folder
+    from fragprune_plugins.storage.ply import write_ply
+
+    path, (splat, store) = Path(path), model
+    store = ThresholdStore(len(splat)) if store is None else store
+    if path.suffix.lower() != ".ply":
+        raise OutputError(str(path), "not the name of a PLY", "a name in .ply", "Rename it.")
+    if len(store) != len(splat):
+        raise AlignmentError(
+            str(path),
+            f"a store of {len(store)} thresholds",
+            f"{len(splat)}, one per Gaussian",
+            "Pass the store of this very model.",
+        )
+    folder = writable_folder(path.parent)
+    target = sidecar.path_beside(path)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".fragprune-") as scratch:
+        whole = Path(scratch) / path.name
+        write_ply(whole, splat, marked=not store.neutral)
+        beside = sidecar.save(whole, store, settings=settings)
+        with replacing(target) as new_sidecar, replacing(path) as new_model:
+            os.replace(beside, new_sidecar)
+            os.replace(whole, new_model)
+    return target

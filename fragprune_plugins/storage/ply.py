@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import InputError, ModelFileError
+from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage.atomic import replacing
 from fragprune_plugins.types import Splats
 
@@ -61,6 +62,8 @@ class SplatFile:
     rotation: Tensor
     thresholds: Tensor | None = None
     filter_3d: Tensor | None = None
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         n = len(self.xyz)

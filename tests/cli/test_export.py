@@ -9,8 +9,7 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.models import load_model
+from fragprune_plugins.storage import models, sidecar
 from fragprune_plugins.storage.ply import read_ply, write_ply
 
 
@@ -61,7 +60,7 @@ def test_over_a_pair_leaves_no_stale_sidecar(tmp_path):
     sidecar.save(path, store)
     assert run("export", path, "--out", out).exit_code == 0
     assert torch.equal(read_ply(out).thresholds, store.values)
-    assert load_model(out)[1] is not None  # a neutral sidecar would have hidden the column
+    assert models.load(out)[1] is not None  # a neutral sidecar would have hidden the column
 
 
 def test_nothing_to_export(tmp_path):

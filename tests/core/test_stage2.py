@@ -92,13 +92,15 @@ def test_a_view_drawn_without_gradients_feels_no_pressure_and_is_no_first_visit(
     assert it.progress().fragments_before is None
 
 
-def test_a_step_that_does_not_learn_leaves_no_gradient_for_the_next():
+def test_a_step_that_does_not_learn_truncates_and_leaves_no_gradient_for_the_next():
     it = stage(settings=Settings(iterations=10, pressure=1e-2))
     it.schedule = Turns(it.settings)
     step(it, "a")
     before = it.store.logits.detach().clone()
     it.begin(lambda: OPACITIES)
-    assert not it.thresholds(None).requires_grad
+    held = it.thresholds(None)
+    assert torch.equal(held, torch.sigmoid(before))
+    assert not held.requires_grad
     it.end()
     assert torch.equal(it.store.logits.detach(), before)
     assert it.store.logits.grad is None

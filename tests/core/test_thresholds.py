@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from fragprune_plugins.errors import AlignmentError, SidecarError
+from fragprune_plugins.errors import AlignmentError, InputError, SidecarError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 
@@ -325,3 +325,39 @@ def test_values_of_a_state_from_elsewhere_stay_inside_too():
     store.load_state_dict(state)
     values = store.values.detach()
     assert ((values > 0) & (values < 1)).all()
+
+
+def test_a_store_holds_the_thresholds_it_was_given():
+    given = torch.tensor([1e-6, 0.01, 0.5, 0.999])
+    store = ThresholdStore.from_falloff(given, lr=0.1)
+    assert torch.allclose(store.values, given, rtol=1e-5)
+    assert store.optimizer.param_groups[0]["lr"] == 0.1
+    store.values.sum().backward()
+    store.step()
+    assert (store.values < given).all()  # it learns on from there
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        torch.tensor([0.5, 0.0]),
+        torch.tensor([0.5, 1.0]),
+        torch.tensor([0.5, math.nan]),
+        torch.tensor([[0.5]]),
+        torch.tensor([1, 2]),
+    ],
+)
+def test_thresholds_that_are_none_are_refused(given):
+    with pytest.raises(InputError, match="falloff in"):
+        ThresholdStore.from_falloff(given)
+
+
+def test_a_limit_of_alpha_is_the_same_alpha_at_every_rim():
+    opacities = torch.tensor([[0.05], [0.5], [1.0]])
+    store = ThresholdStore.from_alpha(0.04, opacities)
+    assert torch.allclose(store.values * opacities[:, 0], torch.tensor(0.04))
+    faint = ThresholdStore.from_alpha(0.1, torch.tensor([0.0, 0.05, 0.1])).values
+    assert ((faint > 0.999) & (faint < 1)).all()
+    for none in (0.0, 1.0, math.nan):
+        with pytest.raises(InputError):
+            ThresholdStore.from_alpha(none, opacities)

@@ -1,0 +1,71 @@
+"""What holds tensors is shown on one line, without their numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import pkgutil
+from importlib import import_module
+
+import pytest
+import torch
+from finetune import tiny
+
+import fragprune_plugins as fp
+from fragprune_plugins.reprs import one_line, short
+
+EXCLUDED = (".demo.host", ".testing", "__main__")
+
+
+def holding_tensors():
+    """Every dataclass of ours, but for private ones, one of whose fields is a tensor."""
+    for found in pkgutil.walk_packages(fp.__path__, "fragprune_plugins."):
+        if any(part in found.name for part in EXCLUDED) or ".native._" in found.name:
+            continue
+        for kind in vars(import_module(found.name)).values():
+            own = dataclasses.is_dataclass(kind) and kind.__module__ == found.name
+            if own and not kind.__name__.startswith("_"):
+                types = (str(each.type) for each in dataclasses.fields(kind))
+                if any("Tensor" in name for name in types):
+                    yield kind
+
+
+@pytest.mark.parametrize("kind", sorted(set(holding_tensors()), key=lambda kind: kind.__name__))
+def test_a_dataclass_with_tensors_is_shown_short(kind):
+    assert kind.__repr__ is one_line
+
+
+@pytest.fixture(scope="module")
+def values():
+    splat = tiny.random_model(count=500)
+    inputs = fp.RasterInputs(tiny.cameras()[0].view(), splat.splats())
+    outputs = fp.rasterize(inputs.with_counts())
+    store = fp.ThresholdStore(500)
+    model = fp.Model(splat, store)
+    return [inputs.view, inputs.splats, inputs, outputs, splat, store, model]
+
+
+def test_one_line_without_numbers_of_tensors(values):
+    for value in values:
+        text = repr(value)
+        assert text.startswith(type(value).__name__ + "(")
+        assert "\n" not in text
+        assert "tensor(" not in text
+        assert len(text) < 800
+
+
+def test_shapes_types_and_counts_are_shown(values):
+    view, splats, *_, splat, store, model = values
+    assert repr(store) == "ThresholdStore(logits=float32[500], steps=0)"
+    assert repr(splat) == (
+        "SplatFile(xyz=float32[500, 3], f_dc=float32[500, 1, 3], f_rest=float32[500, 3, 3], "
+        "opacity=float32[500, 1], scaling=float32[500, 3], rotation=float32[500, 4])"
+    )
+    assert repr(model) == f"Model(splat={splat!r}, thresholds={store!r})"
+    assert repr(view).startswith("View(width=32, height=32, tan_fov_x=0.44")
+    assert "sh_degree=1" in repr(splats)
+    assert "cov3d" not in repr(splats)  # what is not given is not shown
+
+
+def test_another_device_is_named():
+    assert short(torch.zeros(3, device="meta")) == "float32[3] on meta"
+    assert short([1, 2]) == "[2 items]"
