@@ -243,6 +243,14 @@ views_option = click.option(
 )
 
 
+def bound_threads(threads: int | None) -> None:
+    """Let torch, and the engines with it, take so many CPU threads; None leaves them all."""
+    if threads is not None:
+        import torch
+
+        torch.set_num_threads(threads)
+
+
 def open_engine(engine: str, device: str, threads: int | None) -> tuple[Engine, torch.device]:
     """The engine that was asked for, and the device to put models and views on.
 
@@ -252,13 +260,10 @@ def open_engine(engine: str, device: str, threads: int | None) -> tuple[Engine, 
         UsageError: there is no such device.
         EngineError: there is no such engine.
     """
-    import torch
-
     from fragprune_plugins.engines import device_for
     from fragprune_plugins.plugins.hooks import engine_for
 
-    if threads is not None:
-        torch.set_num_threads(threads)
+    bound_threads(threads)
     where = device_for(device, engine)
     return engine_for(engine, where), where
 

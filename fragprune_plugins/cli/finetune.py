@@ -108,7 +108,7 @@ def command(
         save(out, result)
         dropped = dropping(out, whole, len(splat), len(smaller))
     rows = [asdict(point) for point in result.curves]
-    if curves is not None and result.thresholds is not None:
+    if curves is not None and rows:
         from fragprune_plugins.measure.report_page import save_learning
 
         save_learning(curves, rows, result.thresholds)
@@ -144,12 +144,6 @@ def command(
         f"{result.engine} engine, {done.steps} iterations{pressure} in "
         f"{result.train_seconds:.0f} s.",
     ]
-    if done.target_reached is False:
-        lines.append(
-            f"The target of {settings.target_speedup:g}x was missed: "
-            f"{done.speedup or 1:.2f}x fewer fragments on the training views. "
-            "More --iters or another target may help."
-        )
     if result.interrupted:
         lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations.")
     if dropped:

@@ -32,6 +32,11 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"
 
+_ONLY_CONTROLS = (
+    "Only controls lie here: no run or fine-tuning that truncates. "
+    "Run the same command without --control, then report again."
+)
+
 _SLIDERS = """Views that were held out. Drag the sliders: left of the handle before, right of it
 after; beside it the photograph; below, the fragments that each pixel draws."""
 
@@ -68,6 +73,7 @@ def command(
     results = [record for record in records if record.command in ("run", "finetune")]
     pruned = [record for record in results if record.data.get("settings", {}).get("truncate")]
     main = [*records, *results, *pruned][-1]
+    control = main.data.get("settings", {}).get("truncate") is False
     others = [record for record in records if record is not main]
     files = [record.path for record in records]
     line = _sentence(main, files)
@@ -82,6 +88,7 @@ def command(
             quote=line,
             text=[
                 report_page.preformatted(_table(main)),
+                *([report_page.paragraph(_ONLY_CONTROLS)] if control else []),
                 report_page.paragraph(missing or (_SLIDERS if views else "")),
                 *(block for record in others for block in _block(record, files)),
             ],
@@ -97,12 +104,14 @@ def command(
         "page": str(target),
         "result": line,
         "command": main.command,
+        "control": control,
         "record": str(main.path),
         "views": views,
         "pictures": len(views) * 4 + len(more),
     }
     report |= {key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")}
-    return Report(report, "\n".join([line, *([missing] if missing else []), f"Wrote {target}."]))
+    notes = [_ONLY_CONTROLS if control else "", missing]
+    return Report(report, "\n".join([line, *filter(None, notes), f"Wrote {target}."]))
 
 
 def _columns(record: Record) -> dict[str, dict[str, Any]]:
@@ -133,7 +142,7 @@ def _number(value: float | None) -> str:
 
 def _sentence(record: Record, among: Sequence[Path]) -> str:
     """The outcome in a line one can quote; ``among`` are files that may record its control."""
-    from fragprune_plugins.measure.wording import fewer, gain, outcome
+    from fragprune_plugins.measure.wording import IS_CONTROL, fewer, gain, missed, outcome
     from fragprune_plugins.storage.records import control_of
 
     data, columns = record.data, list(_columns(record).values())
@@ -150,7 +159,10 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     before, after = seen["fragments_per_pixel_before"], seen["fragments_per_pixel_after"]
     if not before or not after:
         return f"{of}nothing was learned."
-    return f"{of}{fewer(before, after)} on training views; frame times were not measured."
+    said = f"{of}{fewer(before, after)} on training views; frame times were not measured"
+    if data.get("settings", {}).get("truncate") is False:
+        return said + IS_CONTROL
+    return f"{said}.{missed(data)}"
 
 
 def _block(record: Record, among: Sequence[Path]) -> list[str]:
@@ -205,9 +217,10 @@ def _draw(
         )
         before = Candidate(one, before_store, drawn["drawing"])
         after = Candidate(other, store, drawn["drawing"])
-        if curves and store is not None:
+        if curves:
             rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
-            report_page.save_learning(folder / report_page.LEARNING, rows, store.values)
+            values = None if store is None else store.values
+            report_page.save_learning(folder / report_page.LEARNING, rows, values)
             learning = [("How it learned", report_page.LEARNING)]
         scene = Photographs.from_dict(drawn)
         dataset = load_photographs(replace(scene, folder=data or scene.folder))

@@ -14,9 +14,11 @@ from fragprune_plugins.cli.common import (
     JSON,
     Command,
     Report,
+    bound_threads,
     device_option,
     engine_option,
     open_engine,
+    threads_option,
 )
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import FragpruneError, UsageError
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
 @learning_options
 @engine_option("What rasterizes where thresholds apply or the host's own rasterizer is missing")
 @device_option("Where the host runs; cpu runs a CUDA-only host without a GPU.")
+@threads_option
 @click.option(
     "--evaluate/--no-evaluate",
     default=True,
@@ -68,6 +71,7 @@ def command(
     settings: Settings,
     engine: str,
     device: str,
+    threads: int | None,
     evaluate: bool,
 ) -> Report:
     """Train with a host's own command, then learn truncation thresholds.
@@ -90,6 +94,7 @@ def command(
     from fragprune_plugins.injection.launch import RunOptions, run
     from fragprune_plugins.injection.process import current_gpu
 
+    bound_threads(threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     options = RunOptions(
         adapter=adapter,
@@ -178,7 +183,7 @@ def _measure(
 def _describe(
     summary: RunSummary, data: dict[str, Any], not_compared: FragpruneError | None
 ) -> str:
-    from fragprune_plugins.measure.wording import describe, fewer, outcome
+    from fragprune_plugins.measure.wording import describe, fewer, missed, outcome
 
     if not summary.iterations:
         return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
@@ -189,18 +194,15 @@ def _describe(
     else:
         if summary.fragments_before and summary.fragments_after:
             change = fewer(summary.fragments_before, summary.fragments_after)
-            lines.append(f"{change} on training views; frame times were not measured.")
+            lines.append(
+                f"{change} on training views; frame times were not measured.{missed(data)}"
+            )
         if not_compared:
             why = f"{not_compared.where}: {not_compared.found}. {not_compared.remedy}"
             lines.append(f"Not compared on held-out views because of {why}")
         elif summary.photographs:
             models = f"{summary.model_before} {summary.model_after}"
             lines.append(f"Compare: fragprune compare {models}")
-    if summary.target_reached is False:
-        lines.append(
-            f"The target of {summary.settings['target_speedup']:g}x fewer fragments was missed by "
-            "more than 5 % on the training views. More --iters or another target may help."
-        )
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "

@@ -64,21 +64,24 @@ def draw_views(
     return views
 
 
-def save_learning(path: Path, curves: Sequence[dict[str, float]], thresholds: Tensor) -> None:
+def save_learning(
+    path: Path, curves: Sequence[dict[str, float]], thresholds: Tensor | None
+) -> None:
     """Draw loss, fragments and median threshold over the steps, and all thresholds at the end.
 
     Args:
         path: the PNG.
         curves: a dict per step, as a run's summary has them.
-        thresholds: (N,) learned, falloff.
+        thresholds: (N,) learned, falloff; None, of a control, leaves out what shows them.
     """
     import numpy as np
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 3.2), layout="constrained")
+    shown = 2 if thresholds is None else 4
+    figure = Figure(figsize=(3.75 * shown, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
-    loss, fragments, median, spread = figure.subplots(1, 4)
+    loss, fragments, *others = figure.subplots(1, shown)
     steps = np.array([row["step"] for row in curves])
     window = max(1, min(50, len(steps) // 4))
     for axes, key, color, label in (
@@ -90,12 +93,14 @@ def save_learning(path: Path, curves: Sequence[dict[str, float]], thresholds: Te
         axes.plot(steps, values, color=color, alpha=0.25, linewidth=0.8)
         axes.plot(steps[window // 2 :][: len(mean)], mean, color=color)
         axes.set(xlabel="step", ylabel=label, ylim=(0, None))
-    median.plot(steps, [row["threshold_median"] for row in curves], color="tab:green")
-    median.set(xlabel="step", ylabel="median threshold (falloff)", ylim=(0, None))
-    final = thresholds.detach().cpu().numpy()
-    spread.hist(np.maximum(final, 1e-4), bins=np.geomspace(1e-4, 1, 60), color="tab:blue")
-    spread.set(xscale="log", xlabel="threshold (falloff)", ylabel="Gaussians")
-    for axes in (loss, fragments, median, spread):
+    if thresholds is not None:
+        median, spread = others
+        median.plot(steps, [row["threshold_median"] for row in curves], color="tab:green")
+        median.set(xlabel="step", ylabel="median threshold (falloff)", ylim=(0, None))
+        final = thresholds.detach().cpu().numpy()
+        spread.hist(np.maximum(final, 1e-4), bins=np.geomspace(1e-4, 1, 60), color="tab:blue")
+        spread.set(xscale="log", xlabel="threshold (falloff)", ylabel="Gaussians")
+    for axes in (loss, fragments, *others):
         axes.grid(alpha=0.25)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)

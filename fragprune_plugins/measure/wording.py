@@ -10,11 +10,17 @@ _EQUAL = 0.005  # a ratio of fragments that reads 1.00
 CLAIMED = 2
 """Standard errors that frame times must differ by to be called different."""
 
+FELL = 0.5
+"""A loss of PSNR, in dB, that is warned of."""
+
 _CONTROL = {
     "run": "--stage finetune --control to the same command",
     "finetune": "--control to the same command, with another --out in the same folder",
 }
 """What runs a control where it is found afterwards."""
+
+IS_CONTROL = ": a control, nothing is truncated."
+"""Ends the sentence on one."""
 
 _ROWS = (
     ("PSNR, dB", "psnr", 2),
@@ -73,18 +79,41 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
     before, after = data["before"], data["after"]
     gained = f"{gain(before, after)} that were held out"
     if not data["settings"]["truncate"]:
-        return f"{gained}: a control, nothing is truncated."
-    if control is None:
-        return (
+        said = f"{gained}{IS_CONTROL}"
+    elif control is None:
+        said = (
             f"{gained}. More training alone may be a part of the dB: no control was run; "
             f"to see, add {_CONTROL[command]}."
         )
+    else:
+        said = (
+            f"{gained}. The control, as many iterations without truncation, has "
+            f"{control['fragments_per_pixel']:.1f} fragments per pixel and "
+            f"{control['psnr'] - before['psnr']:+.2f} dB: pruning itself makes "
+            f"{after['psnr'] - control['psnr']:+.2f} dB."
+        )
+    return said + missed(data) + _fell(before, after, control)
+
+
+def missed(data: dict[str, Any]) -> str:
+    """That a fine-tuning missed its target, a sentence with a space before it; else nothing."""
+    if data.get("target_reached") is not False:
+        return ""
+    speedup = data.get("speedup")
+    got = f": {speedup:.2f}x there" if speedup else ""
     return (
-        f"{gained}. The control, as many iterations without truncation, has "
-        f"{control['fragments_per_pixel']:.1f} fragments per pixel and "
-        f"{control['psnr'] - before['psnr']:+.2f} dB: pruning itself makes "
-        f"{after['psnr'] - control['psnr']:+.2f} dB."
+        f" The target of {data['settings']['target_speedup']:g}x fewer fragments was missed by "
+        f"more than 5 % on the training views{got}; more --iters or another target may help."
     )
+
+
+def _fell(before: dict[str, Any], after: dict[str, Any], control: dict[str, Any] | None) -> str:
+    """A warning where much PSNR was lost; else nothing."""
+    loss = (control or before)["psnr"] - after["psnr"]
+    if loss <= FELL:
+        return ""
+    against = "the control" if control else "the model before"
+    return f" Warning: PSNR fell by {loss:.2f} dB against {against}."
 
 
 def fewer(before: float, after: float) -> str:

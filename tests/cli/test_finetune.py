@@ -15,6 +15,7 @@ import pytest
 import torch
 from cli.commands import run, run_json
 from finetune import tiny
+from PIL import Image
 
 from fragprune_plugins.finetuning import loop
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
@@ -121,6 +122,18 @@ def test_target_control_and_curves(scene, tmp_path):
     report = run_json(*arguments, "--control")
     assert report["speedup"] == pytest.approx(1, abs=0.02)  # opacities alone move
     assert sidecar.load(out)[0].neutral
+
+
+def test_curves_of_a_control_are_drawn_without_thresholds(scene, tmp_path):
+    data, path, _ = scene
+    out, curves = tmp_path / "out.ply", tmp_path / "curves.png"
+    words = ("--data", data, "--out", out, "--iters", 5, "--curves", curves)
+    run_json("finetune", path, *words)
+    with Image.open(curves) as both:
+        whole = both.size
+    run_json("finetune", path, *words, "--control")
+    with Image.open(curves) as half:
+        assert half.size == (whole[0] // 2, whole[1])
 
 
 def test_goes_on_from_thresholds_beside_the_model(scene, tmp_path):

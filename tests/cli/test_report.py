@@ -98,6 +98,30 @@ def test_a_run_that_was_not_measured_reports_its_training_views(tmp_path):
     )
 
 
+def test_a_folder_of_controls_alone_is_named_as_one(folder, tmp_path):
+    out, data, _ = folder
+    zero = tmp_path / "zero"
+    words = ("--out", zero / "zero.ply", "--data", data, "--iters", 2, "--control")
+    run_json("finetune", out / "pruned.ply", *words)
+    text = run("report", zero).stdout
+    assert ": a control, nothing is truncated." in text.splitlines()[0]
+    assert "Only controls lie here" in text
+    assert "Only controls lie here" in (zero / "report.html").read_text()
+    report = run_json("report", zero)
+    assert report["control"] is True
+    assert report["pictures"] == 4 * len(report["views"]) + 1  # what it learned, too
+    assert run_json("report", out)["control"] is False
+
+
+def test_a_control_that_was_not_measured_is_named_as_one(tmp_path):
+    seen = {"fragments_per_pixel_before": 30.0, "fragments_per_pixel_after": 29.0}
+    data = {"adapter": "my-host", "iterations": 5, "training_views": seen, "photographs": None}
+    settings = {"settings": {"truncate": False}}
+    records.leave(tmp_path / "point_cloud.ply", "run", data | settings)
+    line = run_json("report", tmp_path)["result"]
+    assert line.endswith("frame times were not measured: a control, nothing is truncated.")
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"format": "another"}'])
 def test_a_record_that_is_none_is_refused(tmp_path, text):
     (tmp_path / "a.fragprune.json").write_text(text)

@@ -8,13 +8,16 @@ import subprocess
 import sys
 
 import pytest
+import torch
 from cli.commands import run, run_json
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 from PIL import Image
 
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import launch
 from fragprune_plugins.testing import mutations
 
 WORDS = ["--device", "cpu", "--iters", 6]
@@ -63,6 +66,21 @@ def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_pa
     (line,) = (line for line in result.stdout.splitlines() if "x fewer fragments" in line)
     assert " ms (" in line
     assert "no control was run; to see, add --stage finetune --control" in line
+
+
+def test_the_host_and_the_engine_take_as_many_threads_as_they_are_given(
+    scene, tmp_path, monkeypatch
+):
+    threads = []
+
+    def launched(*_):
+        threads.append(torch.get_num_threads())
+        raise UsageError("host", "a stand-in", "no more than its threads", "Nothing.")
+
+    monkeypatch.setattr(launch, "run", launched)
+    for words in ([], ["--threads", 3]):
+        assert run("run", *words, *command(scene, tmp_path / "out")).exit_code == 2
+    assert threads == [1, 3]
 
 
 def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):

@@ -65,6 +65,34 @@ def test_the_difference_to_the_control_is_quoted():
     assert "no control" not in line
 
 
+TARGET = {"settings": {"truncate": True, "target_speedup": 8.0}, "target_reached": False}
+
+
+@pytest.mark.parametrize("control", [None, CONTROL])
+def test_a_missed_target_is_a_part_of_the_result(control):
+    for more, got in (({"speedup": 3.104}, ": 3.10x there; "), ({}, "views; ")):
+        line = outcome("finetune", data() | TARGET | more, control)
+        assert "The target of 8x fewer fragments was missed by more than 5 %" in line
+        assert got in line
+    assert "target" not in outcome("finetune", data() | TARGET | {"target_reached": True}, control)
+
+
+@pytest.mark.parametrize(
+    ("after", "control", "warning"),
+    [
+        (22.45, None, "Warning: PSNR fell by 7.64 dB against the model before."),
+        (29.60, None, ""),
+        (29.60, 30.29, "Warning: PSNR fell by 0.69 dB against the control."),
+        (29.60, 29.20, ""),
+    ],
+)
+def test_a_picture_that_is_worse_by_half_a_decibel_is_warned_of(after, control, warning):
+    figures = data() | {"after": measured(5.0, 1.0, after)}
+    line = outcome("finetune", figures, control and measured(39.0, 2.3, control))
+    assert line.endswith(warning)
+    assert ("Warning" in line) == bool(warning)
+
+
 def test_a_control_says_that_it_is_one():
     line = outcome("finetune", data(truncate=False), None)
     assert "a control, nothing is truncated" in line
