@@ -79,31 +79,31 @@ class HostFailed(FragpruneError):  # noqa: N818 - the host's failure, reported
 
 
 class SeamError(FragpruneError):
-    """A host lacks a function we wrap, or has it with other parameters."""
+    """A host lacks a function that we wrap, or the function has other parameters."""
 
     code = "seam"
 
 
 class LateImportError(FragpruneError):
-    """The host imported what we must wrap before we were activated."""
+    """The host imported a function that we must wrap before we were activated."""
 
     code = "late-import"
 
 
 class SessionError(FragpruneError):
-    """Activation out of order: twice at once, or none active."""
+    """Activation out of order: a second session while one is active, or no active session."""
 
     code = "session"
 
 
 class EngineError(FragpruneError):
-    """No engine can do what was asked here."""
+    """No engine on this machine can do the task."""
 
     code = "engine"
 
 
 class KernelError(EngineError):
-    """Kernels that cannot be compiled for, or loaded into, a GPU."""
+    """Kernels cannot be compiled for a GPU, or loaded into it."""
 
     code = "kernel"
 
@@ -121,19 +121,19 @@ class PluginError(FragpruneError):
 
 
 class RecordError(FragpruneError):
-    """No figures to report, or a file of them that cannot be read."""
+    """There is no record to report, or a record cannot be read."""
 
     code = "record"
 
 
 class NotComparedError(FragpruneError):
-    """Before and after of a host's run cannot be measured on views that it held out."""
+    """A host's run cannot be measured on its held-out views."""
 
     code = "not-compared"
 
 
 class DivergedError(FragpruneError):
-    """NaN or infinity in what was learned; nothing of it is saved."""
+    """Learned values are NaN or infinite; none of them is saved."""
 
     code = "not-finite"
 
@@ -145,12 +145,12 @@ class UsageError(FragpruneError):
 
 
 class Interrupted(FragpruneError):  # noqa: N818 - a person's wish, not a fault
-    """Ctrl-C during stage 2, after what was learned has been saved; exit code 130."""
+    """Ctrl-C during stage 2; the learned values are saved first. Exit code 130."""
 
     code = "interrupted"
 
 
 class Terminated(Interrupted):
-    """SIGTERM during stage 2, after what was learned has been saved; exit code 143."""
+    """SIGTERM during stage 2; the learned values are saved first. Exit code 143."""
 
     code = "terminated"

@@ -1,4 +1,4 @@
-"""Engines: implementations of one contract, rasterization with a threshold per Gaussian."""
+"""Engines: implementations of one interface, rasterization with a threshold per Gaussian."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ENGINES = ("reference", "cpu", "cuda")
 
 
 class Engine(Protocol):
-    """What every engine does; inputs that require gradients get them."""
+    """The interface of an engine. Inputs that require gradients receive them."""
 
     name: str
 
@@ -34,28 +34,31 @@ class Engine(Protocol):
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
 
         Raises:
-            InputError: by ``inputs.check_thresholds``, thresholds that are not one per Gaussian.
+            InputError: there is not one threshold per Gaussian (``inputs.check_thresholds``).
         """
 
 
 @runtime_checkable
 class Slicer(Protocol):
-    """What our own engines do beside."""
+    """An engine that also cuts Gaussians in space and time, as all of ours do."""
 
     def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
-        """Cut Gaussians in space and time at a moment; inputs that require gradients get them."""
+        """Cut Gaussians in space and time at a moment.
+
+        Inputs that require gradients receive them.
+        """
 
 
 def device_for(wanted: str = "auto", engine: str = "auto") -> torch.device:
-    """The device that a command works on: the one rule behind ``--device``.
+    """Choose the device that a command works on: the only rule behind ``--device``.
 
     Args:
         wanted: "cpu", "cuda", "cuda:N", or "auto": the GPU where torch sees one and our cuda
             engine may be used on it, else the CPU.
-        engine: by name; ours named "cpu" and "cuda" draw on nothing else.
+        engine: its name. Our "cpu" engine draws on the CPU alone, our "cuda" engine on a GPU alone.
 
     Raises:
-        UsageError: no such device here, or one that the engine cannot draw on.
+        UsageError: the device does not exist, or the engine cannot draw on it.
     """
     import torch
 
@@ -87,13 +90,14 @@ def device_for(wanted: str = "auto", engine: str = "auto") -> torch.device:
 
 
 def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
-    """Our own engine by name; "auto" takes the fastest that runs on the device.
+    """Create one of our own engines by name; "auto" is the fastest that runs on the device.
 
-    On a GPU that is the cuda engine, once it has proved itself there (``engines.cuda.self_check``);
-    until then the reference engine draws small scenes, with a warning, and refuses large ones.
+    On a GPU that is the cuda engine, once it has passed the check there
+    (``engines.cuda.self_check``). Until then the reference engine draws small scenes, with a
+    warning, and refuses large ones.
 
     Raises:
-        EngineError: an unknown name, or an engine that cannot run here.
+        EngineError: the name is unknown, or the engine cannot run here.
     """
     if name == "auto":
         name, why_not = _fastest(str(device))
@@ -115,7 +119,7 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
 
 
 def _fastest(device: str) -> tuple[str, tuple[str, str] | None]:
-    """The engine's name; where it stands in for the cuda engine, why, and what to do."""
+    """The fastest engine's name. If it replaces the cuda engine, also the reason and a remedy."""
     if device.startswith("cuda"):
         why_not = _why_not_cuda(device)
         return ("reference" if why_not else "cuda"), why_not
@@ -125,7 +129,7 @@ def _fastest(device: str) -> tuple[str, tuple[str, str] | None]:
 
 
 def _why_not_cuda(device: str) -> tuple[str, str] | None:
-    """Why the cuda engine is not to be used on a GPU, and what to do; None when it is."""
+    """The reason not to use the cuda engine on a GPU and a remedy; None if it may be used."""
     from fragprune_plugins.engines.cuda import driver
 
     reason = driver.missing()
@@ -139,7 +143,7 @@ def _why_not_cuda(device: str) -> tuple[str, str] | None:
 
 @cache
 def _fallback(why: str, remedy: str) -> Engine:
-    """One for each reason, which is told once."""
+    """The reference engine for small scenes; cached, so that each reason is logged once."""
     from fragprune_plugins.engines.reference import Fallback
 
     return Fallback(why, remedy)
@@ -150,23 +154,23 @@ _slicer = cache(create_engine)
 
 
 def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = "auto") -> Sliced:
-    """The 3D Gaussians that Gaussians in space and time are at a moment. Differentiable.
+    """Cut Gaussians in space and time at a moment: 3D Gaussians remain. Differentiable.
 
-    Gradients are those of RT-4DGS, whose kernels differentiate by hand: without ``rotations_r`` the
-    marginal has none; colours are differentiated as seen where the moment has moved the means,
-    though shown as seen where they are stored; where time has a say in them, the second coefficient
-    gets the first one's gradient, and the times that of the highest cosine alone, with the opposite
-    sign.
+    Gradients are those of RT-4DGS, whose hand-written kernels differ from the true derivatives.
+    Without ``rotations_r`` the marginal has no gradient. Colours are evaluated with directions to
+    the stored means, but differentiated with directions to the moved means. If colours depend on
+    time, the second coefficient receives the first one's gradient, and the times receive only the
+    gradient of the highest cosine, with the opposite sign.
 
     Args:
         splats: the Gaussians.
         moment: when and from where.
-        engine: a name as ``create_engine`` takes it, or an engine; one that is not ours and cuts
-            nothing leaves it to the fastest of ours on the device.
+        engine: a name for ``create_engine``, or an engine. If it cannot cut Gaussians, the fastest
+            of our engines on the device does.
 
     Raises:
-        InputError: harmonics with fewer coefficients than the moment's cosines take.
-        EngineError: no such engine here.
+        InputError: there are fewer SH coefficients than the moment's cosines need.
+        EngineError: there is no such engine here.
     """
     if isinstance(engine, Slicer):
         return engine.slice(splats, moment)

@@ -1,4 +1,4 @@
-"""Tensors as compiled code takes them: contiguous, in one place, by their address."""
+"""Tensors in the form that compiled code reads: contiguous, on one device, by address."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 def plain(
     tensor: Tensor, where: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Tensor:
-    """The values, contiguous on a device, in four bytes each."""
+    """The tensor's values, contiguous on a device, as 4-byte numbers."""
     return tensor.detach().to(where, dtype).contiguous()
 
 
 def address(tensor: Tensor | None) -> int | None:
-    """Of its first number; None stands for no array, or for an empty one."""
+    """The address of a tensor's first number; None for no tensor or an empty one."""
     return None if tensor is None or tensor.numel() == 0 else tensor.data_ptr()

@@ -1,4 +1,4 @@
-"""One rasterization as compiled code takes it, on a CPU and on a GPU alike: arrays and a struct."""
+"""One rasterization in the form that compiled code reads: arrays and a struct."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _COMPENSATIONS: Final = get_args(Compensation)
 def native_arrays(
     inputs: RasterInputs, thresholds: Tensor | None, where: torch.device | str = "cpu"
 ) -> dict[str, Tensor]:
-    """The tensors that are read, by their names in fragprune_inputs, as ``plain`` gives them.
+    """The tensors that the engine reads, after ``plain``, by their names in fragprune_inputs.
 
     Args:
-        inputs: what is drawn; the values of ``means2d_hook`` are not used.
-        thresholds: (N,) or None, as ``inputs.check_thresholds`` lets pass.
-        where: the device that reads them.
+        inputs: the rasterization; the values of ``means2d_hook`` are not used.
+        thresholds: (N,) or None, already checked by ``inputs.check_thresholds``.
+        where: the device that will read the arrays.
     """
     given = vars(inputs.view) | vars(inputs.splats) | vars(inputs) | {"thresholds": thresholds}
     return {
@@ -46,14 +46,14 @@ def native_inputs(
     threads: int = 1,
     workspace: int | None = None,
 ) -> binding.Inputs:
-    """fragprune_inputs; it points into the arrays, which must outlive it.
+    """Fill the struct fragprune_inputs. It points into the arrays, which must outlive it.
 
     Args:
-        inputs: what is drawn; ``counts`` and ``scores`` say what comes back, not what goes in.
-        arrays: as ``native_arrays`` gives them.
+        inputs: the rasterization. ``counts`` and ``scores`` are ignored: they choose outputs.
+        arrays: the result of ``native_arrays``.
         widen: thresholds will want a gradient.
-        threads: of the cpu engine.
-        workspace: of the cpu engine.
+        threads: number of threads, for the cpu engine.
+        workspace: address of the workspace, for the cpu engine.
     """
     view, splats = inputs.view, inputs.splats
     return binding.Inputs(
@@ -81,12 +81,12 @@ def native_inputs(
 
 
 def native_lengths(arrays: dict[str, Tensor]) -> binding.Lengths:
-    """fragprune_lengths of arrays by name."""
+    """Fill the struct fragprune_lengths for arrays given by name."""
     return binding.Lengths(**{name: array.numel() for name, array in arrays.items()})
 
 
 def native_threads() -> int:
-    """As many as torch uses; the C side takes no more than the bound."""
+    """The number of threads that torch uses, at most the bound of the C interface."""
     return min(torch.get_num_threads(), THREADS_MAX)
 
 

@@ -1,4 +1,4 @@
-"""The oracle as an engine: slow, readable, on any device; what other engines are tested against."""
+"""The oracle as an engine: slow, readable, on any device. Other engines are tested against it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ log = logging.getLogger("fragprune")
 
 
 class ReferenceEngine:
-    """Plain torch with autograd; the only place where core types meet the oracle's."""
+    """Rasterizes with plain torch and autograd, by converting core types to the oracle's."""
 
     name = "reference"
 
@@ -70,11 +70,11 @@ FALLBACK_LIMIT: Final = 10**9
 
 
 class Fallback(ReferenceEngine):
-    """The oracle where the engine that is meant cannot run: for small scenes alone.
+    """The oracle in place of an engine that cannot run; for small scenes only.
 
     Args:
-        why: the engine that is meant cannot run.
-        remedy: the next thing to do.
+        why: the reason why the intended engine cannot run.
+        remedy: what the user can do about it.
     """
 
     def __init__(self, why: str, remedy: str) -> None:
@@ -85,7 +85,7 @@ class Fallback(ReferenceEngine):
         """Draw the splats; see ``ReferenceEngine``.
 
         Raises:
-            EngineError: there are too many for it.
+            EngineError: there are too many Gaussians for this slow engine.
         """
         n, width, height = len(inputs.splats), inputs.view.width, inputs.view.height
         if n * width * height > FALLBACK_LIMIT:
@@ -114,7 +114,7 @@ def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:
 
 
 def options_of(inputs: RasterInputs) -> Options:
-    """The oracle's dialect."""
+    """The oracle's options for these inputs."""
     return Options(
         scale_modifier=inputs.scale_modifier,
         dilation=inputs.dilation,
@@ -128,7 +128,7 @@ def options_of(inputs: RasterInputs) -> Options:
 
 
 def camera_of(inputs: RasterInputs) -> Camera:
-    """The oracle's camera."""
+    """The oracle's camera for these inputs."""
     view = inputs.view
     return Camera(
         width=view.width,

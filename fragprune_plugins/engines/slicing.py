@@ -1,7 +1,7 @@
-"""Gaussians in space and time, cut at a moment by compiled code: the seam to autograd.
+"""Cuts Gaussians in space and time at a moment with compiled code, under autograd.
 
-Cutting looks at one Gaussian at a time, so that the cpu engine and the cuda engine share all but
-the call itself, a ``Blade``. Nothing is kept between the passes but what was given.
+Each Gaussian is cut by itself. So the cpu engine and the cuda engine share everything but the call
+itself, a ``Blade``. Between the two passes only the inputs are kept.
 """
 
 from __future__ import annotations
@@ -48,33 +48,33 @@ _FELT_BY = {
 
 
 class Blade(Protocol):
-    """Where and by what Gaussians are cut."""
+    """The compiled functions that cut Gaussians, and the device they run on."""
 
     @property
     def where(self) -> torch.device:
-        """The device that tensors must be on."""
+        """The device on which the tensors must be."""
 
     def empty(self, *shape: int) -> Tensor:
-        """Memory for float32."""
+        """An uninitialised float32 tensor of this shape on the device."""
 
     def slice(self, given: binding.Spacetime, to: binding.Sliced) -> None:
-        """fragprune_slice."""
+        """Call fragprune_slice."""
 
     def unslice(
         self, given: binding.Spacetime, by: binding.Sliced, to: binding.SpacetimeGrads
     ) -> None:
-        """fragprune_unslice."""
+        """Call fragprune_unslice."""
 
 
 @dataclass
 class _Cut:
-    """One cut: what goes in beside the differentiable inputs.
+    """The inputs of one cut that are not differentiable.
 
     Attributes:
-        blade: of the engine.
-        splats: as the engine got them.
-        moment: likewise.
-        arrays: what the compiled side reads.
+        blade: the engine's compiled functions.
+        splats: the engine's input.
+        moment: the engine's input.
+        arrays: the tensors that compiled code reads.
     """
 
     blade: Blade
@@ -83,7 +83,7 @@ class _Cut:
     arrays: dict[str, Tensor]
 
     def given(self) -> binding.Spacetime:
-        """The C struct; it points into ``arrays``."""
+        """The C struct of the inputs; it points into ``arrays``."""
         moment, sh = self.moment, self.splats.sh
         return binding.Spacetime(
             threads=native_threads(),
@@ -101,7 +101,7 @@ class _Cut:
 
 
 class _Slice(torch.autograd.Function):
-    """The engines' seam to autograd."""
+    """The autograd function of a cut."""
 
     @staticmethod
     def forward(ctx: Any, cut: _Cut, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
@@ -147,10 +147,10 @@ class _Slice(torch.autograd.Function):
 
 
 def slice_by(blade: Blade, splats: SpacetimeSplats, moment: Moment) -> Sliced:
-    """Cut the Gaussians at the moment; differentiable in all that the splats hold.
+    """Cut the Gaussians at the moment; differentiable in every tensor of the splats.
 
     Raises:
-        InputError: harmonics with fewer coefficients than the moment's cosines take.
+        InputError: there are fewer SH coefficients than the moment's cosines need.
     """
     check_harmonics(splats, moment)
     tensors = {name: getattr(splats, name) for name in _NAMES}
@@ -171,7 +171,7 @@ def slice_by(blade: Blade, splats: SpacetimeSplats, moment: Moment) -> Sliced:
 
 
 def check_harmonics(splats: SpacetimeSplats, moment: Moment) -> None:
-    """Raise InputError unless there are coefficients and times for the cosines in use."""
+    """Raise InputError if coefficients or times for the cosines in use are missing."""
     orders = moment.sh_degree_t if splats.sh is not None and splats.sh_degree == 3 else 0
     if not orders:
         return

@@ -35,7 +35,7 @@ def engine_for(
         plugins: to ask; those of the process when None.
 
     Raises:
-        EngineError: an unknown name, or an engine that cannot run here.
+        EngineError: the name is unknown, or the engine cannot run here.
         PluginError: a plugin raised, or gave what is no engine.
     """
     device, plugins = torch.device(device), plugins or installed()
@@ -126,7 +126,7 @@ def rasterize(
 
     Raises:
         InputError: thresholds that do not match the Gaussians.
-        EngineError: no such engine here.
+        EngineError: there is no such engine here.
         PluginError: a plugin raised, or gave an answer that cannot be used.
     """
     thresholds = thresholds_for(inputs, thresholds)

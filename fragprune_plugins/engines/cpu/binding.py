@@ -32,7 +32,7 @@ class Error(ctypes.Structure):
 
 
 class _Named(ctypes.Structure):
-    """A struct built by the names of its fields; those not given are zero."""
+    """A struct built from keyword arguments; fields that are not given are zero."""
 
     def __init__(self, **fields: Any) -> None:
         unknown = fields.keys() - {name for name, *_ in self._fields_}
@@ -42,7 +42,7 @@ class _Named(ctypes.Structure):
 
 
 class _Sized(_Named):
-    """One that begins with its own size."""
+    """A struct whose first field is its own size."""
 
     def __init__(self, **fields: Any) -> None:
         super().__init__(size=ctypes.sizeof(type(self)), **fields)
@@ -175,8 +175,8 @@ class Library:
     Attributes:
         build: baseline, avx2 or avx512.
         path: the shared library's file.
-        lanes: pixels that it handles with one instruction.
-        calls: its functions, by ctypes.
+        lanes: pixels that one instruction handles.
+        calls: its C functions, as ctypes objects.
     """
 
     build: str
@@ -190,7 +190,7 @@ class Unavailable(Exception):  # noqa: N818 - a state of this machine, reported 
 
 
 def _path_of(build: str) -> str:
-    """The build's file, found without importing it: it is no Python module."""
+    """The path of a build's file. The file is not a Python module and is not imported."""
     spec = importlib.util.find_spec(f"fragprune_plugins.native._cpu_{build}")
     if spec is None or spec.origin is None:
         raise Unavailable(f"the {build} build is not installed (was there a C++17 compiler?)")
@@ -198,10 +198,10 @@ def _path_of(build: str) -> str:
 
 
 def open_build(build: str) -> Library:
-    """Open one build and check that it speaks our version.
+    """Open one build and check the version of its interface.
 
     Raises:
-        Unavailable: it is absent, broken, or of another version.
+        Unavailable: the build is absent, broken, or of another version.
     """
     path = _path_of(build)
     try:
@@ -249,7 +249,7 @@ def open_build(build: str) -> Library:
 
 
 def cpu_features() -> int:
-    """Bits of fragprune_cpu_features of this machine; 0 when no build can tell."""
+    """This machine's bits of fragprune_cpu_features; 0 if no build can be asked."""
     try:
         return int(open_build("baseline").calls.fragprune_cpu_features())
     except Unavailable:
@@ -271,10 +271,10 @@ def usable_builds() -> list[str]:
 
 
 def choose() -> Library:
-    """Open the best build, or the one that the environment names.
+    """Open the best build, or the build that the environment variable names.
 
     Raises:
-        Unavailable: switched off, or no build can be used.
+        Unavailable: the engine is switched off, or no build can be used.
     """
     wanted = os.environ.get(ENVIRONMENT, "").strip().lower()
     if wanted in ("off", "0"):
@@ -302,7 +302,7 @@ _answers: dict[str, Library | str] = {}
 
 
 def _answer() -> Library | str:
-    """The library, or why there is none; decided once for each value of the environment."""
+    """The library, or the reason why there is none; cached for each value of the environment."""
     key = os.environ.get(ENVIRONMENT, "")
     with _lock:
         if key not in _answers:
@@ -314,7 +314,7 @@ def _answer() -> Library | str:
 
 
 def forget() -> None:
-    """Decide anew at the next call; for tests and after a repair of the installation."""
+    """Forget the choice of a build, so that the next call chooses again; for tests."""
     with _lock:
         _answers.clear()
 
@@ -328,7 +328,7 @@ def library() -> Library:
     """The opened build.
 
     Raises:
-        EngineError: there is none; the message says why.
+        EngineError: there is none; the message gives the reason.
     """
     from fragprune_plugins.errors import EngineError
 
@@ -344,7 +344,7 @@ def library() -> Library:
 
 
 def describe() -> dict[str, Any]:
-    """For ``fragprune doctor``: the build in use or the reason why there is none."""
+    """What ``fragprune doctor`` prints: the build in use, or the reason why there is none."""
     answer = _answer()
     if isinstance(answer, Library):
         return {
@@ -366,7 +366,7 @@ def describe() -> dict[str, Any]:
 
 
 class State:
-    """Owns a fragprune_state: what backward needs, freed with the last reference.
+    """Owns a fragprune_state, the data that backward needs; frees it with the last reference.
 
     Attributes:
         handle: the C pointer; None until forward has filled it.
@@ -383,10 +383,10 @@ class State:
 
 
 class Workspace:
-    """Owns a fragprune_workspace: memory that one call hands on to the next; for any threads.
+    """Owns a fragprune_workspace: memory that calls reuse. Any thread may use it.
 
     Attributes:
-        handle: the C pointer, or None where there was no memory for it.
+        handle: the C pointer; None if memory was short.
     """
 
     def __init__(self, opened: Library) -> None:
@@ -394,10 +394,10 @@ class Workspace:
         self.handle: int | None = opened.calls.fragprune_workspace_new()
 
     def take(self, size: int) -> ctypes.Array[ctypes.c_char]:
-        """A buffer of `size` bytes; its memory comes back when the last reference goes.
+        """A buffer of `size` bytes; its memory returns to the workspace with the last reference.
 
         Raises:
-            MemoryError: there is none.
+            MemoryError: there is not enough memory.
         """
         address = self._calls.fragprune_workspace_take(self.handle, size) if self.handle else None
         if address is None:

@@ -48,9 +48,9 @@ _STAGES = ("projection", "binning", "blend")
 
 
 def _empty(workspace: binding.Workspace, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """As torch.empty, for four bytes a number; large ones in memory that the engine used before.
+    """Like torch.empty for 4-byte numbers, but large tensors reuse memory of the engine.
 
-    Fresh memory costs more than filling it: the system clears it page by page.
+    Fresh memory is slow: the system clears it page by page, which takes longer than filling it.
     """
     size = 4 * math.prod(shape)
     if size < _SMALL:
@@ -69,17 +69,17 @@ def _stop(status: int, error: binding.Error) -> NoReturn:
 
 @dataclass
 class _Drawing:
-    """One forward pass: what goes in beside the differentiable inputs, and what stays behind.
+    """One forward pass: its non-differentiable inputs, and the data that it leaves for backward.
 
     Attributes:
-        inputs: as the engine got them.
-        library: the build that draws.
-        workspace: the engine's.
-        arrays: what the C side reads, kept alive as long as its state.
-        state: what backward needs; None when nothing wants gradients.
-        evaluated: lanes spent.
+        inputs: the engine's input.
+        library: the build in use.
+        workspace: the engine's reusable memory.
+        arrays: the tensors that C code reads; they live as long as its state.
+        state: the data that backward needs; None if no gradients are needed.
+        evaluated: (Gaussian, pixel) lanes that were computed.
         stages: milliseconds by stage.
-        found: what counts and scores ask for, by the names of ``RasterOutputs``.
+        found: the requested counts and scores, by their names in ``RasterOutputs``.
     """
 
     inputs: RasterInputs
@@ -92,7 +92,7 @@ class _Drawing:
     found: dict[str, Tensor] = field(default_factory=dict)
 
     def draw(self, wants: dict[str, bool]) -> tuple[Tensor, ...]:
-        """Run the forward pass; image, invdepth, alpha, features, radii, fragments per pixel."""
+        """Run the forward pass: image, invdepth, alpha, features, radii, fragments per pixel."""
         view, n = self.inputs.view, len(self.inputs.splats)
         size = (view.height, view.width)
         empty = partial(_empty, self.workspace)
@@ -143,7 +143,7 @@ class _Drawing:
         return image, invdepth, alpha, features, radii, drawn
 
     def undraw(self, upstream: tuple[Tensor | None, ...], wants: dict[str, bool]) -> dict[str, Any]:
-        """Run the backward pass; gradients by name, float32 on the CPU."""
+        """Run the backward pass; returns gradients by name, float32 on the CPU."""
         assert self.state is not None
         by = [None if g is None else plain(g) for g in upstream]
         image, invdepth, alpha, features, per_pixel = by
@@ -172,7 +172,7 @@ class _Drawing:
 
 
 class _Rasterize(torch.autograd.Function):
-    """The engine's seam to autograd."""
+    """The autograd function of a rasterization."""
 
     @staticmethod
     def forward(ctx: Any, drawing: _Drawing, *tensors: Tensor | None) -> tuple[Tensor, ...]:
@@ -205,7 +205,7 @@ class _Rasterize(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class _Blade:
-    """Cuts with the compiled library; see ``engines.slicing``."""
+    """Cuts Gaussians with the compiled library; see ``engines.slicing``."""
 
     library: binding.Library
     workspace: binding.Workspace
@@ -230,10 +230,10 @@ class _Blade:
 
 
 class CpuEngine:
-    """Rasterizes with the compiled library: any number of threads, the same result to the bit.
+    """Rasterizes with the compiled library; results are the same, to the bit, for any threads.
 
     Args:
-        library: the build to use; the best for this machine when None.
+        library: the build to use; None for the best one on this machine.
     """
 
     name = "cpu"

@@ -1,7 +1,7 @@
-"""The cuda engine against what needs no GPU: frames of a size at which blocks of threads meet.
+"""Compares the cuda engine with engines that need no GPU, on frames of many thread blocks.
 
-Large frames are held against the cpu engine's, small ones and slices against the oracle's, sorting
-against torch's. Frames are repeated, and must stay the same and hold no memory.
+Large frames are compared with the cpu engine's, small frames and slices with the oracle's, and
+sorted keys with torch's. Repeated frames must be the same and must not accumulate memory.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class Workload:
 
     Attributes:
         keys: to sort.
-        gaussians: of the large frame; tiles' lists are longer than a block's 256 threads.
+        gaussians: of the large frame; some tiles' lists are longer than a block's 256 threads.
         size: of the large frame, pixels.
         wide_gaussians: of the wide frame.
-        wide_size: of the wide frame, pixels; more tiles than two passes of sorting tell apart.
+        wide_size: of the wide frame, pixels; so many tiles that sorting needs three passes.
         steps: how often the large frame is drawn and differentiated.
     """
 
@@ -56,13 +56,13 @@ class Workload:
 
 
 def compare(gpu: Device, where: torch.device, workload: Workload | None = None) -> list[str]:
-    """What the cuda engine does otherwise than it should; nothing when all is well.
+    """Describe every difference of the cuda engine; empty if all is well.
 
-    Without the cpu engine, large frames are compared with themselves alone.
+    Without the cpu engine, large frames are only compared with their repetitions.
 
     Args:
-        gpu: what runs the kernels.
-        where: the device that tensors are to live on.
+        gpu: runs the kernels.
+        where: the device of the tensors.
         workload: how much to draw.
     """
     workload = Workload() if workload is None else workload
@@ -76,7 +76,7 @@ def compare(gpu: Device, where: torch.device, workload: Workload | None = None) 
 
 
 def _sorting(gpu: Device, where: torch.device, count: int) -> Iterator[str]:
-    """Of keys that are nearly all different, and of keys of few kinds: equal ones keep order."""
+    """Sort keys that are nearly all different, and keys with few values: equal keys keep order."""
     for bits in (31, 9):
         generator = torch.Generator().manual_seed(bits)
         keys = torch.randint((1 << bits) - 1, (count,), generator=generator, dtype=torch.int32)
@@ -157,7 +157,7 @@ def _wide_frame(gpu: Device, where: torch.device, workload: Workload) -> Iterato
 
 
 def bytes_held(where: torch.device) -> int:
-    """By tensors on a GPU."""
+    """Bytes that tensors hold on a GPU."""
     return torch.cuda.memory_allocated(where)
 
 
@@ -165,11 +165,11 @@ def bytes_held(where: torch.device) -> int:
 
 
 def differences(what: str, found: dict[str, Tensor], expected: dict[str, Tensor]) -> Iterator[str]:
-    """Names all that is off in what was ``drawn_and_learned``.
+    """Name every difference between two results of ``drawn_and_learned``.
 
-    A fragment that lies on a cut may fall to one engine and not to the other: rarely, anywhere, and
-    by any amount. So a few pixels may be off, and a few rows; but not many of those that one warp
-    draws, or that one block of threads differentiates.
+    One engine may draw a fragment on a cut that the other does not. This is rare, can happen
+    anywhere, and can change a pixel by any amount. So a few pixels and rows may differ, but not
+    many in one warp's sub-tile or among the rows of one thread block.
     """
     for name, right in expected.items():
         away = (found[name] - right).abs()
@@ -194,10 +194,10 @@ def differences(what: str, found: dict[str, Tensor], expected: dict[str, Tensor]
 
 
 def scene(count: int, size: tuple[int, int], extent: float) -> tuple[RasterInputs, Tensor]:
-    """Gaussians all over a picture, and thresholds (N,); the same each time, float32 on the CPU.
+    """Gaussians all over a picture, and thresholds (N,); always the same, float32 on the CPU.
 
-    Of each thousand, one at least is a giant, half as wide as the picture: all threads of a warp
-    write its tiles, in several rounds where the picture has more than 32 rows of them. Some lie off
+    At least one of each thousand is a giant, half as wide as the picture: all threads of a warp
+    write its tiles, in several rounds if the picture has more than 32 rows of tiles. Some lie off
     the picture or behind the camera.
 
     Args:
@@ -258,7 +258,7 @@ def on(
 def drawn_and_learned(
     engine: Engine, inputs: RasterInputs, thresholds: Tensor
 ) -> dict[str, Tensor]:
-    """The picture (3, H, W), and gradients of all that training moves, by name; on the CPU."""
+    """The picture (3, H, W), and gradients of every trained tensor by name; on the CPU."""
     given = {name: getattr(inputs.splats, name) for name in _LEARNED}
     given |= {"thresholds": thresholds, "background": inputs.view.background}
     given["hook"] = given["means"].new_zeros(len(thresholds), 3)

@@ -1,7 +1,7 @@
 """Runs kernels on a GPU: the only place that calls CUDA's driver.
 
-Streams and contexts are torch's: kernels go to torch's current stream of the tensors' device, which
-need not be torch's current device, and does not become it.
+Streams and contexts are torch's. A kernel goes to torch's current stream on the tensors' device.
+torch's current device may be another one, and does not change.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ THREADS: Final = 256
 
 
 def missing() -> str | None:
-    """Why kernels cannot be compiled and run here; None when they can."""
+    """The reason why kernels cannot be compiled and run here; None if they can."""
     try:
         kernels.compiler()
     except kernels.Unavailable as why:
@@ -32,7 +32,7 @@ def missing() -> str | None:
 
 
 def remedy() -> str:
-    """What to do when something is missing."""
+    """What the user can do if ``missing`` gives a reason."""
     cuda = torch.version.cuda
     if cuda is None:
         return "Install torch for CUDA."
@@ -43,7 +43,7 @@ def remedy() -> str:
 
 
 def version() -> str:
-    """The driver's: the newest CUDA that it knows, and on Linux its own."""
+    """The newest CUDA version that the driver supports, and on Linux the driver's version."""
     from cuda.bindings import driver
 
     _, newest = driver.cuDriverGetVersion()
@@ -54,7 +54,7 @@ def version() -> str:
 
 
 class Driver:
-    """Compiles, loads and launches; keeps what it loaded, for each device.
+    """Compiles, loads and launches kernels; keeps the loaded kernels for each device.
 
     Raises:
         EngineError: there is no compiler or no GPU.
@@ -91,8 +91,8 @@ class Driver:
         """Run a kernel on the current stream of a device; see ``engines.frames.Device``.
 
         Raises:
-            KernelError: it does not compile or load.
-            EngineError: it does not start, or one before it failed.
+            KernelError: the kernel does not compile or load.
+            EngineError: the kernel does not start, or an earlier kernel failed.
         """
         index = torch.cuda.current_device() if where.index is None else where.index
         self._call("cuCtxPushCurrent", self._context(index))
@@ -114,7 +114,7 @@ class Driver:
             return bool(torch.cuda.is_current_stream_capturing())
 
     def _context(self, index: int) -> Any:
-        """Torch's own, which this thread may never have met."""
+        """Make torch's context current in this thread, which may not have used it before."""
         with self._lock:
             if index not in self._contexts:
                 torch.cuda.init()  # type: ignore[no-untyped-call]
@@ -138,7 +138,7 @@ class Driver:
         return function
 
     def _load(self, index: int, source: str, macros: dict[str, int]) -> Any:
-        """Machine code for this GPU, or PTX where its driver wants none of that."""
+        """Load machine code for this GPU, or PTX if its driver refuses the machine code."""
         major, minor = torch.cuda.get_device_capability(index)
         capability = 10 * major + minor
         compiler = kernels.compiler()
@@ -164,7 +164,7 @@ class Driver:
         )
 
     def _call(self, function: str, *arguments: Any) -> Any:
-        """One call of the driver: its only result, if it has one."""
+        """Call a function of the driver; returns its only result, if any."""
         status, *results = getattr(self._driver, function)(*arguments)
         if int(status) != 0:
             raise EngineError(
@@ -177,7 +177,7 @@ class Driver:
 
 
 def describe() -> dict[str, Any]:
-    """For ``fragprune doctor``: which way kernels take to this machine's GPU, or why none."""
+    """What ``fragprune doctor`` prints: how kernels reach the GPU, or why they cannot."""
     try:
         found = kernels.compiler()
     except kernels.Unavailable:

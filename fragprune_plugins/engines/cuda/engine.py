@@ -37,7 +37,7 @@ _FIRST_CAPACITY = 1 << 20
 
 
 class _Rasterize(torch.autograd.Function):
-    """The engine's seam to autograd."""
+    """The autograd function of a rasterization."""
 
     @staticmethod
     def forward(
@@ -69,15 +69,16 @@ class _Rasterize(torch.autograd.Function):
 
 
 class CudaEngine:
-    """Rasterizes on a GPU, by kernels that are compiled when they are first used.
+    """Rasterizes on a GPU with kernels that are compiled at first use.
 
     Args:
-        device: runs the kernels; the GPU that the tensors live on when None.
-        deterministic: gradients are the same to the bit in each run, for more time and memory;
-            what torch.use_deterministic_algorithms says when None. Images always are.
-        packed: where no gradients are wanted, keep projected Gaussians in 32 bytes instead of 48:
-            colours and inverse depths as half precision, opacities and cutoffs with 16 bits. A
-            pixel is off by up to 2^-11 of the largest colour, and by a fragment that lies on a cut.
+        device: runs the kernels; None for the GPU of the tensors.
+        deterministic: make gradients the same to the bit in each run, at the cost of time and
+            memory; None follows torch.use_deterministic_algorithms. Images are always the same.
+        packed: if no gradients are needed, store projected Gaussians in 32 bytes instead of 48,
+            with colours and inverse depths in half precision, opacities and cutoffs in 16 bits. A
+            pixel changes by up to 2^-11 of the largest colour, and by a fragment that lies on a
+            cut.
 
     Raises:
         EngineError: kernels cannot be compiled or run here; the message says why.
@@ -105,7 +106,7 @@ class CudaEngine:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
 
         Raises:
-            InputError: the Gaussians are not on a GPU, or thresholds are not one for each.
+            InputError: the Gaussians are not on a GPU, or there is not one threshold for each.
         """
         inputs.check_thresholds(thresholds)
         self._on_device(inputs.splats)
@@ -142,10 +143,10 @@ class CudaEngine:
         return where
 
     def draw(self, drawing: Drawing, wanted: Wanted) -> Drawn:
-        """The forward pass, again with more room when the lists did not fit.
+        """Run the forward pass; repeat it with more room if the lists did not fit.
 
-        Captured into a graph, a note of what its replays are short of goes with it. The graph owns
-        the frame's memory: of one that is replaced, nothing remains here.
+        A frame captured into a graph also records how much room its replays lack. The graph owns
+        the frame's memory, so nothing of a replaced graph remains here.
         """
         deterministic = self._deterministic
         if deterministic is None:
@@ -174,11 +175,11 @@ class CudaEngine:
         return drawn
 
     def check(self) -> None:
-        """Look at the frames captured into graphs, after a replay; waits for the GPU.
+        """Check the frames captured into graphs, after a replay; waits for the GPU.
 
         Raises:
-            EngineError: since the last look a replay was short of room for its lists, or its sample
-                offsets were too large: its picture is void.
+            EngineError: since the last check a replay lacked room for its lists, or its sample
+                offsets were too large. Its picture is invalid.
         """
         for worst in self._shortages.values():
             entries, spread = worst.tolist()

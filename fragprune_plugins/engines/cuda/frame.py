@@ -1,7 +1,7 @@
-"""What is launched on a GPU for one rasterization, in which order and in whose memory.
+"""The kernels of one rasterization on a GPU: their order, arguments and memory.
 
-All memory is torch's and all work goes to torch's current stream. Nothing here knows the driver: a
-``Device`` runs a kernel by name, a GPU (``native.driver``) or, in tests, an emulation of one.
+All memory is torch's, and all work goes to torch's current stream. This module does not use the
+driver. A ``Device`` runs a kernel by name: a GPU (``cuda.driver``) or, in tests, an emulation.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _fields(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
 
 
 class Frame(ctypes.Structure):
-    """fp::Frame: what the kernels of a forward pass are handed."""
+    """fp::Frame: the argument of a forward pass's kernels."""
 
     _fields_ = (
         ("inputs", binding.Inputs),
@@ -84,7 +84,7 @@ class Sort(ctypes.Structure):
 
 
 class Undraw(ctypes.Structure):
-    """fp::Undraw: what the kernels of a backward pass are handed."""
+    """fp::Undraw: the argument of a backward pass's kernels."""
 
     _fields_ = (
         ("frame", Frame),
@@ -96,7 +96,7 @@ class Undraw(ctypes.Structure):
 
 
 class Slicing(ctypes.Structure):
-    """fp::Slicing: what the kernels are handed that cut Gaussians at a moment, and back."""
+    """fp::Slicing: the argument of the kernels that cut Gaussians at a moment, both ways."""
 
     _fields_ = (
         ("given", binding.Spacetime),
@@ -117,7 +117,7 @@ MACROS: Final = {
 def blend_macros(
     features: int = 0, *, counts: bool = False, scores: bool = False, packed: bool = False
 ) -> dict[str, int]:
-    """What native/cuda/blend.cu is compiled with."""
+    """The macros with which native/cuda/blend.cu is compiled."""
     return {
         "FP_FEATURES": features,
         "FP_COUNTS": int(counts),
@@ -135,15 +135,15 @@ def unblend_macros(
     offsets: bool = False,
     features: int = 0,
 ) -> dict[str, int]:
-    """What native/cuda/unblend.cu is compiled with.
+    """The macros with which native/cuda/unblend.cu is compiled.
 
     Args:
-        wanted: inputs that gradients are wanted of.
-        sh_turns: colours depend on where the mean is seen from.
-        invdepth: a gradient of inverse depth came.
-        absolute: the hook's third column is filled.
-        offsets: pixels are sampled off their places.
-        features: channels of which a gradient came.
+        wanted: names of the inputs that need gradients.
+        sh_turns: whether colours depend on the viewing direction.
+        invdepth: whether there is a gradient by inverse depth.
+        absolute: whether to fill the hook's third column.
+        offsets: whether pixels have sample offsets.
+        features: the number of channels that have a gradient.
     """
     colour = bool(wanted & {"colors", "sh"}) or ("means" in wanted and sh_turns)
     return {
@@ -174,7 +174,7 @@ VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
 
 
 class Device(Protocol):
-    """Whatever runs kernels.
+    """Runs kernels by name: a GPU, or an emulation in tests.
 
     Attributes:
         kind: torch's name for the type of device that the tensors live on.
@@ -239,7 +239,7 @@ def launch(
     blocks: int,
     arguments: ctypes.Structure,
 ) -> None:
-    """Run a kernel, if there is work for it."""
+    """Run a kernel unless it has no work."""
     if blocks:
         device.launch(where, source, {**MACROS, **macros}, kernel, blocks, arguments)
 
@@ -253,7 +253,7 @@ def launch_sort(
     values: list[int],
     passes: int,
 ) -> None:
-    """Sort by 8 bits a pass, to and fro between two pairs of arrays."""
+    """Sort 8 bits in each pass, alternating between two pairs of arrays."""
     blocks = _blocks(arguments.capacity, SORT_KEYS)
     for k in range(passes):
         arguments.keys, arguments.sorted_keys = keys[k % 2], keys[1 - k % 2]
@@ -266,7 +266,7 @@ def launch_sort(
 
 
 def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
-    """The tensors of a rasterization that gradients can be wanted of, but for thresholds."""
+    """The tensors of a rasterization that can have gradients, thresholds excepted."""
     splats = inputs.splats
     names = ["opacities", "colors", "features"]
     if isinstance(splats, Splats):
@@ -279,7 +279,7 @@ def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
 
 
 def refuse(entries: int, spread: float) -> None:
-    """Raise EngineError when the kernels cannot draw so many entries, or offsets so far."""
+    """Raise EngineError if the kernels cannot draw so many entries, or such large offsets."""
     if entries > ENTRIES_MAX:
         raise EngineError(
             "engine 'cuda'",
@@ -313,14 +313,14 @@ class Drawn(NamedTuple):
 
 
 class Drawing:
-    """One rasterization: a forward pass, what backward needs of it, a backward pass.
+    """One rasterization: its forward pass, the data kept for backward, its backward pass.
 
-    It does not hold its own outputs. Autograd's graph, which the outputs hold, holds the drawing:
-    a way back from there would be a cycle through C++, which no collector finds.
+    It does not hold its own outputs. The outputs hold autograd's graph, and the graph holds the
+    drawing. A reference back would be a cycle through C++, which no garbage collector finds.
 
     Attributes:
         where: the device that it runs on.
-        evaluated: lanes spent on (Gaussian, pixel) pairs; NaN until it is read.
+        evaluated: (Gaussian, pixel) lanes that were computed; NaN until read.
     """
 
     evaluated: float = math.nan
@@ -339,13 +339,13 @@ class Drawing:
     # ---- forward -------------------------------------------------------------------------------
 
     def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool, packed: bool) -> Drawn:
-        """Launch the forward pass; void when there are more entries than the capacity.
+        """Launch the forward pass. Its result is invalid if entries exceed the capacity.
 
         Args:
-            capacity: entries of all tiles' lists that there shall be room for.
-            wanted: gradients that will be wanted.
-            deterministic: give each entry a slot, for backward to add up in order.
-            packed: keep less of each Gaussian, where no gradients are wanted.
+            capacity: the number of list entries, over all tiles, to allocate room for.
+            wanted: names of the inputs that will need gradients.
+            deterministic: give each entry its own slot, so that backward can add in order.
+            packed: store Gaussians in fewer bytes; only without gradients.
         """
         inputs, n, where = self._inputs, self._n, self.where
         height, width = inputs.view.height, inputs.view.width
@@ -461,23 +461,23 @@ class Drawing:
         )
 
     def read(self) -> int:
-        """Wait for the GPU; how many entries there are.
+        """Wait for the GPU, then return the number of entries.
 
         Raises:
-            EngineError: what the kernels could not draw.
+            EngineError: the kernels could not draw this many entries or such offsets.
         """
         _, entries, _, self.evaluated = map(int, self._found.tolist())
         refuse(entries, 0.0 if self._spread is None else float(self._spread))
         return entries
 
     def shortage(self, capacity: int) -> Tensor:
-        """(2,) float64 on the device: entries when they found no room, else 0; what they spread."""
+        """(2,) float64 on the device: entries if they did not fit, else 0; spread of offsets."""
         entries = self._found[1]
         spread = torch.zeros_like(entries) if self._spread is None else self._spread
         return torch.stack([entries.where(entries > capacity, 0).double(), spread.double()])
 
     def _new_outputs(self) -> dict[str, Any]:
-        """What the kernels fill in, by its name in ``Drawn``; None for what nobody wants."""
+        """The tensors that the kernels fill, by their names in ``Drawn``; None if unwanted."""
         inputs, n = self._inputs, self._n
         size = (inputs.view.height, inputs.view.width)
         new = partial(torch.empty, device=self.where)
@@ -516,7 +516,7 @@ class Drawing:
         by_features: Tensor | None,
         by_fragments: Tensor | None,
     ) -> dict[str, Tensor]:
-        """Run the backward pass for gradients by the outputs; gradients by the inputs, by name."""
+        """Run the backward pass: from the outputs' gradients to the inputs', by name."""
         assert self._frame is not None
         inputs, frame, n, where = self._inputs, self._frame, self._n, self.where
         upstream = {
@@ -574,7 +574,7 @@ class KernelBlade:
     where: torch.device
 
     def empty(self, *shape: int) -> Tensor:
-        """Memory for float32."""
+        """An uninitialised float32 tensor of this shape on the device."""
         return torch.empty(shape, device=self.where)
 
     def slice(self, given: binding.Spacetime, to: binding.Sliced) -> None:

@@ -1,7 +1,7 @@
-"""Compiles the GPU's kernels when they are first used, and keeps what came of it.
+"""Compiles the GPU's kernels at first use, and keeps the compiled code.
 
-The compiler is NVRTC, the copy that torch's own wheels bring, reached through ``cuda.bindings``; or
-nvcc, where one is on the path. Neither Python's nor torch's headers are involved.
+The compiler is NVRTC, from torch's own wheels, through ``cuda.bindings``, or nvcc if it is on the
+path. Python's and torch's headers are not needed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ typedef long long int64_t; typedef unsigned long long uint64_t;
 
 
 class Unavailable(Exception):  # noqa: N818 - a state of this machine, reported by describe()
-    """Kernels cannot be compiled here; the message says why."""
+    """Kernels cannot be compiled here; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Image:
 
     Attributes:
         code: machine code, or PTX that the driver compiles further.
-        log: what the compiler said; resources among it.
+        log: the compiler's output, which includes resources.
     """
 
     code: bytes
@@ -62,11 +62,11 @@ class Image:
 
 @dataclass(frozen=True)
 class Resources:
-    """What a kernel needs of a multiprocessor.
+    """The resources of a multiprocessor that a kernel needs.
 
     Attributes:
         registers: per thread.
-        stack: bytes of local memory per thread; arrays that found no registers.
+        stack: bytes of local memory per thread, for arrays that did not fit into registers.
         spills: bytes stored to local memory and loaded again.
         shared: bytes of shared memory per block.
     """
@@ -83,7 +83,7 @@ class Compiler(Protocol):
     Attributes:
         name: nvrtc or nvcc.
         version: of the toolkit.
-        architectures: compute capabilities that it makes machine code for, ascending.
+        architectures: compute capabilities for which it makes machine code, ascending.
     """
 
     name: str
@@ -116,10 +116,10 @@ class Nvrtc:
         self.architectures = tuple(sorted(int(a) for a in found if a >= OLDEST))
 
     def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
-        """As the protocol says.
+        """Compile a source; see ``Compiler``.
 
         Raises:
-            Unavailable: it does not compile; the message has the log.
+            Unavailable: the source does not compile; the message has the log.
         """
         text = (SOURCES / f"{source}.cu").read_bytes()
         program = self._call(
@@ -180,10 +180,10 @@ class Nvcc:
         self.architectures = tuple(sorted(code for code in codes if code >= OLDEST))
 
     def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
-        """As the protocol says.
+        """Compile a source; see ``Compiler``.
 
         Raises:
-            Unavailable: it does not compile; the message has the log.
+            Unavailable: the source does not compile; the message has the log.
         """
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "image"
@@ -212,7 +212,7 @@ _COMPILERS: Final[dict[str, Callable[[], Compiler]]] = {"nvrtc": Nvrtc, "nvcc": 
 
 @cache
 def _choose(wanted: str) -> Compiler | str:
-    """The compiler, or why there is none."""
+    """The compiler, or the reason why there is none."""
     if wanted in ("off", "0"):
         return f"switched off by {ENVIRONMENT}={wanted}"
     if wanted and wanted not in _COMPILERS:
@@ -239,14 +239,14 @@ def compiler() -> Compiler:
 
 
 def target_of(capability: int, architectures: tuple[int, ...]) -> str:
-    """What to compile for: machine code where the toolkit knows the GPU, else PTX for an older one.
+    """The compile target: machine code if the toolkit knows the GPU, else PTX for an older one.
 
     Args:
         capability: of the GPU, major times ten plus minor.
         architectures: that the toolkit knows.
 
     Raises:
-        Unavailable: older than anything that can run the kernels.
+        Unavailable: the GPU is too old to run the kernels.
     """
     if capability in architectures:
         return f"sm_{capability}"
@@ -276,7 +276,7 @@ def cache_folder() -> Path:
 
 @cache
 def digest_of_sources() -> bytes:
-    """Of everything that kernels may include."""
+    """A digest of all files that kernels may include."""
     digest = hashlib.sha256()
     parent = SOURCES.parent
     for folder in ("cuda", "cpu", "include"):
@@ -295,9 +295,9 @@ def _name_of(by: Compiler, source: str, macros: dict[str, int], target: str) -> 
 def image_of(
     source: str, macros: dict[str, int], target: str, by: Compiler | None = None
 ) -> tuple[Image, bool]:
-    """A compiled source, and whether it was there already.
+    """A compiled source, and whether it was in the cache.
 
-    Processes that want the same at the same time wait for the first of them. Where the folder
+    Processes that need the same source at the same time wait for the first of them. If the folder
     cannot be written, nothing is kept.
 
     Args:
@@ -307,7 +307,7 @@ def image_of(
         by: the compiler; ``compiler()`` when None.
 
     Raises:
-        Unavailable: no compiler, or it does not compile.
+        Unavailable: there is no compiler, or the source does not compile.
     """
     by = compiler() if by is None else by
     folder = cache_folder()
@@ -328,9 +328,9 @@ def image_of(
 
 @contextmanager
 def _one_at_a_time(path: Path) -> Iterator[None]:
-    """Waits for those who write the file, where files can be locked.
+    """Wait for other processes that write the file, if files can be locked.
 
-    Elsewhere two may write the same, one after the other; neither reads a part of it.
+    Without locks two processes may write the same file in turn. Neither reads a partial file.
     """
     from filelock import FileLock, Timeout
 
@@ -342,7 +342,7 @@ def _one_at_a_time(path: Path) -> Iterator[None]:
 
 
 def _read(path: Path) -> Image | None:
-    """An image that was kept; None when there is none, or it is damaged."""
+    """Read an image from the cache; None if it is absent or damaged."""
     try:
         digest, log_size, rest = path.read_bytes().split(b"\n", 2)
     except (OSError, ValueError):
@@ -354,7 +354,7 @@ def _read(path: Path) -> Image | None:
 
 
 def _write(path: Path, image: Image) -> None:
-    """Keeps an image; readers see all of it or nothing."""
+    """Write an image to the cache; readers see all of it or nothing."""
     log = image.log.encode()
     rest = log + image.code
     with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
@@ -363,7 +363,7 @@ def _write(path: Path, image: Image) -> None:
 
 
 def resources(log: str) -> dict[str, Resources]:
-    """What each kernel needs, as ptxas -v reported it."""
+    """The resources of each kernel, from the report of ptxas -v."""
     found = {}
     for part in re.split(r"Compiling entry function '", log)[1:]:
         name = part.split("'", 1)[0]

@@ -1,7 +1,8 @@
-"""Whether the cuda engine may be trusted on a GPU: there, it is compared with what needs none.
+"""Decides whether the cuda engine may be used on a GPU, by comparing it with other engines.
 
-In a process of its own: a kernel that reads where it must not takes its process's GPU with it, and
-one that waits forever does not return. What was found is remembered beside the compiled kernels.
+The comparison runs in its own process: a kernel with an invalid read breaks the GPU for its whole
+process, and a kernel that waits forever does not return. The verdict is stored beside the compiled
+kernels.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _FAILS, _COULD_NOT_RUN = 3, 4  # exit codes
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a check found.
+    """The result of a check.
 
     Attributes:
         outcome: "fails" when the engine draws something else, crashes or never returns; "could not
@@ -66,20 +67,20 @@ class Verdict:
 
 
 def why_not(device: torch.device | str) -> Verdict | None:
-    """Why not to draw with the cuda engine on a GPU; None when it has proved itself there."""
+    """The reason not to draw with the cuda engine on a GPU; None if it passed the check there."""
     verdict = _remembered(device) or _checked(str(device))
     return None if verdict.outcome == "agrees" else verdict
 
 
 @cache
 def _checked(device: str) -> Verdict:
-    """A check, once in this process."""
+    """Check a GPU, at most once in this process."""
     log.info("checking the cuda engine on %s, once on this machine", device)
     return check_in_subprocess(device)
 
 
 def check_in_subprocess(device: torch.device | str) -> Verdict:
-    """Compare in another process, and remember what was found; but not that nothing was."""
+    """Compare in another process and store the verdict, unless the check could not run."""
     verdict = _run(device)
     if verdict.outcome != "could not run":
         with suppress(OSError):  # read-only: the next process checks again
@@ -118,7 +119,7 @@ def _marker(device: torch.device | str) -> Path:
 
 @cache
 def _circumstances(device: str) -> str:
-    """Names everything that a verdict holds for: GPUs of one kind share it."""
+    """Everything that a verdict depends on; GPUs of one kind share a verdict."""
     compiler = kernels.compiler()
     gpu = torch.cuda.get_device_properties(device)
     what = (
