@@ -1,1 +1,1 @@
-"""Benchmarks: a scene everybody can make again, medians with spread, ratios in one run."""
+"""Benchmarks: a reproducible scene, medians with their spread, ratios within one run."""

@@ -1,7 +1,7 @@
-"""Other rasterizers that are installed here, timed on our scene: the same picture, or no figure.
+"""Times other installed rasterizers on our scene, if they draw the same picture.
 
-A peer runs in a process of its own: a crash or a deadlock in its driver is then an answer too. To
-add one, write how it draws as in ``_gausscam`` and enter it in ``PEERS``.
+A peer runs in its own process, so a crash or a deadlock of its driver is reported like any other
+failure. To add a peer, write a function like ``_gausscam`` and enter it in ``PEERS``.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Drawing:
     """A peer that is ready to draw.
 
     Attributes:
-        device: what it draws on, by its own name.
-        draw: one frame, in memory when it returns; the part that is timed.
-        image: (3, H, W) in 0 to 1, of what ``draw`` returned.
+        device: the peer's name of its device.
+        draw: draws one frame into memory; this call is timed.
+        image: converts the result of ``draw`` to (3, H, W) in [0, 1].
     """
 
     device: str
@@ -60,15 +60,15 @@ def time_peer(
 
     Args:
         name: one of ``installed()``.
-        splats: activated; SH of degree 0, which is all that some peers draw.
-        view: pixels square, background black.
-        truth: (3, H, W) our picture of the same.
-        repeats: frames after one to warm up.
-        limit: seconds, for all of them.
+        splats: activated, with SH degree 0, because some peers draw no more.
+        view: a camera with square pixels and a black background.
+        truth: (3, H, W) our picture of the same scene.
+        repeats: number of timed frames, after one warm-up frame.
+        limit: seconds for all frames together.
 
     Returns:
         name, width, height, gaussians, device, ms_median, ms_min, ms_se, psnr, failed. Times are
-        None where it drew another picture or none; failed then says so.
+        None if the peer drew another picture or none; failed then has the reason.
     """
     row: dict[str, Any] = {
         "name": name,
@@ -160,7 +160,7 @@ PEERS: dict[str, tuple[tuple[str, ...], Callable[[Arrays], Drawing]]] = {
 
 
 def _child(name: str, inputs: str, outputs: str, repeats: str) -> None:
-    """Draw in this process and leave picture, times in ms and device in a file."""
+    """Draw in this process, and write picture, times in ms and device to a file."""
     with np.load(inputs) as given:
         drawing = PEERS[name][1](dict(given))
     frame = drawing.draw()

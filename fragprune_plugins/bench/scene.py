@@ -1,9 +1,9 @@
 """The bench scene: random Gaussians that load a rasterizer as a trained scene does.
 
-Same distribution, and for the same count and seed the same numbers, as the scene that the figures
-in docs/ were measured on: surfaces and floaters over depths 2 to 14, log-normal anisotropic scales
-with one short axis, opacities of two kinds, view-dependent colour. About 53 fragments are blended
-per pixel, close to Bicycle's 49.
+The figures in docs/ were measured on this scene; the same count and seed give the same numbers:
+surfaces and floaters over depths 2 to 14, log-normal anisotropic scales with one short axis,
+opacities of two kinds, view-dependent colour. About 53 fragments are blended per pixel, close to
+Bicycle's 49.
 """
 
 from __future__ import annotations

@@ -21,12 +21,12 @@ Pass = Literal["forward", "forward_backward"]
 
 @dataclass(frozen=True)
 class Case:
-    """One thing to time.
+    """A rasterization to time.
 
     Attributes:
-        scene: its name.
-        view: the camera, where the Gaussians are.
-        splats: activated Gaussians; where they are, everything happens.
+        scene: the scene's name.
+        view: the camera, on the Gaussians' device.
+        splats: activated Gaussians; their device does the work.
         kind: forward only, or with every gradient.
         thresholds: (N,) or None.
     """
@@ -57,10 +57,10 @@ def measure(
     On a GPU the clock stops when it is idle again, after the backward pass too.
 
     Args:
-        cases: what to draw.
-        engines: who draws; the first one's picture is what the others' are compared with.
-        repeats: rounds after one to warm up.
-        say: told each finished round.
+        cases: the rasterizations to time.
+        engines: the engines to time. Pictures are compared with those of the first engine.
+        repeats: number of rounds after one warm-up round.
+        say: called with a line of text after each finished round.
 
     Returns:
         One dict a case and engine: scene, width, height, gaussians, pass, engine, device, threads,
@@ -125,11 +125,11 @@ def measure(
 
 
 def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, dict[str, float]]:
-    """What truncation saves, by scene and size, forward.
+    """How much of the saved fragments becomes saved time, by scene and size, forward pass.
 
     Returns:
-        For "scene WIDTHxHEIGHT": fragments, how many times fewer are drawn; time, how many times
-        less a frame takes; share, time over fragments: 1 where all of the one becomes the other.
+        For each "scene WIDTHxHEIGHT": ``fragments`` and ``time``, the ratios of untruncated to
+        truncated, and ``share``, time over fragments.
     """
     found: dict[str, dict[str, float]] = {}
     forward = [r for r in results if r["engine"] == engine and r["pass"] == "forward"]
@@ -149,10 +149,11 @@ def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, dic
 
 
 def scaling(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float] | None:
-    """How a fragment's price moves with Gaussians and pixels: untruncated, forward.
+    """The range of the time per fragment over scenes and sizes: untruncated, forward pass.
 
     Returns:
-        least and most, ns per fragment, and their ratio; None for fewer than two such rows.
+        ``least`` and ``most`` in ns per fragment, and their ``ratio``; None for fewer than two
+        rows.
     """
     prices = [
         r["ns_per_fragment"]
@@ -166,7 +167,7 @@ def scaling(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float] 
 
 
 def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
-    """A call that draws once; with gradients of a fixed random loss where they are asked for."""
+    """Make a function that draws once, optionally with gradients of a fixed random loss."""
     inputs = RasterInputs(case.view, case.splats)
     if case.kind == "forward":
 
@@ -203,7 +204,7 @@ def _standard_error(values: Sequence[float]) -> float:
 def _with_peak(
     job: Callable[[], RasterOutputs], device: torch.device
 ) -> tuple[RasterOutputs, float | None]:
-    """Run once (this also warms up); the most memory in use above where it began, in MB."""
+    """Run once, which also warms up; returns the peak memory above the start, in MB."""
     if device.type == "cuda":
         synchronize(device)
         torch.cuda.reset_peak_memory_stats(device)

@@ -1,1 +1,1 @@
-"""Photographs and cameras, read from the folders that trainings use."""
+"""Reads photographs and cameras from the folders that training uses."""

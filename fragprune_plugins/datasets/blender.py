@@ -1,4 +1,4 @@
-"""Blender's layout: transforms_train.json and transforms_test.json, as NeRF synthetic scenes."""
+"""Reads Blender's layout, transforms_train.json and transforms_test.json (NeRF synthetic)."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def read(folder: Path) -> tuple[list[Row], list[Row]]:
-    """Training and held-out views: name, camera, image path.
+    """Read training and held-out views: name, camera, image path.
 
     Raises:
-        DatasetError: a missing or broken file, lens distortion, a missing image.
+        DatasetError: a file or image is missing or broken, or the lens has distortion.
     """
     train, test = (
         read_transforms(folder / f"transforms_{part}.json") for part in ("train", "test")
@@ -32,7 +32,7 @@ def read(folder: Path) -> tuple[list[Row], list[Row]]:
 
 
 def read_transforms(path: Path) -> list[Row]:
-    """The views of one transforms file.
+    """Read the views of one transforms file.
 
     Intrinsics are ``fl_x, fl_y, cx, cy`` where given, else ``camera_angle_x`` and a centred
     principal point; ``w, h`` where given, else the size of the image.
@@ -61,10 +61,10 @@ def read_transforms(path: Path) -> list[Row]:
 
 
 def load_json(path: Path) -> Any:
-    """A JSON file's content.
+    """Read a JSON file.
 
     Raises:
-        DatasetError: missing or not JSON.
+        DatasetError: the file is missing or not JSON.
     """
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))

@@ -19,10 +19,10 @@ from fragprune_plugins.types import View
 
 
 def load_cameras(path: Path, *, white_background: bool = False) -> list[tuple[str, View]]:
-    """Named views of a cameras file.
+    """Read the named views of a cameras file.
 
     Raises:
-        DatasetError: missing, broken or empty.
+        DatasetError: the file is missing, broken or empty.
     """
     content = load_json(path)
     if isinstance(content, dict):

@@ -1,4 +1,4 @@
-"""COLMAP's sparse model: cameras and images, text or binary."""
+"""Reads COLMAP's sparse model: cameras and images, text or binary."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder with cameras and images files: sparse/0, or sparse; None when neither."""
+    """The folder with the cameras and images files: sparse/0 or sparse; None if neither."""
     for candidate in (folder / "sparse" / "0", folder / "sparse"):
         if any((candidate / f"images.{kind}").exists() for kind in ("bin", "txt")):
             return candidate
@@ -52,14 +52,14 @@ def find_model(folder: Path) -> Path | None:
 
 
 def read(folder: Path, images: str = "images") -> tuple[list[Row], list[Row]]:
-    """Training and held-out views: name, camera, image path.
+    """Read training and held-out views: name, camera, image path.
 
     Args:
         folder: the scene.
-        images: the folder in it that holds the images.
+        images: name of the folder with the images.
 
     Raises:
-        DatasetError: broken files, a camera model with distortion, an image without camera.
+        DatasetError: a file is broken, a camera has distortion, or an image has no camera.
     """
     model = find_model(folder)
     assert model is not None, "the caller looked"
@@ -97,13 +97,13 @@ def read(folder: Path, images: str = "images") -> tuple[list[Row], list[Row]]:
 
 
 def _image_path(images: Path, name: str) -> Path:
-    """Hosts take the base name alone; COLMAP may hold subfolders."""
+    """The image's path, by its base name as hosts do; COLMAP's name may include subfolders."""
     full = images / name
     return full if full.exists() else images / Path(name).name
 
 
 def _rotation(quaternion: tuple[float, ...]) -> Tensor:
-    """(3, 3) float64 from w, x, y, z of any length."""
+    """(3, 3) float64 rotation from a quaternion w, x, y, z of any length."""
     q = torch.tensor(quaternion, dtype=torch.float64)
     w, x, y, z = (q / q.norm()).tolist()
     return torch.tensor(

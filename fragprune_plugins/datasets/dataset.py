@@ -1,4 +1,4 @@
-"""Photographs with their cameras, from a COLMAP or a Blender (transforms) folder."""
+"""Loads photographs with their cameras from a COLMAP or a Blender (transforms) folder."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Shot:
     Attributes:
         name: unique in its dataset.
         view: the camera, with the background colour that the image was composited over.
-        path: the image file; read when first asked for, kept as 8-bit in main memory, wherever
-            the view lives: a scene's photographs may be larger than a GPU's memory.
+        path: the image file. It is read at first use and kept in main memory at 8 bits a channel,
+            because a scene's photographs may be larger than a GPU's memory.
     """
 
     name: str
@@ -41,11 +41,11 @@ class Shot:
 
     @property
     def image(self) -> Tensor:
-        """(3, H, W) RGB in [0, 1], alpha composited over the view's background; where that is."""
+        """(3, H, W) RGB in [0, 1], composited over the view's background, on its device."""
         return self._bytes.to(self.view.background.device).permute(2, 0, 1).float() / 255
 
     def to(self, device: torch.device | str) -> Shot:
-        """The same photograph with its view on a device; itself where it is there."""
+        """The same photograph with its view on a device; ``self`` if it is there already."""
         if self.view.background.device == torch.device(device):
             return self
         return replace(self, view=self.view.to(device))
@@ -73,7 +73,7 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Views to learn from and views held out for measuring."""
+    """Training views, and held-out views for measuring."""
 
     train: Sequence[Shot]
     test: Sequence[Shot]
@@ -84,7 +84,7 @@ class Dataset:
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from their mean, world units.
 
-        Hosts scale the learning rate of positions by it.
+        Hosts scale the learning rate of positions by this.
         """
         centres = torch.stack([shot.view.campos for shot in self.train])
         return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max()) or 1.0
@@ -95,7 +95,7 @@ class Dataset:
 
 
 def load_photographs(photographs: Photographs) -> Dataset:
-    """What ``load_dataset`` gives for the photographs of a run."""
+    """Load the photographs of a run with ``load_dataset``."""
     return load_dataset(
         photographs.folder,
         resolution=photographs.resolution,
@@ -118,13 +118,13 @@ def load_dataset(
 
     Args:
         folder: the scene.
-        resolution: divide the images' sides by this; or how large they are read.
-        white_background: composite images with alpha over white instead of black, render likewise.
-        images: where a COLMAP folder holds them.
+        resolution: a divisor of the images' sides, or a ``Resolution``.
+        white_background: composite images with alpha over white instead of black, and render so.
+        images: name of the image folder of a COLMAP scene.
 
     Raises:
-        DatasetError: neither or both layouts, missing images, an unknown camera model, sizes that
-            do not match.
+        DatasetError: the folder has neither layout or both, an image is missing, a camera model is
+            unknown, or sizes do not match.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -161,7 +161,7 @@ def load_dataset(
 def make_shot(
     name: str, camera: Camera, path: Path, background: Tensor, resolution: Resolution
 ) -> Shot:
-    """Pair an image file with its camera; only the file's header is read here.
+    """Pair an image file with its camera. This reads only the file's header.
 
     Raises:
         DatasetError: the file is missing or unreadable, or its size does not fit the camera.

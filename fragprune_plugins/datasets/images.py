@@ -1,4 +1,4 @@
-"""Image files, looked at without decoding them."""
+"""Sizes of image files, without decoding them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, pixels.
 
     Raises:
-        DatasetError: it is missing or no image.
+        DatasetError: the file is missing or not an image.
     """
     from PIL import Image
 

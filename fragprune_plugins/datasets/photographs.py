@@ -1,4 +1,4 @@
-"""Which photographs a model was trained on, and how they were read: enough to read them again."""
+"""Records which photographs a model was trained on and how they were read, to read them again."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Resolution:
-    """At how many pixels photographs are read.
+    """The size at which photographs are read.
 
     Attributes:
         divide: both sides are divided by this and rounded.
-        width: pixels; where given, images are scaled to this width in place of being divided, and
-            both sides cut down to whole pixels.
+        width: pixels. If given, images are scaled to this width instead of divided, and both sides
+            are cut down to whole pixels.
         shrink_only: images narrower than ``width`` stay as they are.
     """
 
@@ -23,9 +23,9 @@ class Resolution:
     shrink_only: bool = False
 
     def of(self, width: int, height: int) -> tuple[int, int]:
-        """The size that an image of this size is read at, one pixel or more a side.
+        """The size at which an image of this size is read, at least one pixel a side.
 
-        The arithmetic is the hosts', rounding and all: a pixel more is another picture.
+        The rounding is the hosts' own, because one more pixel would make another picture.
         """
         if self.width is None:
             return max(1, round(width / self.divide)), max(1, round(height / self.divide))
@@ -40,7 +40,7 @@ class Photographs:
     """A scene folder and how its images are read.
 
     Attributes:
-        folder: COLMAP's or Blender's.
+        folder: a COLMAP or Blender scene.
         resolution: of the images.
         white_background: images with alpha are composited over white instead of black.
         images: name of the folder of a COLMAP scene that holds the images.
@@ -57,7 +57,7 @@ class Photographs:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Photographs:
-        """What ``as_dict`` gave; records of earlier versions have a divisor as resolution."""
+        """Rebuild from ``as_dict``. Records of earlier versions have a divisor as resolution."""
         size = values["resolution"]
         return cls(
             Path(values["folder"]),

@@ -1,4 +1,4 @@
-"""A pinhole camera with its pose, as every reader gives it."""
+"""A pinhole camera with its pose, which every reader returns."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Camera:
         )
 
     def view(self, background: Tensor | None = None) -> View:
-        """As the engines take it; computed in float64, float32 in the result."""
+        """The camera as a view for engines, computed in float64, float32 in the result."""
         exact = View.pinhole(
             self.rotation,
             self.translation,

@@ -1,4 +1,4 @@
-"""Wall-clock time of a frame, the work that a GPU still has to do included."""
+"""Wall-clock time of a frame, including work that is still queued on a GPU."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Made = TypeVar("Made")
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until a device has done all that it was told; a CPU has."""
+    """Wait until a device has finished its queued work; a CPU has none."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def timed(work: Callable[[], Made], device: torch.device) -> tuple[Made, float]:
-    """What work gives, and the milliseconds from an idle device to an idle device."""
+    """Run ``work``; returns its result and the milliseconds from idle device to idle device."""
     synchronize(device)
     started = time.perf_counter()
     made = work()

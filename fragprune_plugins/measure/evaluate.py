@@ -1,4 +1,4 @@
-"""Quality, fragments and latency of splats on photographs, under the names of every report."""
+"""Measures quality, fragments and latency of splats on photographs."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ REPEATS = 9
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A splat and how to draw it.
+    """A splat to measure, and how to draw it.
 
     Attributes:
         model: the Gaussians.
-        thresholds: their store, whose plugins are asked at every view; or (N,) to use as they are;
-            None for no truncation.
-        drawing: fields of ``RasterInputs`` where other rules than vanilla's apply.
+        thresholds: a store, for which plugins are asked at every view; (N,) thresholds to use as
+            they are; or None for no truncation.
+        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
     """
 
     model: SplatFile
@@ -42,13 +42,13 @@ class Candidate:
     __repr__ = one_line
 
     def inputs(self, view: View, splats: Splats) -> RasterInputs:
-        """One view of the activated model."""
+        """The inputs of one view with the activated model."""
         return RasterInputs(view, splats, **self.drawing)
 
     def draw(
         self, engine: Engine, view: View, splats: Splats, *, counts: bool = False
     ) -> RasterOutputs:
-        """One view of the activated model; also with fragments counted."""
+        """Draw one view of the activated model, optionally with counts of fragments."""
         inputs = replace(self.inputs(view, splats), counts=counts)
         return engine.rasterize(inputs, thresholds_for(inputs, self.thresholds))
 
@@ -75,15 +75,15 @@ def measure(
 ) -> list[dict[str, Any]]:
     """Measure splats against the same photographs, timing them in turns.
 
-    Frames of all candidates are timed interleaved, so that a busy machine slows them alike. A
-    frame is one rasterization of activated Gaussians with thresholds at hand, forward only, without
-    reading or writing images; on a GPU it lasts until the GPU is idle again.
+    Frames of all candidates are timed in turns, so that a busy machine slows them alike. A frame is
+    one forward rasterization of activated Gaussians with given thresholds, without reading or
+    writing images. On a GPU it ends when the GPU is idle.
 
     Args:
-        candidates: what to measure; on one device, where the views are taken.
-        shots: the views; figures are means over them.
+        candidates: the splats to measure, all on one device; views move there.
+        shots: the views. Figures are means over them.
         engine: a name or an engine.
-        repeats: timed frames a view and candidate.
+        repeats: number of timed frames for each view and candidate.
 
     Returns:
         One dict a candidate: psnr (dB), ssim, lpips (None), fragments_per_pixel,

@@ -1,4 +1,4 @@
-"""Image quality, one image against its photograph; images are clamped to [0, 1] first."""
+"""Image quality of one image against its photograph. Images are clamped to [0, 1] first."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def ssim(image: Tensor, target: Tensor) -> float:
     """Structural similarity by scikit-image, in [-1, 1], of two images (3, H, W).
 
     The hosts' parameters: Gaussian window of sigma 1.5 (11 pixels), population covariance, data
-    range 1, mean over channels. Pixels within 5 of the border are left out, which the hosts'
-    zero-padded version counts.
+    range 1, mean over channels. Pixels within 5 of the border are left out; the hosts' zero-padded
+    version counts them.
 
     Raises:
         InputError: an image smaller than the window.
@@ -50,8 +50,8 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
 
 def lpips(image: Tensor, target: Tensor) -> None:
-    """Not computed: LPIPS needs network weights, which would have to be downloaded.
+    """Not computed, because LPIPS needs network weights from a download.
 
-    Reports carry ``null``. Render both models with ``fragprune render`` and run the ``lpips``
-    package on the pictures where its weights are at hand.
+    Reports carry ``null``. To compute LPIPS, render both models with ``fragprune render`` and run
+    the ``lpips`` package on the pictures.
     """

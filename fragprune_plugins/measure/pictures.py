@@ -24,7 +24,7 @@ def save_image(path: Path, image: Tensor) -> None:
     """Write an image (3, H, W), clamped to [0, 1], as 8-bit PNG.
 
     Raises:
-        OutputError: the place cannot be written; so for every function here.
+        OutputError: the file cannot be written. Every function here raises it.
     """
     with replacing(path) as temporary:
         picture(image).save(temporary, format="PNG")
@@ -43,18 +43,18 @@ def save_heatmap(path: Path, fragments: Tensor, limit: float) -> None:
     Args:
         path: the PNG.
         fragments: (H, W) counts.
-        limit: the count at the top of the scale; pass the same for pictures to compare.
+        limit: the count at the top of the scale; use one value for pictures to compare.
     """
     save_panel(path, [("", fragments)], limit)
 
 
 def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float) -> None:
-    """Write pictures side by side under their titles: (3, H, W) as they are, (H, W) as colours.
+    """Write pictures side by side under their titles; counts (H, W) become colours.
 
     Args:
         path: the PNG.
-        pictures: titles and pictures, all of one size.
-        limit: the count at the top of the colour scale that all (H, W) share.
+        pictures: (title, picture), where a picture is (3, H, W) RGB or (H, W) counts, of one size.
+        limit: the count at the top of the colour scale, which all (H, W) share.
     """
     from matplotlib.figure import Figure
     from mpl_toolkits.axes_grid1 import ImageGrid  # type: ignore[import-untyped]

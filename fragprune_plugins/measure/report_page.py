@@ -1,4 +1,4 @@
-"""A page that shows what was gained: a sentence, a table, sliders over views, curves."""
+"""An HTML page of results: a sentence, a table, sliders over views, learning curves."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _SHOWN = 3  # views on the page
 def draw_views(
     folder: Path, before: Candidate, after: Candidate, shots: Sequence[Shot], engine: Engine
 ) -> dict[str, list[str]]:
-    """Draw some of the views, spread over all: photograph, before, after, fragment densities.
+    """Draw some evenly spread views: photograph, before, after, fragment densities.
 
     Args:
         folder: for the PNGs.
-        before: the model as it was.
-        after: the model to compare with it.
-        shots: the views; they go where the models are.
-        engine: that draws.
+        before: the model before fine-tuning.
+        after: the model to compare with ``before``.
+        shots: the views; they move to the models' device.
+        engine: draws the views.
 
     Returns:
-        The files of each view shown, by the view's name: its photograph, before, after, fragments.
+        Files by the name of the view: its photograph, before, after, fragments.
     """
     import torch
 
@@ -116,16 +116,16 @@ def compose(
     source: Callable[[str], str],
     ending: Sequence[str] = (),
 ) -> str:
-    """The page as HTML.
+    """Compose the page as HTML.
 
     Args:
         title: also its heading.
         quote: the outcome in a sentence, shown large.
         text: paragraphs and tables, HTML.
-        views: names of views that ``draw_views`` has drawn, each shown under a slider.
-        pictures: (heading, file) of more pictures, at full width.
-        source: makes a picture's file name what its ``src`` is: a relative path, or its bytes.
-        ending: as ``text``, below the pictures.
+        views: names of views that ``draw_views`` drew; each has a slider.
+        pictures: (heading, file) of further pictures at full width.
+        source: turns a picture's file name into its ``src``, a relative path or a data URL.
+        ending: paragraphs and tables below the pictures, HTML.
     """
     sections = [_view(name, source) for name in views]
     sections += [
@@ -140,12 +140,12 @@ def compose(
 
 
 def preformatted(text: str) -> str:
-    """A table of text as HTML."""
+    """Preformatted text, such as a table, as HTML."""
     return f"<pre>{html.escape(text)}</pre>"
 
 
 def paragraph(text: str) -> str:
-    """Prose as HTML."""
+    """A paragraph of text as HTML."""
     return f"<p>{html.escape(text)}</p>"
 
 

@@ -1,4 +1,4 @@
-"""Gaussians that a model can do without: those that reach no pixel."""
+"""Finds and removes Gaussians that reach no pixel."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ def drop_invisible(
     *,
     engine: str | Engine = "auto",
 ) -> tuple[SplatFile, ThresholdStore]:
-    """A model and its thresholds without the rows that are not ``visible``; both stay as they were.
+    """Copy a model and its thresholds without the rows that are not ``visible``.
 
-    Thresholds keep their moments. It goes by what the store holds, whatever plugins answer.
+    Thresholds keep their moments. Visibility follows the thresholds in the store, not the answers
+    of plugins.
 
     Raises:
-        InputError: none is visible.
+        InputError: no Gaussian is visible.
     """
     kept = visible(model, None if store.neutral else store.values.detach(), views, engine=engine)
     smaller = ThresholdStore(0, store.logits.device)
@@ -45,21 +46,21 @@ def visible(
     *,
     engine: str | Engine = "auto",
 ) -> Tensor:
-    """(N,) bool: Gaussians without which a picture could change.
+    """(N,) bool: the Gaussians whose removal could change a picture.
 
-    Without views these are all that have an ellipse at all: opacity of 1/255 or more. With views,
-    those that reach the centre of a pixel in one of them, hidden by others there or not. Pictures
-    of the views are the same to the bit without the others, if activated values are: torch.sigmoid
-    may round an opacity otherwise where it stands in another row.
+    Without views, these are the Gaussians with an opacity of 1/255 or more. With views, these are
+    the Gaussians that reach the centre of a pixel in at least one view, hidden by others or not.
+    Without the other Gaussians, the pictures of the views are the same to the bit if activated
+    values are. (torch.sigmoid may round an opacity differently in another row.)
 
     Args:
         model: N Gaussians.
         thresholds: (N,) falloff in (0, 1), or None for no truncation.
-        views: all that must stay as they are.
+        views: the views whose pictures must stay the same.
         engine: a name or an engine.
 
     Raises:
-        InputError: there is none.
+        InputError: no Gaussian is visible.
     """
     splats = model.splats()
     seen = splats.opacities >= ALPHA_MIN

@@ -1,4 +1,4 @@
-"""How measurements are put: a table of them, and the sentence that one quotes."""
+"""Turns measurements into text: a table, and a sentence to quote."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00
 
 CLAIMED = 2
-"""Standard errors that frame times must differ by to be called different."""
+"""Frame times count as different if they differ by this many standard errors."""
 
 FELL = 0.5
 """A loss of PSNR, in dB, that is warned of."""
@@ -17,7 +17,7 @@ _CONTROL = {
     "run": "--stage finetune --control to the same command",
     "finetune": "--control to the same command, with another --out in the same folder",
 }
-"""What runs a control where it is found afterwards."""
+"""How a user runs a control so that later results find it."""
 
 IS_CONTROL = ": a control, nothing is truncated."
 """Ends the sentence on one."""
@@ -33,7 +33,7 @@ _ROWS = (
 
 
 def describe(columns: dict[str, dict[str, Any]]) -> str:
-    """A table of measurements, one column each, and how the last differs from the one before."""
+    """A table with a column for each measurement, and the change between the last two."""
     reports = list(columns.values())
     head = " " * 20 + "".join(f"{name:>16}" for name in columns)
     lines = [head + f"{'change':>12}" if len(columns) > 1 else head]
@@ -60,7 +60,7 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
 
 
 def gain(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """What the second measurement gains over the first: fragments, frame times, PSNR."""
+    """A phrase for the gain of one measurement over another: fragments, frame times, PSNR."""
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
         f"{_frames(before, after)}, {after['psnr'] - before['psnr']:+.2f} dB PSNR "
@@ -69,12 +69,12 @@ def gain(before: dict[str, Any], after: dict[str, Any]) -> str:
 
 
 def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) -> str:
-    """What a fine-tuning gained on held-out views, and how much of that is not pruning's.
+    """A sentence for the gain of a fine-tuning on held-out views, and for the control's share.
 
     Args:
         command: "run" or "finetune".
-        data: its figures, "before", "after" and "settings" among them.
-        control: measured after as many iterations without truncation; None where that was not run.
+        data: its figures, including "before", "after" and "settings".
+        control: the measurement after as many iterations without truncation; None if not run.
     """
     before, after = data["before"], data["after"]
     gained = f"{gain(before, after)} that were held out"
@@ -117,7 +117,7 @@ def _fell(before: dict[str, Any], after: dict[str, Any], control: dict[str, Any]
 
 
 def fewer(before: float, after: float) -> str:
-    """How many times fewer fragments per pixel, or more."""
+    """A phrase for the ratio of fragments per pixel: fewer, as many or more."""
     ratio = before / max(after, 1e-9)
     change = f"{ratio:.2f}x fewer" if ratio > 1 else f"{1 / max(ratio, 1e-9):.2f}x more"
     change = "as many" if abs(ratio - 1) < _EQUAL else change
@@ -125,7 +125,7 @@ def fewer(before: float, after: float) -> str:
 
 
 def _frames(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """Frame times; how many times as fast only where their standard errors allow it."""
+    """A phrase for frame times, with their ratio only if it exceeds the standard errors."""
     was, now = before["frame_ms"], after["frame_ms"]
     ratio = was / max(now, 1e-9)
     errors = (report["frame_ms_se"] / max(report["frame_ms"], 1e-9) for report in (before, after))

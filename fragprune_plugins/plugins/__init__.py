@@ -1,1 +1,1 @@
-"""Plugins: the hooks they may answer, how they are found, and our own answers."""
+"""Plugins: their hooks, how they are found, and our own answers."""

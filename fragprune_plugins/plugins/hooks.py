@@ -1,4 +1,4 @@
-"""What the core asks its plugins, and its own answers where no plugin has one.
+"""Asks plugins, and gives our own answers if no plugin answers.
 
 Every command, the session of a host and the functions of the package ask here and nowhere else.
 """
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 def engine_for(
     name: str, device: torch.device | str = "cpu", plugins: Plugins | None = None
 ) -> Engine:
-    """The engine of a name for tensors on a device, a plugin's or our own; created once.
+    """The engine with a name, for tensors on a device: a plugin's or our own. Created once.
 
     Args:
-        name: "auto", "reference", "cpu", "cuda", or what a plugin answers to.
-        device: where the tensors live.
-        plugins: to ask; those of the process when None.
+        name: "auto", "reference", "cpu", "cuda", or a name that a plugin answers.
+        device: the device of the tensors.
+        plugins: the plugins to ask; None for those of the process.
 
     Raises:
         EngineError: the name is unknown, or the engine cannot run here.
-        PluginError: a plugin raised, or gave what is no engine.
+        PluginError: a plugin raised, or its answer is not an engine.
     """
     device, plugins = torch.device(device), plugins or installed()
     engine = plugins.engines.get((name, device))
@@ -52,10 +52,10 @@ def engine_for(
 
 
 def schedule_for(settings: Settings, plugins: Plugins | None = None) -> Schedule:
-    """When thresholds start, move and stop in stage 2: a plugin's schedule, or the paper's.
+    """The schedule of stage 2: a plugin's, or the paper's.
 
     Raises:
-        PluginError: a plugin raised, or gave what is no schedule.
+        PluginError: a plugin raised, or its answer is not a schedule.
     """
     hook = hookspecs.fragprune_create_schedule
     answer = (plugins or installed()).ask(hook, _no_schedule, settings=settings)
@@ -65,16 +65,16 @@ def schedule_for(settings: Settings, plugins: Plugins | None = None) -> Schedule
 def thresholds_for(
     inputs: RasterInputs, given: Tensor | ThresholdStore | None, plugins: Plugins | None = None
 ) -> Tensor | None:
-    """The thresholds (N,) to draw with, in falloff; None where there are none.
+    """The thresholds (N,) to draw with, in falloff; None for no truncation.
 
     Args:
         inputs: of the rasterization.
-        given: a store, whose plugins are asked unless it is neutral; or thresholds to use as they
-            are.
-        plugins: to ask; those of the process when None.
+        given: a store, for which plugins are asked unless it is neutral; or thresholds to use as
+            they are.
+        plugins: the plugins to ask; None for those of the process.
 
     Raises:
-        PluginError: a plugin raised, or gave other than N thresholds in (0, 1).
+        PluginError: a plugin raised, or its answer is not N thresholds in (0, 1).
     """
     if not isinstance(given, ThresholdStore):
         return given
@@ -92,10 +92,10 @@ def thresholds_for(
 def select_adapter(
     repo: HostRepo, matches: Sequence[Match], plugins: Plugins | None = None
 ) -> str | None:
-    """The name of the adapter that a plugin prefers where several fit; None where none has a say.
+    """The name of the adapter that a plugin prefers if several fit; None if no plugin answers.
 
     Raises:
-        PluginError: a plugin raised, or named none of them.
+        PluginError: a plugin raised, or named an adapter that does not fit.
     """
     names = [match.adapter for match in matches]
 
@@ -115,19 +115,20 @@ def rasterize(
 ) -> RasterOutputs:
     """Draw splats, each truncated at its own threshold. Differentiable; any engine.
 
-    A fragment of Gaussian i is drawn iff q <= min(-2 ln tau_i, 2 ln(255 o_i)), q its squared
-    Mahalanobis distance; the gradient of tau comes from a logistic surrogate at the rim.
+    A fragment of Gaussian i is drawn if and only if q <= min(-2 ln tau_i, 2 ln(255 o_i)), where q
+    is its squared Mahalanobis distance. The gradient of tau comes from a logistic surrogate at the
+    rim.
 
     Args:
         inputs: camera and Gaussians.
-        thresholds: (N,) falloff in (0, 1), used as they are; a store, whose plugins are asked; or
-            None.
+        thresholds: (N,) falloff in (0, 1), used as they are; a store, for which plugins are asked;
+            or None for no truncation.
         engine: a name ("auto", "reference", "cpu", "cuda", a plugin's) or an engine object.
 
     Raises:
         InputError: thresholds that do not match the Gaussians.
         EngineError: there is no such engine here.
-        PluginError: a plugin raised, or gave an answer that cannot be used.
+        PluginError: a plugin raised, or its answer cannot be used.
     """
     thresholds = thresholds_for(inputs, thresholds)
     inputs.check_thresholds(thresholds)  # also for engines that are not ours
@@ -159,7 +160,7 @@ def _no_schedule(answer: Any) -> Wrong | None:
 
 
 def _no_thresholds(answer: Any, count: int, device: torch.device) -> Wrong | None:
-    """What is wrong with thresholds; on a GPU it waits for them, which our own need not."""
+    """Say what is wrong with a plugin's thresholds. On a GPU this waits for the values."""
     expected = f"({count},) floating-point thresholds in (0, 1) on {device}"
     if not isinstance(answer, Tensor):
         return repr(answer), expected

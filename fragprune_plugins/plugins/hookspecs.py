@@ -28,9 +28,9 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 @hookspec
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer adapters; called once per start.
+    """Offer adapters; called once in a process.
 
-    :param register: call it with each adapter.
+    :param register: the function to call with each adapter.
     """
 
 
@@ -39,7 +39,7 @@ def fragprune_select_adapter(repo: HostRepo, matches: Sequence[Match]) -> str | 
     """Break a tie when several adapters fit a folder.
 
     :param repo: the checkout.
-    :param matches: those that fit, with why.
+    :param matches: the adapters that fit, with reasons.
     """
 
 
@@ -47,12 +47,12 @@ def fragprune_select_adapter(repo: HostRepo, matches: Sequence[Match]) -> str | 
 def fragprune_truncate(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
     """Give the thresholds (N,) in falloff to apply to one rasterization: learned, fixed, your own.
 
-    Asked wherever a model that has thresholds is drawn. Where no plugin answers, it is the learned
-    ones.
+    Asked for every rasterization of a model that has thresholds. If no plugin answers, the learned
+    thresholds apply.
 
-    :param inputs: camera and the Gaussians about to be drawn: the model's N, or those of them that
-        the host picked; their thresholds are picked alike.
-    :param store: the learned thresholds of the model being drawn; the answer has one for each.
+    :param inputs: the camera and the Gaussians about to be drawn: all N of the model, or a
+        selection by the host. The same selection of thresholds applies.
+    :param store: the learned thresholds of the model. The answer has one threshold for each.
     """
 
 
@@ -60,10 +60,10 @@ def fragprune_truncate(inputs: RasterInputs, store: ThresholdStore) -> Tensor | 
 def fragprune_create_engine(name: str, device: torch.device) -> Engine | None:
     """Supply a rasterizer that honours thresholds.
 
-    Asked once for a name and a device. Where no plugin answers, it is one of ours.
+    Asked once for each name and device. If no plugin answers, one of our engines is used.
 
-    :param name: what the user asked for, "auto" included.
-    :param device: where the tensors live.
+    :param name: the name that the user gave, which may be "auto".
+    :param device: the device of the tensors.
     """
 
 
@@ -71,15 +71,15 @@ def fragprune_create_engine(name: str, device: torch.device) -> Engine | None:
 def fragprune_create_schedule(settings: Settings) -> Schedule | None:
     """Decide when thresholds start, move and stop in stage 2.
 
-    Where no plugin answers, it is the paper's schedule.
+    If no plugin answers, the paper's schedule is used.
 
-    :param settings: what the user asked for.
+    :param settings: the user's settings.
     """
 
 
 @hookspec
 def fragprune_attached(model: Any, store: ThresholdStore) -> None:
-    """Look at a model that has just got its store, new or restored.
+    """Called after a model received its store, new or restored.
 
     :param model: the host's model object.
     :param store: its thresholds.
@@ -88,16 +88,16 @@ def fragprune_attached(model: Any, store: ThresholdStore) -> None:
 
 @hookspec
 def fragprune_population_changed(store: ThresholdStore, change: PopulationChange) -> None:
-    """Look at rows that were kept, appended or replaced; the store already agrees.
+    """Called after rows were kept, appended or replaced, and the store followed.
 
     :param store: the thresholds after the change.
-    :param change: what happened, with counts before and after.
+    :param change: the kind of change, with counts before and after.
     """
 
 
 @hookspec
 def fragprune_step(stats: StepStats) -> None:
-    """Look at a training step that is over; do not touch.
+    """Called after a training step; must not change anything.
 
     :param stats: step, fragments per pixel, pressure.
     """
@@ -105,15 +105,15 @@ def fragprune_step(stats: StepStats) -> None:
 
 @hookspec
 def fragprune_saved(path: Path) -> None:
-    """Learn that a sidecar was written.
+    """Called after a sidecar was written.
 
-    :param path: of the sidecar.
+    :param path: the sidecar's path.
     """
 
 
 @hookspec
 def fragprune_finished(summary: Summary) -> None:
-    """Learn that the host's script ended, however it ended.
+    """Called after the host's script ended, with success or not.
 
-    :param summary: what was gained.
+    :param summary: the figures of the run.
     """

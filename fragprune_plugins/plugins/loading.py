@@ -1,7 +1,8 @@
-"""The plugins of this process: found, blocked, loaded one by one, and asked one by one.
+"""Finds, blocks, loads and asks the plugins of this process, one by one.
 
-One plugin that fails never stops the others: at import it becomes a finding, in a hook it is named.
-Environment: ``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take comma-separated entry-point names.
+A plugin that fails never stops the others. A failure at import becomes a finding; a failure in a
+hook is an error that names the plugin. Environment: ``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take
+comma-separated entry-point names.
 """
 
 from __future__ import annotations
@@ -50,14 +51,14 @@ def _manager() -> pluggy.PluginManager:
 
 @dataclass
 class Plugins:
-    """Registered plugins, the adapters they offer, and what went wrong on the way.
+    """Registered plugins, the adapters that they offer, and findings about failed plugins.
 
     Attributes:
         adapters: by name.
-        findings: what was blocked, shadowed or failed.
+        findings: plugins that were blocked or shadowed, or that failed.
         loaded: the value of each entry point by its name.
-        engines: that were created, by the name that was asked for and the device: an engine keeps
-            memory and kernels that its next frame uses again.
+        engines: created engines, by requested name and device. An engine keeps memory and kernels
+            for its next frame.
         _off: (plugin, hook) of observers that raised.
     """
 
@@ -69,14 +70,14 @@ class Plugins:
     _off: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
 
     def register(self, plugin: object, name: str) -> None:
-        """Take a plugin and its adapters, or none of it.
+        """Register a plugin and its adapters; if it fails, register nothing of it.
 
         Args:
             plugin: a module or an object with hooks.
             name: unique among the plugins.
 
         Raises:
-            PluginError: it has an unknown hook or argument, or it raised.
+            PluginError: the plugin has an unknown hook or argument, or it raised.
         """
         offered: list[HostAdapter] = []
 
@@ -111,11 +112,11 @@ class Plugins:
         self.adapters.sort(key=lambda adapter: adapter.name)
 
     def ask(self, hook: Hook, wrong: Callable[[Any], Wrong | None], **given: Any) -> Any:
-        """The first answer that is not None; None where no plugin answers.
+        """Ask a hook; returns the first answer that is not None, or None if no plugin answers.
 
         Args:
-            hook: which.
-            wrong: says what is wrong with an answer, None where nothing is.
+            hook: the hook's name.
+            wrong: returns what is wrong with an answer, or None.
             given: the hook's arguments.
 
         Raises:
@@ -131,7 +132,7 @@ class Plugins:
         return None
 
     def tell(self, hook: Hook, **given: Any) -> None:
-        """Tell every observer; one that raises is reported, and not told again."""
+        """Call every observer. An observer that raises is reported and not called again."""
         for each in self._implementations(hook):
             key = each.plugin_name, hook.__name__
             if key in self._off:
@@ -147,14 +148,14 @@ class Plugins:
         return [each.plugin_name for each in self._implementations(hook)]
 
     def _implementations(self, hook: Hook) -> Iterator[pluggy.HookImpl]:
-        """In the order they are called: the last one registered first."""
+        """A hook's implementations in the order of calls: the last one registered comes first."""
         caller: pluggy.HookCaller = getattr(self._manager.hook, hook.__name__)
         return reversed(caller.get_hookimpls())
 
 
 @cache
 def installed() -> Plugins:
-    """The plugins of this process, found once; what went wrong is logged."""
+    """The plugins of this process, found once; findings are logged."""
     plugins = load_plugins()
     for finding in plugins.findings:
         if finding.level != "info":
@@ -229,7 +230,7 @@ def _take(plugins: Plugins, adapter: HostAdapter) -> None:
 
 
 def _call(implementation: pluggy.HookImpl, hook: Hook, given: dict[str, Any]) -> Any:
-    """What one plugin answers.
+    """Call one plugin's hook and return its answer.
 
     Raises:
         PluginError: it raised.

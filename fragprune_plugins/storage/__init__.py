@@ -1,1 +1,1 @@
-"""Files of models and of what was learned about them, written whole or not at all."""
+"""Files of models, thresholds and records. A file is written completely or not at all."""

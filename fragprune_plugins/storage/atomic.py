@@ -14,9 +14,9 @@ from fragprune_plugins.errors import OutputError
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; on success it takes ``path``'s name.
+    """Yield a temporary path in the same folder. On success it is renamed to ``path``.
 
-    Whatever fails inside, ``path`` stays as it was and the temporary file is gone.
+    If anything fails inside, ``path`` stays as it was and the temporary file is removed.
 
     Raises:
         OutputError: the folder or file cannot be written.
@@ -49,10 +49,10 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def writable_folder(path: Path) -> Path:
-    """Create the folder if need be and prove that a file can be made in it; returns it.
+    """Create the folder if it is missing, and check that a file can be made in it; returns it.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the folder cannot be written.
     """
     path = Path(path)
     try:
@@ -70,7 +70,7 @@ def writable_folder(path: Path) -> Path:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
+    """The SHA-256 digest of a file, hexadecimal."""
     sha = hashlib.sha256()
     with open(path, "rb") as file:
         while block := file.read(1 << 20):

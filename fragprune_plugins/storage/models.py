@@ -1,4 +1,4 @@
-"""A model with its thresholds, wherever these are: in the sidecar, or in the file itself."""
+"""Loads a model with its thresholds, from the sidecar or from the file itself."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@ One ``vertex`` element of float32 columns, values before activation: x y z, nx n
 f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
 (logit), scale_0..2 (log), rot_0..3 (w x y z, any length). ``fragprune export`` adds one column,
 ``trunc_threshold``: the threshold itself, in falloff, in (0, 1). Unknown columns are ignored,
-except Mip-Splatting's ``filter_3D``: its models are drawn by rules of their own, so only who knows
-these may read them.
+except Mip-Splatting's ``filter_3D``: such a model is refused unless the caller draws by the rules
+of Mip-Splatting.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ _REMEDY = "Pass the point_cloud.ply that a 3DGS training saved."
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """A splat as its file holds it: N Gaussians, before activation, float32.
+    """A splat with the values of its file: N Gaussians, before activation, float32.
 
     Attributes:
         xyz: (N, 3) means, world.
         f_dc: (N, 1, 3) first SH coefficient.
-        f_rest: (N, K - 1, 3) the others, K = (degree + 1)^2.
+        f_rest: (N, K - 1, 3) the other coefficients, K = (degree + 1)^2.
         opacity: (N, 1) logits.
         scaling: (N, 3) logarithms of standard deviations.
         rotation: (N, 4) quaternions w, x, y, z of any length.
-        thresholds: (N,) truncation thresholds in (0, 1) where the file carries them.
-        filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units: it widens
-            every axis and dims what it widens.
+        thresholds: (N,) truncation thresholds in (0, 1); None if the file has none.
+        filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units. It widens
+            every axis and lowers the opacity accordingly.
     """
 
     xyz: Tensor
@@ -94,11 +94,11 @@ class SplatFile:
 
     @property
     def sh_degree(self) -> int:
-        """0 to 3, from the number of coefficients."""
+        """The SH degree, 0 to 3, from the number of coefficients."""
         return _REST_COUNTS[3 * self.f_rest.shape[1]]
 
     def to(self, device: torch.device | str) -> SplatFile:
-        """The same Gaussians on a device; the very tensors where they are there."""
+        """The same Gaussians on a device; tensors that are there already are not copied."""
         moved = {name: each.to(device) for name, each in vars(self).items() if each is not None}
         return replace(self, **moved)
 
@@ -108,7 +108,7 @@ class SplatFile:
         return replace(self, **{k: rows[mask] for k, rows in held.items() if rows is not None})
 
     def splats(self) -> Splats:
-        """The Gaussians activated, as engines take them; differentiable."""
+        """The Gaussians after activation, for engines; differentiable."""
         opacities, scales = torch.sigmoid(self.opacity[:, 0]), torch.exp(self.scaling)
         if self.filter_3d is not None:
             wider = (scales.square() + self.filter_3d.square()).sqrt()
@@ -125,11 +125,11 @@ class SplatFile:
 
 
 def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
-    """Read a trained splat; SH degree follows from the number of f_rest columns.
+    """Read a trained splat. The number of f_rest columns gives the SH degree.
 
     Args:
         path: the file.
-        filtered: accept a model with a 3D filter; the caller draws it by Mip-Splatting's rules.
+        filtered: accept a model with a 3D filter, which the caller draws by Mip-Splatting's rules.
 
     Raises:
         ModelFileError: missing, truncated, not a PLY, not a Gaussian splat, empty or not finite.
@@ -202,16 +202,16 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
 def write_ply(
     path: Path, model: SplatFile, thresholds: Tensor | None = None, *, marked: bool = False
 ) -> None:
-    """Write a splat as hosts do, bit for bit what ``read_ply`` gave; atomically.
+    """Write a splat atomically in the hosts' layout, with the exact values that ``read_ply`` gave.
 
     Args:
         path: the file; an existing one is replaced only when the new one is complete.
         model: the Gaussians.
-        thresholds: (N,) written as the last column ``trunc_threshold`` when given.
-        marked: say in the header that a sidecar with thresholds belongs to it.
+        thresholds: (N,) for the last column ``trunc_threshold``; None for no such column.
+        marked: note in the header that a sidecar with thresholds belongs to the file.
 
     Raises:
-        OutputError: the place cannot be written.
+        OutputError: the file cannot be written.
     """
     from plyfile import PlyData, PlyElement
 
@@ -241,9 +241,9 @@ def write_ply(
 
 
 def is_marked(path: Path) -> bool:
-    """Whether a file is a PLY whose header says that a sidecar holds its thresholds.
+    """Whether a file is a PLY with the mark that its thresholds are in a sidecar.
 
-    One that has a column of thresholds needs no sidecar, whatever its header says.
+    A file with a column of thresholds needs no sidecar, so it does not count as marked.
     """
     if not path.is_file():
         return False

@@ -1,4 +1,4 @@
-"""What commands leave beside their results for ``fragprune report``: their figures as JSON."""
+"""Records: the figures of a command as JSON beside its result, for ``fragprune report``."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
 
 @dataclass(frozen=True)
 class Record:
-    """One command's figures.
+    """The figures of one command.
 
     Attributes:
-        path: of the file.
-        command: that left it: run, finetune, compare or profile.
-        data: what it printed with --json, and what the page needs besides.
+        path: the record's file.
+        command: the command that wrote it: run, finetune, compare or profile.
+        data: the command's --json output, and further data for the page.
     """
 
     path: Path
@@ -34,10 +34,10 @@ class Record:
 
 
 def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
-    """Write a record beside a result, in place of the one an earlier command left there.
+    """Write a record beside a result; it replaces an earlier record.
 
     Raises:
-        OutputError: the place cannot be written.
+        OutputError: the file cannot be written.
     """
     target = path_beside(model)
     content = {"format": FORMAT, "command": command, "data": data}
@@ -47,15 +47,15 @@ def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
 
 
 def path_beside(result: Path) -> Path:
-    """Where the record of a result lies."""
+    """The path of a result's record."""
     return Path(result).with_suffix(SUFFIX)
 
 
 def beside(result: Path) -> Record | None:
-    """The record of a result; None without one, or where the result was written again since.
+    """Read the record of a result; None if there is none or the result was rewritten since.
 
     Raises:
-        RecordError: it cannot be read.
+        RecordError: the record cannot be read.
     """
     path = path_beside(result)
     if not path.exists() or path.stat().st_mtime_ns < result.stat().st_mtime_ns:
@@ -64,10 +64,10 @@ def beside(result: Path) -> Record | None:
 
 
 def find(folder: Path) -> list[Record]:
-    """All records in a folder and below, oldest first.
+    """Read all records in a folder and below, oldest first.
 
     Raises:
-        RecordError: there is none, or one cannot be read.
+        RecordError: there is no record, or a record cannot be read.
     """
     found = files(folder, below=True)
     if not found:
@@ -81,20 +81,20 @@ def find(folder: Path) -> list[Record]:
 
 
 def files(folder: Path, *, below: bool = False) -> list[Path]:
-    """The files of records in a folder, or also below it, oldest first."""
+    """The files of records in a folder, optionally also below it, oldest first."""
     find_files = Path(folder).rglob if below else Path(folder).glob
     return sorted(find_files(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime)
 
 
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
-    """What was measured after the control of a fine-tuning, where one of the files records it.
+    """Find the measurement of a fine-tuning's control; None if no file records it.
 
-    The control began with the same model and learned for as many iterations, likewise but without
-    truncation. Files that are no records are passed over.
+    The control started from the same model, with the same iterations and settings, but without
+    truncation. Files that are not records are ignored.
 
     Args:
-        data: of the fine-tuning, "before", "iterations" and "settings" among it.
-        among: files to look through; the last that fits counts.
+        data: of the fine-tuning, including "before", "iterations" and "settings".
+        among: the files to search; the last match counts.
     """
     for path in reversed(among):
         with contextlib.suppress(RecordError):
@@ -134,7 +134,7 @@ def _read(path: Path) -> Record:
 
 
 def strict(value: Any) -> Any:
-    """JSON knows neither NaN nor infinity: null."""
+    """Replace NaN and infinity by null, because JSON has neither."""
     if isinstance(value, dict):
         return {key: strict(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

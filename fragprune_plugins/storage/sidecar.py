@@ -1,8 +1,8 @@
 """The sidecar: a safetensors file beside the host's own that carries a threshold store.
 
 ``point_cloud.ply`` gets ``point_cloud.fragprune.safetensors``. Its metadata names the model file's
-digest and row count, so a stale pair is refused; the host's file stays as the host wrote it. A PLY
-that we write ourselves says in its header that it has a sidecar, so that one without is noticed.
+digest and row count, so a pair that does not match is refused. The host's file stays as the host
+wrote it. A PLY that fragprune writes has a mark in its header, so a missing sidecar is noticed.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ FORMAT = "fragprune-thresholds-1"
 
 @dataclass(frozen=True)
 class SidecarInfo:
-    """What a sidecar says of itself.
+    """The metadata of a sidecar.
 
     Attributes:
         rows: number of Gaussians.
         model_sha256: digest of the model file it belongs to.
         adapter: name of the adapter that wrote it, "" when written without a host.
         host_commit: the host checkout's commit, "" when unknown.
-        settings: what the fine-tuning was asked to do.
+        settings: of the fine-tuning.
     """
 
     rows: int
@@ -44,7 +44,7 @@ class SidecarInfo:
 
 
 def path_beside(model: Path) -> Path:
-    """Where a model file's sidecar lies."""
+    """The path of a model file's sidecar."""
     return Path(model).with_suffix(SUFFIX)
 
 
@@ -52,7 +52,7 @@ def lies_beside(model: Path) -> bool:
     """Whether a model file has a sidecar.
 
     Raises:
-        SidecarError: it has none, and was saved with one.
+        SidecarError: it has none, but was saved with one.
     """
     path = path_beside(model)
     if not path.exists() and is_marked(model):
@@ -67,10 +67,10 @@ def lies_beside(model: Path) -> bool:
 
 
 def belongs(model: Path) -> bool:
-    """Whether a sidecar lies beside a model file and was written for the file as it is now.
+    """Whether a model file has a sidecar that was written for the file's present content.
 
     Raises:
-        SidecarError: it cannot be read.
+        SidecarError: the sidecar cannot be read.
     """
     return path_beside(model).exists() and _read(model)[1].model_sha256 == digest(model)
 
@@ -83,11 +83,11 @@ def save(
     host_commit: str = "",
     settings: dict[str, Any] | None = None,
 ) -> Path:
-    """Write the store beside a model file that is already there; returns the sidecar's path.
+    """Write the store beside an existing model file; returns the sidecar's path.
 
     Raises:
-        DivergedError: what was learned is not finite.
-        OutputError: the place cannot be written.
+        DivergedError: learned values are not finite.
+        OutputError: the file cannot be written.
     """
     from safetensors.torch import save_file
 
@@ -151,7 +151,7 @@ def _remedy(model: Path) -> str:
 
 
 def _read(model: Path) -> tuple[dict[str, Any], SidecarInfo]:
-    """A sidecar's store state and what it says of itself, whatever model lies beside it."""
+    """Read a sidecar's store state and metadata, without a look at the model beside it."""
     from safetensors import SafetensorError, safe_open
 
     path = path_beside(model)

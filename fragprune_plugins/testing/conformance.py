@@ -1,4 +1,4 @@
-"""What an adapter inherits to be tested: a test for each invariant, on every host there is."""
+"""The class from which an adapter's tests inherit: a test for each invariant, on every host."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ MINIATURE, INSTALLED = "miniature", "installed"
 
 
 class AdapterConformance:
-    """Inherit, name the adapter and how to drive its host: every invariant is then a test.
+    """Inherit from this class and name the adapter and its host: each invariant is then a test.
 
-    Each test runs in a process of its own, on the miniature that ``host`` writes, or the installed
+    Each test runs in its own process: on the miniature that ``host`` writes or the installed
     package that it names, and on every checkout in the folder ``FRAGPRUNE_HOSTS`` that the adapter
     fits.
 
     Attributes:
-        adapter: name of an installed one, or the object itself.
+        adapter: the name of an installed adapter, or the adapter itself.
         host: how to drive its host.
-        examples: sequences of row operations that are tried.
-        longest_order: of import, activation and deactivation, 1 to 5.
+        examples: number of sequences of row operations to try.
+        longest_order: longest sequence of import, activation and deactivation, 1 to 5.
     """
 
     adapter: ClassVar[str | HostAdapter]
@@ -42,7 +42,7 @@ class AdapterConformance:
     longest_order: ClassVar[int] = 3
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
-        """One set of tests a host."""
+        """Parametrise the tests: one set for each host."""
         if "place" in metafunc.fixturenames:
             found = _checkouts(os.environ.get("FRAGPRUNE_HOSTS", ""))
             fitting = [
@@ -56,7 +56,7 @@ class AdapterConformance:
 
     @pytest.fixture
     def case(self, place: Path | None, tmp_path: Path) -> Case:
-        """Adapter and host; the miniature is written anew for each test."""
+        """The adapter and its host. Each test writes a new miniature."""
         driver, root = self.host(), place or tmp_path
         if place is None and driver.package:
             installed = HostRepo.installed(driver.package)
@@ -75,7 +75,7 @@ class AdapterConformance:
 
     @pytest.fixture
     def check(self, request: pytest.FixtureRequest) -> Callable[..., None]:
-        """Run checks in fresh processes and note what they covered."""
+        """Run checks in fresh processes and record their coverage."""
 
         def run(*calls: tuple[Any, ...]) -> None:
             covered, failure = [], ""
@@ -94,45 +94,45 @@ class AdapterConformance:
         return run
 
     def test_off_is_off(self, case: Case, check: Any) -> None:
-        """In every order of import, activation and deactivation."""
+        """While inactive, the host's own objects are in place, in every order of import."""
         each = [(invariants.off_is_off, case, order) for order in invariants.orders(case.longest)]
         check(*each, (invariants.nothing_stays, case))
 
     def test_neutral_is_the_host(self, case: Case, check: Any) -> None:
-        """To the bit: parameters, random streams, pictures."""
+        """Neutral thresholds leave parameters, random streams and pictures the same, to the bit."""
         check((invariants.neutral_is_the_host, case))
 
     def test_alignment(self, case: Case, check: Any) -> None:
-        """Through any sequence of row operations."""
+        """Thresholds follow their rows through any sequence of row operations."""
         check((invariants.alignment, case))
 
     def test_monotone(self, case: Case, check: Any) -> None:
-        """Truncation only takes away, and takes all."""
+        """A higher threshold never adds fragments, and can remove a Gaussian completely."""
         check((invariants.monotone, case))
 
     def test_model_file(self, case: Case, check: Any) -> None:
-        """What is saved is loaded."""
+        """A saved model is loaded with its thresholds."""
         check((invariants.model_file, case))
 
     def test_checkpoint(self, case: Case, check: Any) -> None:
-        """What is captured is restored."""
+        """A checkpoint restores the model and its thresholds."""
         check((invariants.checkpoint, case))
 
     def test_freeze(self, case: Case, check: Any) -> None:
-        """Stage 2 moves what it names."""
+        """Stage 2 moves exactly the parameters that ``--train`` names."""
         check((invariants.freeze, case))
 
     def test_refuse(self, case: Case, check: Any) -> None:
-        """A changed host is refused by what changed."""
+        """A changed host is refused, and the error names the change."""
         check((invariants.refuse, case))
 
     def test_same_picture(self, case: Case, check: Any) -> None:
-        """Whatever the engine."""
+        """Every engine draws the same picture, with the same gradients."""
         check((invariants.same_picture, case))
 
 
 def found_adapter(adapter: str | HostAdapter) -> HostAdapter:
-    """An adapter by name, or itself.
+    """Find an adapter by its name; an adapter object is returned as it is.
 
     Raises:
         LookupError: no installed adapter has the name.
@@ -147,7 +147,7 @@ def found_adapter(adapter: str | HostAdapter) -> HostAdapter:
 
 @cache
 def _checkouts(folder: str) -> list[Path]:
-    """Folders that may be checkouts of hosts: the one named, and those in it."""
+    """Folders that may be checkouts of hosts: the given folder and its subfolders."""
     if not folder:
         return []
     root = Path(folder)

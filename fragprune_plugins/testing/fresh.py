@@ -1,4 +1,4 @@
-"""Runs a function in a process of its own: no host imported, no session, nothing left over.
+"""Runs a function in a fresh process, without an imported host or an active session.
 
 A server imports torch and the plugins once and forks for every call, so that a fresh process costs
 milliseconds.
@@ -25,11 +25,11 @@ _PRELOAD = ["torch._dynamo", "scipy.spatial", "plyfile", "fragprune_plugins.test
 
 
 class FreshProcessError(AssertionError):
-    """What a fresh process raised, as text; or that it died, or took too long."""
+    """A fresh process raised (the message has the traceback), died, or took too long."""
 
 
 class NotApplicable(Exception):  # noqa: N818 - a result, not a fault
-    """A check has nothing to check here; says why."""
+    """A check does not apply to this host; the message gives the reason."""
 
 
 def fresh(function: Callable[..., Any], *arguments: Any, seconds: float = 240.0) -> Any:
@@ -37,12 +37,12 @@ def fresh(function: Callable[..., Any], *arguments: Any, seconds: float = 240.0)
 
     Args:
         function: importable by its module's name, in the kit or installed.
-        arguments: pickled; modules of their classes may be files that only pytest has imported.
-        seconds: after which the process is ended.
+        arguments: are pickled; their classes may come from files that only pytest imported.
+        seconds: time limit of the process.
 
     Raises:
         NotApplicable: the function raised it.
-        FreshProcessError: it raised anything else, died, or took longer.
+        FreshProcessError: the function raised another error, or the process died or took longer.
     """
     context = multiprocessing.get_context("forkserver")
     plugins = [entry.module for entry in entry_points(group=GROUP)]
@@ -72,7 +72,7 @@ def fresh(function: Callable[..., Any], *arguments: Any, seconds: float = 240.0)
 
 
 def _files_of(values: Sequence[Any]) -> dict[str, str]:
-    """Files of modules that functions, classes and objects' classes come from, by module name."""
+    """The files of the modules that define functions, classes and objects, by module name."""
     inside = [
         part for value in values for part in (value, *getattr(value, "__dict__", {}).values())
     ]
@@ -83,7 +83,7 @@ def _files_of(values: Sequence[Any]) -> dict[str, str]:
 
 
 def _serve(answer: Connection, files: dict[str, str], task: bytes) -> None:
-    """In the fresh process: run the task; what it prints is shown only when it fails."""
+    """Run the task in the fresh process; its output is shown only if it fails."""
     import torch
 
     torch.set_num_threads(1)  # the same sums in the same order

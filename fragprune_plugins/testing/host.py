@@ -1,8 +1,8 @@
-"""A host as the conformance kit drives it, and a host under a session.
+"""How the conformance kit drives a host, alone and under a session.
 
 The kit knows no training script. It makes a model and a camera, draws, takes a step, and calls the
-methods that add, remove and overwrite rows; a ``Host`` says how. Its defaults are those of the
-codebases that descend from 3DGS of 2023, so a descendant states only what it has otherwise.
+methods that add, remove and overwrite rows. A ``Host`` says how. Its defaults fit the codebases
+that descend from 3DGS of 2023, so a descendant overrides only its differences.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ FAINT = -9.0
 
 @dataclass(frozen=True)
 class Chance:
-    """What one action draws from; the same chance does the same again.
+    """The randomness of one action; an equal ``Chance`` repeats the action.
 
     Attributes:
-        seed: of everything drawn.
-        share: about how many of the rows, in (0, 1).
+        seed: of all random numbers.
+        share: the approximate share of rows to choose, in (0, 1).
     """
 
     seed: int
@@ -60,16 +60,16 @@ class Chance:
         object.__setattr__(self, "generator", generator)
 
     def uniform(self, *shape: int) -> Tensor:
-        """Numbers in [0, 1)."""
+        """Random numbers in [0, 1), of this shape."""
         return torch.rand(*shape, generator=self.generator)
 
     def rows(self, count: int, share: float | None = None) -> Tensor:
-        """(count,) bool: each row with a probability of ``share``, this chance's by default."""
+        """(count,) bool: each row is True with probability ``share``, by default this chance's."""
         return self.uniform(count) < (self.share if share is None else share)
 
     @property
     def heads(self) -> bool:
-        """A coin."""
+        """True or False with equal probability."""
         return bool(self.seed % 2)
 
 
@@ -78,10 +78,10 @@ Action = Callable[[Any, Any, Chance], None]
 
 
 class Host:
-    """How to drive one host; override what it has otherwise than vanilla 3DGS of 2023.
+    """How to drive one host; override the differences from vanilla 3DGS of 2023.
 
-    ``write`` makes a miniature of it, for where no checkout is at hand; everything else must work
-    on a real checkout too. A host that is an installed package is driven as it is installed.
+    ``write`` makes a miniature of the host, so that tests need no checkout. All other methods must
+    work on a real checkout too. A host that is an installed package is used as installed.
     """
 
     package: str = ""
@@ -102,13 +102,13 @@ class Host:
     """Extent of the scene in the host's densification, world units."""
 
     def write(self, root: Path) -> None:
-        """Write a miniature into an empty folder."""
+        """Write a miniature of the host into an empty folder."""
         shutil.copytree(MINIATURE, root, dirs_exist_ok=True)
 
     # -- making things ---------------------------------------------------------------------------
 
     def arguments(self) -> Any:
-        """What the training script hands ``training_setup``: the host's own defaults."""
+        """The argument of ``training_setup``: the host's own defaults."""
         parser = ArgumentParser()
         group = import_module("arguments").OptimizationParams(parser)
         return group.extract(parser.parse_args([]))
@@ -118,7 +118,8 @@ class Host:
         return import_module("scene.gaussian_model").GaussianModel(degree)
 
     def fill(self, model: Any, cloud: Any) -> None:
-        """Begin from a cloud: ``points``, ``colors``, ``normals`` (N, 3) and ``time`` (N, 1)."""
+        """Fill the model from a cloud: ``points``, ``colors``, ``normals`` (N, 3), ``time`` (N, 1).
+        """
         given = {"pcd": cloud, "cam_infos": [SimpleNamespace(image_name="photo")]}
         names = inspect.signature(model.create_from_pcd).parameters
         model.create_from_pcd(**{name: given.get(name, 1.0) for name in names})
@@ -169,7 +170,7 @@ class Host:
     # -- drawing and learning --------------------------------------------------------------------
 
     def pipe(self) -> Any:
-        """The options that hosts pass to ``render``."""
+        """The pipeline options that hosts pass to ``render``."""
         return SimpleNamespace(
             debug=False,
             compute_cov3D_python=False,
@@ -178,7 +179,7 @@ class Host:
         )
 
     def render(self, camera: Any, model: Any, background: Tensor) -> dict[str, Any]:
-        """The host's function as scripts hold it: "render" (3, H, W) and whatever else."""
+        """Call the host's render function; returns a dict with "render" (3, H, W)."""
         draw = import_module("gaussian_renderer").render
         package: dict[str, Any] = draw(camera, model, self.pipe(), background)
         return package
@@ -195,11 +196,11 @@ class Host:
         return float(loss.detach())
 
     def gather(self, model: Any, package: dict[str, Any]) -> None:
-        """Note what the host densifies by."""
+        """Accumulate the statistics by which the host densifies."""
         model.add_densification_stats(package["viewspace_points"], package["visibility_filter"])
 
     def descend(self, model: Any) -> None:
-        """The optimizers' step."""
+        """Step the optimizers."""
         model.optimizer.step()
         model.optimizer.zero_grad(set_to_none=True)
 
@@ -212,13 +213,13 @@ class Host:
         return int(model.active_sh_degree)
 
     def use_bands(self, model: Any, count: int) -> None:
-        """Draw so many of those that the model has."""
+        """Draw with this many of the model's SH bands."""
         model.active_sh_degree = min(count, model.max_sh_degree)
 
     # -- rows ------------------------------------------------------------------------------------
 
     def actions(self) -> Mapping[str, Action]:
-        """Everything that changes rows, by name; sequences of these are tried."""
+        """All actions that change rows, by name; tests try sequences of them."""
         return {
             "prune": prune,
             "clone": clone,
@@ -231,19 +232,19 @@ class Host:
         }
 
     def restore_from_file(self, model: Any, arguments: Any, chance: Chance) -> None:
-        """Through a checkpoint and back into the same model."""
+        """Write a checkpoint, and restore it into the same model."""
         file = io.BytesIO()
         torch.save((self.capture(model), 7), file)
         file.seek(0)
         self.restore(model, torch.load(file, weights_only=False)[0], arguments)
 
     def mark(self, model: Any, numbers: Tensor) -> None:
-        """Write a number (N,) into each row, where the host copies it from parents to children."""
+        """Write numbers (N,) into the rows, where the host copies them from parents to children."""
         with torch.no_grad():
             model._features_dc[:, 0, 0] = numbers
 
     def marks(self, model: Any) -> Tensor:
-        """(N,) int64 the numbers as they are now; -1 for rows that descend from nobody."""
+        """(N,) int64: the rows' numbers; -1 for rows without a parent."""
         numbers: Tensor = model._features_dc.detach()[:, 0, 0].round().long()
         return numbers
 
@@ -255,30 +256,30 @@ class Host:
     # -- files -----------------------------------------------------------------------------------
 
     def save(self, model: Any, path: Path) -> None:
-        """The host's own way to save a model."""
+        """Save a model with the host's own method."""
         model.save_ply(str(path))
 
     def load(self, model: Any, path: Path) -> None:
-        """The host's own way to load it into an empty model."""
+        """Load a saved model into an empty one with the host's own method."""
         model.load_ply(str(path))
 
     def capture(self, model: Any) -> Any:
-        """What the host puts into a checkpoint."""
+        """The host's checkpoint of a model."""
         return model.capture()
 
     def restore(self, model: Any, captured: Any, arguments: Any) -> None:
-        """Take it up again."""
+        """Restore a model from the host's checkpoint."""
         model.restore(captured, arguments)
 
 
 def reset_opacity(model: Any, arguments: Any, chance: Chance) -> None:
-    """Only once the optimizer has stepped: hosts fail before, and never do it so early."""
+    """Reset opacities, once the optimizer has stepped; before that, hosts fail."""
     if model.optimizer.state:
         model.reset_opacity()
 
 
 def prune(model: Any, arguments: Any, chance: Chance) -> None:
-    """Remove rows, by a mask of torch's or, as some hosts have it, of NumPy's."""
+    """Remove rows by a mask, torch's or, for some hosts, NumPy's."""
     gone = chance.rows(len(model.get_xyz))
     _with_radii(model)
     model.prune_points(gone.numpy() if chance.heads else gone)
@@ -301,7 +302,7 @@ def _densify(method: Any, model: Any, all_rows: float, chance: Chance) -> None:
 
 
 def densify_and_prune(model: Any, arguments: Any, chance: Chance, *more: Any) -> None:
-    """What the training loop calls, with more arguments: clone, split, prune faint and large."""
+    """Call the host's ``densify_and_prune``: clone, split, prune faint and large Gaussians."""
     n = len(model.get_xyz)
     model.xyz_gradient_accum = chance.uniform(n, 1)
     model.denom = chance.rows(n, 0.8)[:, None].float()
@@ -318,14 +319,14 @@ def _takes_radii(method: Any) -> bool:
 
 
 def _with_radii(model: Any) -> None:
-    """Revisions whose ``densify_and_prune`` takes radii keep them on the model meanwhile."""
+    """Keep radii on the model meanwhile, as revisions do whose ``densify_and_prune`` takes them."""
     if _takes_radii(model.densify_and_prune):
         model.tmp_radii = torch.ones(len(model.get_xyz))
 
 
 @dataclass
 class Running:
-    """A host under a session, and the handful of things a training loop does with it."""
+    """A host under a session, with the actions of a training loop."""
 
     session: Session
     driver: Host
@@ -343,7 +344,7 @@ class Running:
         return self.driver.camera(width, height, side=side)
 
     def render(self, camera: Any, model: Any, background: Tensor | None = None) -> dict[str, Any]:
-        """The host's own function, as its scripts hold it."""
+        """Draw a view with the host's own function."""
         background = torch.zeros(3) if background is None else background
         return self.driver.render(camera, model, background)
 
@@ -354,11 +355,11 @@ class Running:
 
 @contextlib.contextmanager
 def imported(path: Path, packages: Sequence[str] = ()) -> Iterator[None]:
-    """A host's folder first on the path; its modules are forgotten afterwards.
+    """Put a host's folder first on the path; afterwards its modules are forgotten.
 
     Args:
         path: the folder.
-        packages: the host's own in it, where it is the folder of all that is installed.
+        packages: the host's packages, if the folder is that of all installed packages.
     """
     known = set(sys.modules)
     sys.path.insert(0, str(path))
@@ -384,16 +385,16 @@ def running(
     active: bool = True,
     **options: Any,
 ) -> Iterator[Running]:
-    """The host in this process, imported under a session (activated unless told otherwise).
+    """Import the host in this process under a session, which is activated by default.
 
     Args:
         settings: of the fine-tuning.
-        adapter: of the host.
+        adapter: the host's adapter.
         path: its folder.
-        driver: how to drive it.
-        plugins: objects with hooks to register besides.
-        active: False makes the session and leaves its activation to the caller.
-        options: of the session; our stand-ins are used unless these say otherwise.
+        driver: how to drive the host.
+        plugins: further objects with hooks to register.
+        active: False leaves the session's activation to the caller.
+        options: of the session; by default it uses our stand-ins.
     """
     loaded = load_plugins()
     for index, plugin in enumerate(plugins or ()):
@@ -411,15 +412,15 @@ def running(
 
 
 def packages_of(adapter: HostAdapter, driver: Host) -> tuple[str, ...]:
-    """The installed packages that are the host; none where it is a folder of its own."""
+    """The installed packages of the host; empty if it is a checkout."""
     return adapter.installed if driver.package else ()
 
 
 @contextlib.contextmanager
 def alone(*, driver: Host, **options: Any) -> Iterator[Running]:
-    """The host by itself, nothing wrapped; our stand-ins are its compiled packages.
+    """The host alone, with nothing wrapped; our stand-ins replace its compiled packages.
 
-    One that cannot draw so on this machine has a session that follows no model, and only draws.
+    If the host cannot draw so on this machine, a session draws for it and follows no model.
     """
     with running(driver=driver, active=not driver.draws_alone, learn=False, **options) as host:
         if driver.draws_alone:
@@ -440,12 +441,12 @@ def tensors(driver: Host, model: Any) -> dict[str, Tensor]:
 
 
 def logits_of(marks: Tensor) -> Tensor:
-    """The threshold logit that ``label`` gives the bearer of a mark."""
+    """The threshold logit that ``label`` gives to a marked row."""
     return -3 + marks.float() / 8
 
 
 def label(host: Running, model: Any) -> None:
-    """Mark row i with i, and give it a threshold and moments that only i has."""
+    """Mark row i with i, and give it a unique threshold and unique moments."""
     numbers = torch.arange(host.adapter.rows(model))
     host.driver.mark(model, numbers)
     host.store(model).load_state_dict(
@@ -460,13 +461,13 @@ def label(host: Running, model: Any) -> None:
 
 
 def expect_ancestors(host: Running, model: Any) -> None:
-    """Every row has the threshold of the row it descends from, and its moments or none.
+    """Check that every row has its ancestor's threshold, and its ancestor's moments or none.
 
-    The marks are the shadow model: the host itself copies them from parents to children. Of the
-    descendants of one row at most one has its moments.
+    The host itself copies the marks from parents to children, so they tell each row's ancestor. At
+    most one descendant of a row may have its moments.
 
     Raises:
-        AssertionError: with the first row that has another's threshold.
+        AssertionError: names the first row with a wrong threshold.
     """
     store, marks = host.store(model), host.driver.marks(model)
     rows, state = host.adapter.rows(model), store.state_dict()

@@ -1,4 +1,4 @@
-"""Changes one thing in a host's source, as its authors might; for checks that must notice."""
+"""Changes one thing in a host's source, as its authors might, for checks that must notice."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def copy_source(repo: HostRepo, target: Path, packages: Sequence[str] = ()) -> H
     Args:
         repo: the host.
         target: an empty folder.
-        packages: the host's own, where its folder holds all that is installed.
+        packages: the host's packages, if its folder is that of all installed packages.
     """
     for folder in [repo.root / name for name in packages] or [repo.root]:
         for file in folder.rglob("*.py"):
@@ -33,7 +33,7 @@ def copy_source(repo: HostRepo, target: Path, packages: Sequence[str] = ()) -> H
 
 @contextmanager
 def changing(repo: HostRepo, seam: Seam) -> Iterator[None]:
-    """Inside, the module of a seam may be changed; it is put back afterwards."""
+    """A context in which a seam's module may be changed; it is restored at the end."""
     path, _ = _definition(repo, seam)
     original = path.read_bytes()
     try:
@@ -43,7 +43,7 @@ def changing(repo: HostRepo, seam: Seam) -> Iterator[None]:
 
 
 def rename_function(repo: HostRepo, seam: Seam) -> None:
-    """The seam's function is called something else."""
+    """Rename the seam's function."""
     path, function = _definition(repo, seam)
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     line = lines[function.lineno - 1]
@@ -52,7 +52,7 @@ def rename_function(repo: HostRepo, seam: Seam) -> None:
 
 
 def rename_parameter(repo: HostRepo, seam: Seam, name: str) -> None:
-    """One of the seam's parameters is called something else; its body is left to fail."""
+    """Rename one parameter of the seam's function, but not its uses in the body."""
     path, function = _definition(repo, seam)
     given = function.args
     (parameter,) = (
@@ -66,10 +66,10 @@ def rename_parameter(repo: HostRepo, seam: Seam, name: str) -> None:
 
 
 def unpack_one_more(repo: HostRepo, seam: Seam) -> int | None:
-    """The seam's function takes one value more from its rasterizer, wherever it unpacks radii.
+    """Unpack one more value from the rasterizer wherever the seam's function unpacks radii.
 
     Returns:
-        The line of the first; None where it unpacks none.
+        The line of the first change; None if the function unpacks no radii.
     """
     path, function = _definition(repo, seam)
     targets = [

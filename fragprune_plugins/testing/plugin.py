@@ -1,7 +1,8 @@
-"""The kit's pytest plugin: a table of adapters and invariants at the end, and as a file.
+"""The kit's pytest plugin: a table of adapters and invariants at the end, or in a file.
 
-Loaded by who asks for it: ``pytest_plugins = ["fragprune_plugins.testing.plugin"]`` in the topmost
-``conftest.py``, or ``pytest -p fragprune_plugins.testing.plugin``.
+Load it with ``pytest_plugins =
+["fragprune_plugins.testing.plugin"]`` in the topmost ``conftest.py``, or ``pytest -p
+fragprune_plugins.testing.plugin``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _SIGNS = {"passed": "ok", "failed": "FAILED"}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--fragprune-report``."""
+    """Add the option ``--fragprune-report``."""
     parser.getgroup("fragprune").addoption(
         "--fragprune-report",
         metavar="FILE",
@@ -30,12 +31,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin with no results."""
+    """Make an empty list of results."""
     config.stash[RESULTS] = []
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Note whose invariant a test is, for its report."""
+    """Note the adapter and the invariant of a test, for its report."""
     kind: Any = getattr(item, "cls", None)
     place = getattr(item, "callspec", None)
     if hasattr(kind, "longest_order") and place is not None and "place" in place.params:
@@ -52,7 +53,7 @@ class _Collector:
         self.results = results
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Keep what the test itself said, or the set-up that failed."""
+        """Keep the outcome of the test itself, or of a failed set-up."""
         properties: dict[str, Any] = dict(report.user_properties)
         if WHAT not in properties or (report.when != "call" and report.passed):
             return
@@ -74,12 +75,12 @@ class _Collector:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Listen."""
+    """Register the collector of results."""
     session.config.pluginmanager.register(_Collector(session.config.stash[RESULTS]))
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Adapters down, invariants across; reasons of what was skipped below."""
+    """Print a row for each adapter, a column for each invariant, and reasons of skips."""
     results = config.stash[RESULTS]
     if not results:
         return
@@ -96,7 +97,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 
 
 def table(results: list[dict[str, Any]]) -> list[str]:
-    """The results as lines of text, one an adapter and host."""
+    """The results as lines of text, one for each adapter and host."""
     columns = list(dict.fromkeys(result["invariant"] for result in results))
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for result in results:

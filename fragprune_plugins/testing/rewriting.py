@@ -1,4 +1,4 @@
-"""Makes a miniature of one host from another's source: passages replaced, methods added."""
+"""Makes one host's miniature from another's source by replacing passages and adding methods."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Changes = Sequence[tuple[str, str]]
 
 
 def changed(text: str, changes: Changes) -> str:
-    """The text with each passage replaced.
+    """Replace each passage in a text.
 
     Raises:
-        ValueError: a passage is not there, or not once.
+        ValueError: a passage does not occur exactly once.
     """
     for old, new in changes:
         if (count := text.count(old)) != 1:
@@ -30,9 +30,9 @@ def rewrite(root: Path, changes: Mapping[str, Changes], added: type | None = Non
 
     Args:
         root: the host's folder.
-        changes: by file, relative to the folder.
-        added: its methods, as they are written, become GaussianModel's, and replace those of the
-            same names.
+        changes: passages to replace, by file relative to the folder.
+        added: a class; the source of its methods is added to GaussianModel and replaces methods of
+            the same names.
     """
     for name, passages in changes.items():
         file = root / name
@@ -54,7 +54,7 @@ def without(text: str, names: Collection[str]) -> str:
 
 
 def _body(kind: type) -> str:
-    """A class's methods as they are written, its docstring left out."""
+    """The source of a class's methods, without its docstring."""
     source = textwrap.dedent(inspect.getsource(kind))
     (definition,) = ast.parse(source).body
     assert isinstance(definition, ast.ClassDef)

@@ -40,9 +40,9 @@ def random_scene(
 ) -> RasterInputs:
     """Anisotropic splats of 0.3 to 12 pixels before a turned camera, awkward ones included.
 
-    Of each ten, one hugs a tile border, one lies off the image and one is behind the near plane or
-    behind the camera. Opacities run from 0.02 to 0.999, some colour channels clamp at zero, and
-    the first two share a mean, hence a depth.
+    Of each ten, one touches a tile border, one lies off the image, and one is behind the near plane
+    or the camera. Opacities run from 0.02 to 0.999, some colour channels clamp at zero, and the
+    first two share a mean, hence a depth.
 
     Args:
         seed: of the whole scene.
@@ -255,7 +255,7 @@ def cast(
 
 
 def concatenate(first: AnySplats, second: AnySplats) -> AnySplats:
-    """Both, first's rows first; they must be of one kind and have the same fields."""
+    """Concatenate two sets, the first one's rows first; both must have the same kind and fields."""
     others = _tensors(second)
     joined: dict[str, Any] = {
         name: torch.cat([t, others[name]]) for name, t in _tensors(first).items()
