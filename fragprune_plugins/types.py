@@ -1,4 +1,4 @@
-"""What one rasterization takes and gives. Frozen values; shapes are checked on construction."""
+"""The inputs and outputs of one rasterization. Frozen; construction checks shapes."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def _check(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = F
 
     Args:
         name: of the tensor.
-        tensor: anything; a dense tensor with its numbers in memory passes.
+        tensor: the value to check; only a dense tensor with its data in memory passes.
         shape: lengths; None stands for any.
-        whole: of an integer type instead of a floating one.
+        whole: require an integer type instead of a floating one.
     """
     if tensor is None:
         return
@@ -59,7 +59,7 @@ def _check(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = F
 
 
 def _is_whole(dtype: torch.dtype) -> bool:
-    """Whether it is an integer type; torch has no name for them all."""
+    """Whether a dtype is an integer type; torch has no common name for them."""
     import torch
 
     return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
@@ -319,7 +319,7 @@ class Splats:
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians live."""
+        """The device of the Gaussians."""
         return self.means.device
 
 
@@ -387,7 +387,7 @@ class SpacetimeSplats:
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians live."""
+        """The device of the Gaussians."""
         return self.means.device
 
 
@@ -401,14 +401,14 @@ _SPACETIME_KINDS = (
 
 @dataclass(frozen=True)
 class Moment:
-    """When and from where Gaussians in space and time are seen.
+    """A moment and a camera position at which Gaussians in space and time are cut.
 
     Attributes:
         timestamp: the moment.
         campos: (3,) camera centre in the world, for colour.
-        duration: longest period of the cosines that colour goes with; above 0.
-        sh_degree_t: how many of them are used at ``sh_degree`` 3, 0 to 2; None for colours that
-            time leaves alone.
+        duration: longest period of the colours' cosines in time; above 0.
+        sh_degree_t: how many cosines are used at ``sh_degree`` 3, 0 to 2; None for colours without
+            time.
         prefilter_var: when positive, added to the variance in time that the marginal sees.
         scale_modifier: factor on the scales.
     """
@@ -440,14 +440,14 @@ class Moment:
 
 @dataclass(frozen=True)
 class Sliced:
-    """N Gaussians at a moment. Who is not there is at the camera, and all else of it is 0.
+    """N Gaussians at a moment. Absent ones have their mean at the camera and zeros elsewhere.
 
     Attributes:
         means: (N, 3) world.
         cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
-        opacities: (N,) times how likely the moment is.
-        present: (N,) bool, those that are there: the moment is likelier than 0.05, 1 at its mean in
-            time, and the covariance is finite.
+        opacities: (N,) multiplied by the likelihood of the moment.
+        present: (N,) bool: whether the likelihood of the moment (1 at the mean in time) exceeds
+            0.05 and the covariance is finite.
         colors: (N, 3) RGB, not below 0; None without ``sh``.
     """
 
@@ -462,15 +462,15 @@ class Sliced:
 
 @dataclass(frozen=True)
 class Footprints:
-    """N Gaussians on the image already, of dialects that project in a way of their own.
+    """N Gaussians that are already projected, for dialects with their own projection.
 
-    One that has no tiles, a depth that is not positive or a conic that is not positive definite
-    draws nothing. All but ``tiles`` are differentiable.
+    A Gaussian draws nothing if it has no tiles, its depth is not positive, or its conic is not
+    positive definite. Everything but ``tiles`` is differentiable.
 
     Attributes:
         means2d: (N, 2) pixels; (0, 0) is the centre of the first pixel.
         conics: (N, 3) inverse covariances xx, xy, yy, pixels^-2.
-        depths: (N,) they are blended in this order, ties by row; 1 / depth feeds ``invdepth``.
+        depths: (N,) the order of blending, ties by row; 1 / depth feeds ``invdepth``.
         opacities: (N,) in (0, 1), used as given.
         colors: (N, 3) RGB, used as given.
         tiles: (N, 4) integers x0, y0, x1, y1, half open: the 16x16 tiles it may draw in.
@@ -502,16 +502,16 @@ class Footprints:
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians live."""
+        """The device of the Gaussians."""
         return self.means2d.device
 
 
 @dataclass(frozen=True)
 class RasterInputs:
-    """One rasterization, of any dialect the engines know.
+    """The inputs of one rasterization, for any dialect that the engines support.
 
-    With ``Footprints``, of the view only size and background count, and scale_modifier, dilation,
-    compensation and near do not.
+    With ``Footprints``, only the size and background of the view are used; scale_modifier,
+    dilation, compensation and near are ignored.
 
     Attributes:
         view: the camera.
@@ -577,7 +577,7 @@ class RasterInputs:
             )
 
     def check_thresholds(self, thresholds: Tensor | None) -> None:
-        """What every engine does first: raise InputError unless there is one per Gaussian, or None.
+        """Raise InputError unless there is one threshold per Gaussian, or None.
 
         Args:
             thresholds: (N,) falloff in (0, 1), of any floating type; None for no truncation.
@@ -585,13 +585,13 @@ class RasterInputs:
         _check("thresholds", thresholds, len(self.splats))
 
     def with_counts(self) -> RasterInputs:
-        """The same, counting fragments per pixel and per Gaussian."""
+        """The same inputs with ``counts`` on."""
         return replace(self, counts=True)
 
 
 @dataclass(frozen=True)
 class RasterOutputs:
-    """What every engine returns; adapters pick what their host wants.
+    """The outputs of one rasterization; an adapter passes its host the ones that it expects.
 
     Attributes:
         image: (3, H, W) RGB with background, not clamped.
@@ -602,7 +602,7 @@ class RasterOutputs:
         fragments_per_pixel: scalar, drawn fragments over pixels; differentiable in the thresholds
             through the rim surrogate, so ``loss + pressure * fragments_per_pixel`` is the fragment
             pressure.
-        evaluated_per_pixel: (Gaussian, pixel) pairs the engine tested, its waste included.
+        evaluated_per_pixel: (Gaussian, pixel) pairs that the engine tested, per pixel.
         fragments: (H, W) int32 drawn fragments per pixel, when counts were asked for.
         fragments_per_gaussian: (N,) int32 drawn fragments, when counts were asked for.
         stages: milliseconds of the forward pass by stage, from engines that keep time.

@@ -1,4 +1,4 @@
-"""What a host is: its source read without importing it, the adapter that describes it.
+"""What a host is: its source, read without an import, and the adapter that describes it.
 
 source    reads a checkout              findings  what reading brings to light
 seams     where a host is entered       adapter   what every adapter says of its host

@@ -1,4 +1,4 @@
-"""What an adapter is: a description of one host. Patching and un-patching are the session's."""
+"""An adapter describes one host. The session patches the host and restores it."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ CHECKPOINT_KEY = "fragprune"
 
 @dataclass(frozen=True)
 class HostInfo:
-    """Who the host is, for people.
+    """The host's name and limits, as text for people.
 
     Attributes:
         title: the method's name.
         repo: owner/name of its public repository.
         states: the revisions this adapter was written for.
-        limits: what will not work with this host, or is refused; a sentence each.
+        limits: things that do not work with this host or are refused, one sentence each.
     """
 
     title: str
@@ -48,13 +48,13 @@ class HostInfo:
 
 @dataclass(frozen=True)
 class HostCall:
-    """The host's call of its rasterizer as data: positional or keyword, no matter.
+    """The host's call of its rasterizer as data, with all arguments by name.
 
     Attributes:
-        settings: what the host configured its rasterizer with.
+        settings: the host's rasterizer settings.
         arguments: of the call, by name.
         entry: the function called, "module:attribute" as seams spell it.
-        engine: what draws it, for dialects that compute with it beforehand (``slice_at``).
+        engine: draws the call; dialects may compute with it first (``slice_at``).
     """
 
     settings: Any
@@ -64,13 +64,13 @@ class HostCall:
 
     @classmethod
     def of(cls, call: SeamCall) -> HostCall:
-        """The call of a rasterizer's seam; what it takes as ``**more`` as given."""
+        """Build from a call at a RASTERIZE seam; arguments in ``**more`` are kept by name."""
         settings = getattr(call.instance, "raster_settings", None)
         named = call.arguments
         return cls(settings, named | named.get("more", {}), str(call.seam))
 
     def get(self, name: str) -> Tensor | None:
-        """A tensor argument; None when it is absent, None or empty (hosts pass all three)."""
+        """A tensor argument, or None if it is absent, None or empty (hosts pass all three)."""
         value: Tensor | None = self.arguments.get(name)
         return None if value is None or value.numel() == 0 else value
 
@@ -80,37 +80,37 @@ class HostCall:
 
 
 class Dialect(ABC):
-    """How one revision of a host calls its rasterizer, and what it expects back."""
+    """Translates one revision's rasterizer call into ``RasterInputs``, and the outputs back."""
 
     means: ClassVar[str] = "means3D"
     """What the call names the (N, 3) means."""
 
     @abstractmethod
     def unpack(self, call: HostCall) -> RasterInputs:
-        """The host's call as core values."""
+        """Translate the host's call into ``RasterInputs``."""
 
     def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
         """Rows (M,) int64 of the model that a call draws, in its order; None for all.
 
         Raises:
-            AlignmentError: the call's Gaussians cannot be told to be those rows.
+            AlignmentError: the call's Gaussians cannot be matched to rows of the model.
         """
         return None
 
     @abstractmethod
     def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
-        """What the host expects back, arity and all."""
+        """Translate outputs into the tuple that the host expects."""
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
     ) -> Any:
-        """Draw and pack; a dialect may draw several times where one picture does not say it all.
+        """Draw and pack. A dialect may draw several times for one call.
 
         Args:
             call: the host's.
-            inputs: what ``unpack`` made of it.
-            draw: rasterizes inputs, with the thresholds that apply to this call; where one call
-                is of several cameras, a second argument numbers them from 0.
+            inputs: the result of ``unpack``.
+            draw: rasterizes inputs with the thresholds of this call. If one call has several
+                cameras, a second argument numbers them from 0.
         """
         return self.pack(draw(inputs), call)
 
@@ -123,50 +123,50 @@ class Dialect(ABC):
         """
 
     def names(self) -> frozenset[str]:
-        """The import names that ``modules`` answers: their packages need not be installed."""
+        """The import names in ``modules``; these packages need not be installed."""
         return frozenset(self.modules(lambda call: None))
 
     def stands_in(self, call: HostCall) -> bool:
-        """Whether ours must answer a call because the host's own function could not."""
+        """Whether our engine must answer a call that the host's own function cannot."""
         return False
 
     def present(self, package: str) -> bool:
-        """Whether the host can import this compiled package of its own here."""
+        """Whether the host can import its own compiled package here."""
         try:
             return find_spec(package) is not None
         except ValueError:  # a module without a spec is a stand-in somebody else put there
             return True
 
     def spares(self) -> dict[str, ModuleType]:
-        """Stand-ins for what the host imports and can do without, used on a CPU where absent."""
+        """Stand-ins for packages that the host imports but does not need, for a CPU."""
         return {}
 
 
 @dataclass(frozen=True)
 class ConfigFile:
-    """A file whose values win over a host's command line; JSON, one object.
+    """A configuration file (one JSON object) whose values override the host's command line.
 
     Attributes:
-        flag: that names it.
+        flag: the flag that names the file.
     """
 
     flag: str
 
     def read(self, path: Path) -> dict[str, Any]:
-        """Values by argument name; OSError or ValueError where there is nothing to be read."""
+        """Values by argument name; raises OSError or ValueError if the file cannot be read."""
         values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         return values
 
     def overrule(self, text: str, values: dict[str, Any]) -> str:
-        """The file's text with these values in place of its own."""
+        """Replace the file's values by these; returns the new text."""
         return json.dumps(json.loads(text) | values)
 
 
 def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
-    """What a configuration file says, by argument name.
+    """The values of a configuration file by argument name.
 
     Raises:
-        UsageError: it cannot be read.
+        UsageError: the file cannot be read.
     """
     try:
         return config.read(path)
@@ -178,29 +178,29 @@ def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class CommandLine:
-    """How a host's training script is told what we need to tell it, and tells what we must know.
+    """The flags of a host's training script that fragprune sets or reads.
 
     Attributes:
-        scripts: paths of training scripts in the checkout, the usual one first; others (render.py)
-            only get thresholds applied.
-        iterations: flag, or its several spellings, of the total number of iterations.
+        scripts: paths of training scripts in the checkout, the usual one first. Other scripts, such
+            as render.py, only draw with thresholds.
+        iterations: the flag of the total number of iterations, or all its spellings.
         output: flags of the output folder.
         source: flags of the data folder.
-        save_checkpoints: flag listing iterations to checkpoint at.
-        resume: flag, or its several spellings, naming the file to resume from.
-        default_iterations: of the host, read from its source.
-        continues: those of the scripts that work on a checkpoint they are given: where ``resume``
-            names one it is stage 1's, not ours to start stage 2 from.
-        config: the file whose values the host puts over its command line, where it has one.
-        checkpoints_only: no other file holds the model, so every stage asks for a last one.
-        skipped: iterations of a run, fresh or resumed, in which no optimizer steps: hosts take no
-            step in their last one. Stage 2 has as many more, and so all the steps it is asked for.
-        restarts: there are no checkpoints: ``resume`` names a model's PLY, from which a new run
-            begins. It counts from 0 and empties its output folder, so stage 2 gets one of its own.
-        resolution: flags of the images' size, () where there are none.
-        images: flags of the folder with the images, likewise.
-        white_background: flags that ask for white behind transparent images, likewise.
-        hold_out: flags without which no view is held out; () where views always are.
+        save_checkpoints: the flag that lists the iterations at which to checkpoint.
+        resume: the flag that names the file to resume from, or all its spellings.
+        default_iterations: the host's default, read from its source.
+        continues: the scripts that always start from a given checkpoint. If ``resume`` names one,
+            it belongs to stage 1, and stage 2 does not start from it.
+        config: the file whose values override the command line; None if the host has none.
+        checkpoints_only: only checkpoints hold the model, so every stage writes one at its end.
+        skipped: number of iterations of a run without an optimizer step; hosts take none in their
+            last one. Stage 2 runs as many extra iterations, so it makes all its steps.
+        restarts: the host has no checkpoints. ``resume`` names a PLY, from which a new run begins.
+            The run counts from 0 and empties its output folder, so stage 2 gets its own folder.
+        resolution: flags of the images' size; () if there are none.
+        images: flags of the folder with the images; () if there are none.
+        white_background: flags for white behind transparent images; () if there are none.
+        hold_out: flags that make the host hold views out; () if it always does.
     """
 
     scripts: tuple[str, ...]
@@ -221,17 +221,17 @@ class CommandLine:
     hold_out: tuple[str, ...] = ()
 
     def spellings(self, field: str) -> tuple[str, ...]:
-        """Every spelling of a flag, the one to use last."""
+        """All spellings of a flag; the last one is the one to use."""
         flags = getattr(self, field)
         return (flags,) if isinstance(flags, str) else flags
 
     def read(self, arguments: list[str]) -> argparse.Namespace:
-        """The values of the flags above, by field, as the host will read them; it reads them all.
+        """The values of the flags above by field, as the host will read them.
 
-        None (False for those without a value) where the command does not say.
+        A flag that the command lacks gives None, or False if it takes no value.
 
         Raises:
-            UsageError: a flag without its value, or a configuration file that cannot be read.
+            UsageError: a flag lacks its value, or the configuration file cannot be read.
         """
         parser = Flags(add_help=False, conflict_handler="resolve")
         options: dict[str, dict[str, Any]] = {
@@ -260,25 +260,24 @@ class CommandLine:
 
 
 class HostAdapter(ABC):
-    """Describes one host: what identifies it, where to wrap, how its tensors are named.
+    """Describes one host: how to recognise it, which functions to wrap, how its tensors are named.
 
-    Subclasses are stateless; what depends on the revision comes from a ``HostRepo``. A host with
-    training scripts has a ``ScriptAdapter``.
+    Subclasses are stateless; anything that depends on the revision comes from a ``HostRepo``. A
+    host with training scripts has a ``ScriptAdapter``.
 
     Attributes:
-        name: of the adapter, as ``--adapter`` takes it.
-        info: who the host is, for people.
-        seams: where to wrap.
-        descends_from: names of adapters whose hosts this one was made from: where they fit too,
-            they step back.
-        installed: import names of the packages that are the host, where it is installed, not
-            checked out.
-        steps_by_rendering: the host does not call the STEP seam in every iteration: where it did
-            not, the first view that it draws with gradients begins the step.
-        appearance: param groups that hold the colour: ``--train appearance`` trains them besides.
-        inherited: param groups that children have from their parents bit for bit, which is checked.
-        gradients_read: param groups whose gradient the host reads in every iteration: frozen, they
-            get zeros.
+        name: the adapter's name, for ``--adapter``.
+        info: the host's name and limits, as text for people.
+        seams: the functions to wrap.
+        descends_from: names of the adapters of this host's ancestors. If an ancestor's adapter fits
+            too, this one is chosen.
+        installed: import names of the host's packages, if it is installed instead of checked out.
+        steps_by_rendering: the host does not call the STEP seam in every iteration. In an iteration
+            without that call, the first view drawn with gradients begins the step.
+        appearance: param groups of the colour, which ``--train appearance`` also trains.
+        inherited: param groups that children copy from their parents bit for bit; this is checked.
+        gradients_read: param groups whose gradient the host reads in every iteration. While frozen,
+            they get zeros.
     """
 
     name: str
@@ -294,15 +293,15 @@ class HostAdapter(ABC):
     # -- the source ------------------------------------------------------------------------------
 
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
-        """The seams of this revision; all of ``seams`` unless a host says otherwise."""
+        """The seams of this revision; by default all of ``seams``."""
         return self.seams
 
     @abstractmethod
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """What the source says about being this host; an error finding means it is not."""
+        """Findings on whether the source is this host; an error finding means that it is not."""
 
     def match(self, repo: HostRepo) -> Match:
-        """Fingerprint and seams together; an adapter that raises does not fit."""
+        """Check fingerprint and seams. An adapter that raises does not fit."""
         try:
             findings = [*self.fingerprint(repo), *check_seams(repo, self.seams_for(repo))]
         except Exception as error:  # the adapter's own; others are still tried
@@ -321,10 +320,10 @@ class HostAdapter(ABC):
 
     @abstractmethod
     def dialect(self, repo: HostRepo) -> Dialect:
-        """How this revision calls its rasterizer."""
+        """The dialect of this revision's rasterizer call."""
 
     def use(self, repo: HostRepo) -> str:
-        """What a user of this host types, for people to read."""
+        """The command that a user of this host types, as text for people."""
         package = self.installed[0] if self.installed else "the host"
         call = f'fragprune_plugins.activate("{self.name}")'
         return f"{call} above the import of {package} in your own script"
@@ -333,7 +332,7 @@ class HostAdapter(ABC):
 
     @abstractmethod
     def means(self, model: Any) -> Tensor:
-        """(N, 3) the tensor the host hands its rasterizer: identifies the model."""
+        """(N, 3) the tensor that the host passes to its rasterizer; it identifies the model."""
 
     @abstractmethod
     def opacities(self, model: Any) -> Tensor:
@@ -344,35 +343,37 @@ class HostAdapter(ABC):
         return len(self.means(model))
 
     def view(self, camera: Any) -> int:
-        """Tells training views apart; by the object, unless a host draws through copies."""
+        """A key that identifies a training view; by default the object's id."""
         return id(camera)
 
     def model_of(self, call: SeamCall) -> Any:
-        """The model that a seam's call is about: what the method was called on, unless a host has
-        trainers, or functions, that change models.
+        """The model of a seam's call: by default the object of the method.
 
-        The tensor of its means will do where a call has no more; None where it is of no concern.
+        Override this for hosts with trainers or functions that change models.
+
+        The tensor of the means is enough if a call has nothing else; None if the call concerns no
+        model of ours.
         """
         return call.instance
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
-        """What a param group is called in ``trained_groups``; None for one without a name."""
+        """The name of a param group for ``trained_groups``; None if it has none."""
         return group.get("name")
 
     def trained_groups(self, train: str) -> frozenset[str] | None:
-        """Names of param groups that stage 2 trains for ``--train``; None for all of them."""
+        """The param groups that stage 2 trains for a value of ``--train``; None for all."""
         opacity = frozenset({"opacity"})
         return {"opacity": opacity, "appearance": opacity | self.appearance, "all": None}[train]
 
     def elsewhere(self, model: Any) -> list[Tensor]:
-        """Parameters of an optimizer that is out of our reach, moved by what is drawn alone."""
+        """Parameters of an optimizer that we cannot reach, which drawing alone moves."""
         return []
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
-        """A chance to bring back state that the host's own resume loses."""
+        """Restore state that the host's own resume loses."""
 
     def checkpoint_state(self, capture: Any) -> dict[str, Any]:
-        """The dict inside the host's checkpoint tuple that tolerates a key of ours."""
+        """The dict inside the host's checkpoint tuple that can hold a key of ours."""
         raise NotImplementedError(f"{self.name}: CAPTURE and RESTORE seams need checkpoint_state")
 
 
@@ -381,10 +382,10 @@ class ScriptAdapter(HostAdapter):
 
     @abstractmethod
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """How to drive the host's training script."""
+        """The flags of the host's training script."""
 
     def use(self, repo: HostRepo) -> str:
-        """What a user of this host types, for people to read."""
+        """The command that a user of this host types, as text for people."""
         script = self.command_line(repo).scripts[0]
         if not repo.package:
             return f"fragprune run -- python {repo.root / script} ..."
@@ -392,14 +393,14 @@ class ScriptAdapter(HostAdapter):
         return f"fragprune run -- python -m {module} ..."
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """The command that can resume what a training script left; the same one by default."""
+        """The command that can resume a training script's result; by default the same command."""
         return script, arguments
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
-        """What a training command reads its photographs from, and how.
+        """The photographs that a training command reads.
 
         Raises:
-            NotComparedError: no view is held out, or our own readers would read them otherwise.
+            NotComparedError: no view is held out, or our readers would read the images differently.
         """
         raise NotComparedError(
             self.name,
@@ -409,13 +410,13 @@ class ScriptAdapter(HostAdapter):
         )
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """How the finished model of a training command is drawn, beyond vanilla's rules.
+        """How to draw the finished model of a training command, where vanilla's rules do not apply.
 
         Returns:
             Fields of ``RasterInputs``.
 
         Raises:
-            NotComparedError: our engines would draw it otherwise than the host.
+            NotComparedError: our engines would draw the model differently from the host.
         """
         return {}
 
@@ -428,12 +429,12 @@ class ScriptAdapter(HostAdapter):
 
     @abstractmethod
     def model_file(self, output: Path, iteration: int) -> Path:
-        """Where the host saves its model at an iteration."""
+        """The file to which the host saves its model at an iteration."""
 
     @abstractmethod
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """Resumable files of an output folder, (iteration, checkpoint or PLY), newest last."""
+        """Files of an output folder to resume from: (iteration, checkpoint or PLY), newest last."""
 
     @abstractmethod
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
-        """Write a checkpoint the host can resume from, made from its PLY."""
+        """Make a checkpoint from a PLY of the host, from which the host can resume."""

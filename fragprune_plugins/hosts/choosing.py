@@ -1,4 +1,4 @@
-"""Chooses the adapter of a checkout: the one asked for, or the only one that fits."""
+"""Chooses the adapter of a checkout: the named one, or the only one that fits."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _SHORT = 100
 
 @dataclass(frozen=True)
 class Tried:
-    """One adapter tried on one codebase.
+    """The result of one adapter on one codebase.
 
     Attributes:
-        adapter: that was tried.
-        match: what its fingerprint and its seams say.
-        seams: each as the source has it.
+        adapter: the adapter.
+        match: the result of its fingerprint and its seams.
+        seams: the state of each seam in the source.
     """
 
     adapter: HostAdapter
@@ -32,41 +32,41 @@ class Tried:
 
     @property
     def held(self) -> int:
-        """Seams that are as the adapter needs them."""
+        """The number of seams that are as the adapter needs them."""
         return sum(state.status == "found" for state in self.seams)
 
     @property
     def looked_up(self) -> int:
-        """Seams that source can tell about."""
+        """The number of seams that the source can decide."""
         return sum(state.status != "at import" for state in self.seams)
 
     @property
     def order(self) -> tuple[int, float, int]:
-        """By kinds of errors, then by the share of seams that hold, then by how much is wrong."""
+        """Sort key: kinds of errors, share of seams that hold, size of the errors."""
         kinds = {finding.code for finding in self.errors}
         complaint = sum(len(finding.found) for finding in self.errors)
         return len(kinds), -self.held / max(1, self.looked_up), complaint
 
     @property
     def errors(self) -> list[Finding]:
-        """What speaks against the adapter."""
+        """The errors of the adapter on this codebase."""
         return [finding for finding in self.match.findings if finding.level == "error"]
 
     def verdict(self) -> str:
-        """Whether it fits, and how much of it."""
+        """Whether the adapter fits, and how many seams hold, as text."""
         return (
             f"{self.adapter.name} {'fits' if self.match.fits else 'does not fit'}: "
             f"{self.held} of {self.looked_up} seams hold"
         )
 
     def brief(self) -> str:
-        """The verdict, and where it is no, what speaks against it first; in one short line."""
+        """The verdict and the first error, if any, in one short line."""
         line = self.verdict() + (f"; {self.errors[0].found}" if self.errors else "")
         return line if len(line) <= _SHORT else f"{line[: _SHORT - 3].rstrip()}..."
 
 
 def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> list[Tried]:
-    """Each adapter tried on a codebase, the one that fits best first."""
+    """Try each adapter on a codebase; returns the results, best fit first."""
     tried = []
     for adapter in adapters:
         match = adapter.match(repo)
@@ -82,10 +82,10 @@ def locate(
     name: str | None = None,
     select: Callable[..., str | None] | None = None,
 ) -> tuple[HostRepo, HostAdapter]:
-    """The checkout that a script's folder is, or lies in, and its adapter; see ``choose``.
+    """Find the checkout that contains a script's folder, and its adapter; see ``choose``.
 
-    Where that is no host but its scripts import one that is installed, or ``name`` is the adapter
-    of such a one, the installed package.
+    If the folder is no host, but its scripts import an installed host, or ``name`` is the adapter
+    of an installed host, the result is the installed package.
     """
     repo, above = HostRepo(folder), HostRepo(folder.resolve().parent)
     try:
@@ -110,18 +110,18 @@ def choose(
     name: str | None = None,
     select: Callable[..., str | None] | None = None,
 ) -> HostAdapter:
-    """The adapter for a checkout: the one asked for, or the only one that fits.
+    """Choose the adapter for a checkout: the named one, or the only one that fits.
 
-    Where the adapters of a host and of an ancestor of it both fit, it is the host's: ``closest``.
+    If the adapters of a host and of its ancestor both fit, the host's is chosen (``closest``).
 
     Args:
         repo: the checkout.
         adapters: to choose from.
-        name: of the one asked for.
+        name: of the adapter that the user named.
         select: breaks a tie; the hook ``fragprune_select_adapter``.
 
     Raises:
-        UnknownHostError: none fits, the one asked for does not, or several do.
+        UnknownHostError: no adapter fits, the named one does not fit, or several fit.
     """
     by_name = {adapter.name: adapter for adapter in adapters}
     if name is not None and name.replace("_", "-") not in by_name:
@@ -157,7 +157,7 @@ def choose(
 
 
 def _nearest(repo: HostRepo, adapters: Sequence[HostAdapter]) -> str:
-    """What speaks against the adapter that comes nearest."""
+    """The errors of the adapter that comes nearest."""
     if not adapters:
         return "none is installed"
     best = attempt(repo, adapters)[0]
@@ -167,11 +167,11 @@ def _nearest(repo: HostRepo, adapters: Sequence[HostAdapter]) -> str:
 
 
 def closest(fitting: Sequence[HostAdapter], adapters: Sequence[HostAdapter]) -> list[HostAdapter]:
-    """Those of the adapters that fit which no other of them descends from.
+    """The fitting adapters without those that are ancestors of another fitting one.
 
     Args:
         fitting: adapters that fit a checkout.
-        adapters: all there are, for the way from a host to an ancestor of its ancestors.
+        adapters: all adapters, to find ancestors of ancestors.
     """
     parents = {adapter.name: adapter.descends_from for adapter in adapters}
     ancestors: set[str] = set()

@@ -1,4 +1,4 @@
-"""What reading a host brings to light: findings, and how well an adapter fits."""
+"""Results of reading a host: findings, and how well an adapter fits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing noticed about a host or an undone patch, fit to print and to serialise."""
+    """An observation about a host or a removed patch, for print and JSON."""
 
     level: Literal["info", "warning", "error"]
     code: str
@@ -30,7 +30,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Match:
-    """How well one adapter fits one folder, and why."""
+    """Whether one adapter fits one folder, with the findings."""
 
     adapter: str
     confidence: Literal["known", "none"]

@@ -1,4 +1,4 @@
-"""A host's flags, of which we read a few: argparse, with our own words for what is wrong."""
+"""Reads a few of a host's flags: argparse with our own error messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fragprune_plugins.errors import UsageError
 
 
 class Flags(argparse.ArgumentParser):
-    """Says what is wrong with a flag as we say everything."""
+    """An argument parser that raises our errors."""
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError; argparse would end the process."""

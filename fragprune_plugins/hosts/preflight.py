@@ -1,4 +1,4 @@
-"""Looks, before a host's script runs, at what it needs: the packages that it imports, its data."""
+"""Checks before a host's script runs that its packages and its data are there."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Missing:
 
     @property
     def distribution(self) -> str:
-        """What pip calls it."""
+        """The package's name for pip."""
         return DISTRIBUTIONS.get(self.module, self.module)
 
     def __str__(self) -> str:
@@ -53,15 +53,15 @@ def install(missing: Iterable[Missing]) -> str:
 def missing_imports(
     repo: HostRepo, scripts: Iterable[Path], provided: Collection[str]
 ) -> list[Missing]:
-    """Packages that scripts of a host import as they start, and that cannot be found here.
+    """Packages that a host's scripts import at their start and that are not installed.
 
-    Followed are the imports at the top of the scripts and of the host's own modules that these
-    import. Imports inside ``try``, a condition or a function are the host's to answer for.
+    This follows the imports at the top of the scripts and of the host's own modules that these
+    import. It ignores imports inside ``try``, a condition or a function.
 
     Args:
         repo: the host.
-        scripts: files that are run.
-        provided: import names, dotted, that we answer.
+        scripts: the files to run.
+        provided: dotted import names for which we have stand-ins.
     """
     found: dict[str, Missing] = {}
     for script in scripts:
@@ -74,13 +74,13 @@ def missing_imports(
 def expect(
     repo: HostRepo, script: Path, provided: Collection[str], data: Path | None = None
 ) -> None:
-    """Raise unless a script's packages and its data are there, naming all that is missing.
+    """Raise unless a script's packages and data are there; the error lists all missing ones.
 
     Args:
         repo: the host.
-        script: that is about to run.
-        provided: import names, dotted, that we answer.
-        data: folder that the command names.
+        script: the script that is about to run.
+        provided: dotted import names for which we have stand-ins.
+        data: the data folder that the command names.
 
     Raises:
         HostNeedsError: something is missing.
@@ -106,7 +106,7 @@ Module = tuple[HostRepo, str]
 
 
 def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Top-level names that a script imports and that are not the host's, and where."""
+    """Top-level names that a script imports from outside the host, with their places."""
     if repo.package and script.is_relative_to(repo.root):  # else a script beside the package
         begin = repo, ".".join(script.relative_to(repo.root).with_suffix("").parts)
     else:
@@ -132,7 +132,7 @@ def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterato
 
 
 def _imports(body: list[ast.stmt], main: bool) -> Iterator[ast.Import | ast.ImportFrom]:
-    """The statements of a module that import whatever happens."""
+    """The import statements of a module that always run."""
     for node in body:
         if isinstance(node, ast.Import | ast.ImportFrom):
             yield node
@@ -141,7 +141,7 @@ def _imports(body: list[ast.stmt], main: bool) -> Iterator[ast.Import | ast.Impo
 
 
 def _is_main(node: ast.stmt) -> TypeGuard[ast.If]:
-    """``if __name__ == "__main__"``, whichever way round."""
+    """Whether a test is ``__name__ == "__main__"``, in either order."""
     return (
         isinstance(node, ast.If)
         and isinstance(node.test, ast.Compare)
@@ -153,7 +153,7 @@ def _is_main(node: ast.stmt) -> TypeGuard[ast.If]:
 
 
 def _names(node: ast.Import | ast.ImportFrom, package: list[str]) -> list[str]:
-    """Dotted names that a statement may import; what it takes from a module may be one too."""
+    """Dotted names that a statement may import; a name taken from a module may be a module too."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
     base = package[: len(package) - node.level + 1] if node.level else []
@@ -162,7 +162,7 @@ def _names(node: ast.Import | ast.ImportFrom, package: list[str]) -> list[str]:
 
 
 def _own(roots: list[HostRepo], name: str) -> list[Module]:
-    """The modules of the host's own that an import of this name runs."""
+    """The host's own modules that an import of this name runs."""
     parts, package = name.split("."), roots[-1].package
     if package and parts[0] != package:
         return []
@@ -175,7 +175,7 @@ def _own(roots: list[HostRepo], name: str) -> list[Module]:
 
 
 def _inside(repo: HostRepo, package: str) -> bool:
-    """Whether a checkout holds a package anywhere: hosts put folders of their own on the path."""
+    """Whether a checkout has a package in any folder, because hosts extend the path."""
     files = (f"{package}.py", f"{package}/__init__.py")
     return not repo.package and any(True for file in files for _ in repo.root.rglob(file))
 

@@ -1,7 +1,7 @@
-"""Seams: the places of a host where we wrap, as data.
+"""Seams: the functions of a host that we wrap, as data.
 
-A table can be printed, checked against source without importing it, tested in every order and
-undone; a procedure cannot.
+As data, seams can be printed, checked against the source without an import, tested in every order
+and undone.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 
 class Role(Enum):
-    """What the session does at a seam. A closed set; the session owns each one's meaning.
+    """What the session does at a seam. The set is closed; the session defines each role.
 
     Attributes:
-        does: that.
-        how: what the seam's ``how`` gives for a call, and when it is asked; "" where it is not.
+        does: what the session does, as text.
+        how: what the seam's ``how`` returns for a call, and when it is called; "" if it is not.
     """
 
     SCENE = "learn where the host writes its output"
@@ -71,22 +71,22 @@ class Role(Enum):
 
 
 NEEDS_HOW = frozenset({Role.ATTACH, Role.PARENTS, Role.REARRANGE, Role.PACK, Role.UNPACK})
-"""Roles in which only the host's adapter can say."""
+"""Roles whose seams need a ``how`` from the adapter."""
 
 
 @dataclass(frozen=True)
 class Seam:
-    """One (module, attribute) of a host.
+    """A function of a host, named by module and attribute.
 
     Attributes:
         role: what the session does there.
         module: dotted import name.
         attribute: dotted path inside it, such as "GaussianModel.training_setup".
-        needs: parameter names the function must have; the session reads its arguments by them, the
-            first one for itself.
+        needs: parameter names that the function must have. The session reads arguments by these
+            names, and uses the first one.
         external: the module is not part of the host's folder (a compiled package), so only the
             import can check it.
-        how: what the host does there in a way of its own; see the role.
+        how: a function for the host's own way of doing this; see the role.
     """
 
     role: Role
@@ -109,12 +109,12 @@ class SeamCall:
     """A call of the host's function at a seam.
 
     Attributes:
-        seam: where.
+        seam: the seam.
         function: the host's own.
         instance: what the method was called on; None for a function.
         args: as passed.
         kwargs: as passed.
-        model: that the call is about.
+        model: the model of the call.
         result: what the host's function returned; None until it was called.
     """
 
@@ -128,14 +128,14 @@ class SeamCall:
 
     @cached_property
     def arguments(self) -> dict[str, Any]:
-        """By name, those left out included."""
+        """All arguments by name, with defaults for omitted ones."""
         bound = signature(self.function).bind(*self.args, **self.kwargs)
         bound.apply_defaults()
         return bound.arguments
 
     @property
     def first(self) -> Any:
-        """The argument that the seam needs first."""
+        """The argument that ``needs`` names first."""
         return self.arguments[self.seam.needs[0]]
 
     def run(self, **changed: Any) -> Any:
@@ -153,7 +153,7 @@ class SeamCall:
         return self.result
 
     def how(self, otherwise: Any = None) -> Any:
-        """What the seam's ``how`` says of this call; ``otherwise`` where it has none."""
+        """The result of the seam's ``how`` for this call; ``otherwise`` if it has none."""
         return otherwise if self.seam.how is None else self.seam.how(self)
 
 
@@ -164,7 +164,7 @@ class RowTrace:
     Attributes:
         origins: (M,) int64, for each row of the model as it is now, the row it was or was copied
             from; None where nothing happened.
-        fresh: (M,) bool, True for rows that are new Gaussians or were made over.
+        fresh: (M,) bool, True for rows that are new or overwritten Gaussians.
     """
 
     origins: Tensor | None = None
@@ -176,14 +176,14 @@ class RowTrace:
 def revised(
     seams: Iterable[Seam], changes: Mapping[str, Mapping[str, Any] | None]
 ) -> tuple[Seam, ...]:
-    """A table of seams as a descendant has it.
+    """Change an ancestor's table of seams for a descendant.
 
     Args:
         seams: the ancestor's.
-        changes: other fields of a seam, by its attribute; None leaves it out.
+        changes: new field values of a seam, by its attribute; None removes the seam.
 
     Raises:
-        ValueError: a seam that is changed is not there.
+        ValueError: a changed seam is not in the table.
     """
     table = tuple(seams)
     if missing := changes.keys() - {seam.attribute for seam in table}:

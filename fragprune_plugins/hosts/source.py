@@ -19,7 +19,7 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def _definition(scope: ast.AST | None, name: str) -> ast.AST | None:
-    """The class or function of a name right inside a module or class."""
+    """The class or function with a name, directly inside a module or class."""
     body: Sequence[ast.stmt] = getattr(scope, "body", ())
     kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     return next((child for child in body if isinstance(child, kinds) and child.name == name), None)
@@ -27,7 +27,7 @@ def _definition(scope: ast.AST | None, name: str) -> ast.AST | None:
 
 @lru_cache(maxsize=256)
 def _parsed(text: str) -> ast.Module | None:
-    """A syntax tree, which nobody changes; None of what is no Python."""
+    """The syntax tree of a text, cached and never changed; None if it is not Python."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a host's invalid escapes are its own affair
@@ -38,7 +38,7 @@ def _parsed(text: str) -> ast.Module | None:
 
 @lru_cache(maxsize=256)
 def _identifiers(tree: ast.Module) -> dict[str, int]:
-    """Every name that a tree uses, defines, takes or reaches by a dot, and its first line."""
+    """Every name, attribute, definition and parameter in a tree, with its first line."""
     lines: dict[str, int] = {}
     for node in ast.walk(tree):
         for kind in ("id", "attr", "name", "arg"):
@@ -50,16 +50,16 @@ def _identifiers(tree: ast.Module) -> dict[str, int]:
 
 @cache
 def _distributions(package: str) -> str:
-    """What has installed an import name, with versions; reads the metadata of all that is there."""
+    """The distributions that provide an import name, with versions."""
     names = packages_distributions().get(package, ())
     return ", ".join(f"{name} {version(name)}" for name in sorted(set(names)))
 
 
 class HostRepo:
-    """A host's checkout, or installed package, read as text.
+    """A host's checkout or installed package, read as text.
 
     Args:
-        root: the folder its entry scripts lie in, or the one that its package lies in.
+        root: the folder of its entry scripts, or the folder that contains its package.
         package: import name of the installed package; "" for a checkout.
     """
 
@@ -98,7 +98,7 @@ class HostRepo:
         return node if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else None
 
     def place(self, module: str, attribute: str) -> str:
-        """The file:line of a definition; where it is absent, of as much of its path as exists."""
+        """The file:line of a definition, or of the existing part of its path if it is absent."""
         scope: ast.AST | None = self.tree(module)
         line = 1
         for name in attribute.split("."):
@@ -134,7 +134,7 @@ class HostRepo:
         ]
 
     def absolute(self, module: str, node: ast.ImportFrom) -> str:
-        """The dotted name that a ``from ... import`` in a module means, relative ones resolved."""
+        """The absolute dotted name of a ``from ... import`` in a module."""
         if not node.level:
             return node.module or ""
         path = self.path(module)
@@ -193,12 +193,12 @@ class HostRepo:
 
 @dataclass(frozen=True)
 class SeamState:
-    """A seam as the source has it.
+    """The state of a seam in the source.
 
     Attributes:
-        seam: looked up.
+        seam: the seam.
         status: "at import" where the source cannot tell, because the module is compiled.
-        at: "file:line" of the function, or of what it was expected in; "" at import.
+        at: "file:line" of the function, or of the place where it was expected; "" at import.
         finding: the error, where there is one.
     """
 
@@ -209,7 +209,7 @@ class SeamState:
 
 
 def look_up(repo: HostRepo, seams: Iterable[Seam]) -> list[SeamState]:
-    """Each seam in the source, in order; nothing is imported."""
+    """Look up each seam in the source, in order, without an import."""
     return [_look_up(repo, seam) for seam in seams]
 
 
@@ -233,5 +233,5 @@ def _look_up(repo: HostRepo, seam: Seam) -> SeamState:
 
 
 def check_seams(repo: HostRepo, seams: Iterable[Seam]) -> list[Finding]:
-    """An error for each seam that is missing or was changed."""
+    """An error finding for each seam that is missing or changed."""
     return [state.finding for state in look_up(repo, seams) if state.finding]

@@ -1,4 +1,4 @@
-"""The base of their adapters: model seams, param groups, row order, files, rasterizer call."""
+"""The base adapter: model seams, param groups, row order, files, rasterizer call."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def optimizers(call: SeamCall) -> list[Any]:
 
 
 def completed(call: SeamCall) -> Any:
-    """A checkpoint made from a PLY lacks the scene's extent; the fresh model knows it."""
+    """Add the scene's extent, from the new model, to a checkpoint made from a PLY."""
     *rest, spatial_lr_scale = call.first
     return (*rest, spatial_lr_scale or call.model.spatial_lr_scale)
 
@@ -82,12 +82,13 @@ MODEL_SEAMS: tuple[Seam, ...] = (
 
 @dataclass(frozen=True)
 class GraphdecoDialect(Dialect):
-    """How diff_gaussian_rasterization and its forks are called.
+    """The call of diff_gaussian_rasterization and its forks.
 
     Attributes:
         package: import name of the rasterizer.
         settings: field names of GaussianRasterizationSettings, as this revision passes them.
-        outputs: arity of what the host unpacks: 2 (colour, radii) or 3 (and inverse depth).
+        outputs: number of values that the host unpacks: 2 (colour, radii) or 3 (also inverse
+            depth).
         sparse_adam: the revision looks for SparseGaussianAdam in the package.
     """
 
@@ -97,7 +98,7 @@ class GraphdecoDialect(Dialect):
     sparse_adam: bool = False
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Matrices are already transposed for row vectors, as the core wants them."""
+        """Translate the call. The host's matrices are already transposed for row vectors."""
         import torch
 
         from fragprune_plugins.types import RasterInputs, Splats, View
@@ -133,11 +134,11 @@ class GraphdecoDialect(Dialect):
         )
 
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
-        """(colour (3, H, W), radii (P,) int32) or, with it, inverse depth (1, H, W)."""
+        """(colour (3, H, W), radii (P,) int32), and inverse depth (1, H, W) if ``outputs`` is 3."""
         return (outputs.image, outputs.radii, outputs.invdepth)[: self.outputs]
 
     def present(self, package: str) -> bool:
-        """A rasterizer that is a module of the host is compiled when it is imported, if it can."""
+        """Whether the package can be imported, or compiled if it is a module of the host."""
         if not self.package.startswith(f"{package}."):
             return super().present(package)
         from torch.cuda import is_available
@@ -146,7 +147,7 @@ class GraphdecoDialect(Dialect):
         return CUDA_HOME is not None and is_available()
 
     def names(self) -> frozenset[str]:
-        """The rasterizer's and simple_knn's, told without importing torch."""
+        """The import names of the rasterizer and simple_knn, without an import of torch."""
         return frozenset((self.package, "simple_knn", "simple_knn._C"))
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
@@ -158,15 +159,15 @@ class GraphdecoDialect(Dialect):
 
 
 class GraphdecoAdapter(ScriptAdapter):
-    """Base of every such adapter; a subclass adds its name and what its host has otherwise.
+    """Base of these adapters; a subclass adds its name and the differences of its host.
 
     Attributes:
         package: import name of the rasterizer.
-        calls: of the rasterizer that the dialect answers; a function may make any one of its own.
-        dialect_type: that answers them.
+        calls: calls of the rasterizer that the dialect answers; each function makes one of them.
+        dialect_type: the dialect that answers them.
         groups: names of the optimizer's param groups, in order, as ``training_setup`` spells them.
-        own_names: "module:name" of what this host's source mentions and its ancestors' does not.
-        scripts: that train, by their paths in the checkout, the usual one first.
+        own_names: "module:name" of names that only this host's source mentions, not its ancestors'.
+        scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
     """
 
@@ -194,14 +195,14 @@ class GraphdecoAdapter(ScriptAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Scripts, names of its own, param groups, and a rasterizer called as the dialect knows."""
+        """Check scripts, the host's own names, param groups, and the calls of the rasterizer."""
         missing = [f"no {name}" for name in self.scripts if not (repo.root / name).is_file()]
         for module, name in (each.split(":") for each in self.own_names):
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
         return [*self.other_host(repo, missing), *self._groups(repo), *self._calls(repo)]
 
     def _groups(self, repo: HostRepo) -> list[Finding]:
-        """An error where param groups are spelled out in the source and are others."""
+        """An error if the source spells out other param groups."""
         setup = "GaussianModel.training_setup"
         found = group_names(repo.function(MODEL, setup))
         if found in ((), self.groups):
@@ -210,7 +211,7 @@ class GraphdecoAdapter(ScriptAdapter):
         return [Finding("error", "param-groups", at, ", ".join(found), expected, OTHER)]
 
     def _calls(self, repo: HostRepo) -> list[Finding]:
-        """An error for each call of the rasterizer that is none of ``calls``."""
+        """An error for each call of the rasterizer that is not in ``calls``."""
         functions = dict.fromkeys(each.function for each in self.calls)
         there = [each for each in functions if repo.function(self.renderer, each)]  # or no seam
         found = []
@@ -241,7 +242,7 @@ class GraphdecoAdapter(ScriptAdapter):
         ]
 
     def other_host(self, repo: HostRepo, found: list[str]) -> list[Finding]:
-        """An error that says all of what speaks against this host, if anything does."""
+        """One error with all differences from this host, if there are any."""
         if not found:
             return []
         return [
@@ -256,7 +257,7 @@ class GraphdecoAdapter(ScriptAdapter):
         ]
 
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
-        """Read from the source of ``render``: what it passes and how many values it unpacks."""
+        """The dialect for the arguments and outputs in the source of ``render``."""
         call = next(iter(read_calls(repo, RENDERER, "render")), None)
         return self.dialect_type(
             package=self.package,
@@ -316,7 +317,7 @@ class GraphdecoAdapter(ScriptAdapter):
         return read_ply(ply)
 
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
-        """The 12-tuple of ``capture``, fresh moments, and the thresholds of the PLY's sidecar."""
+        """Write the tuple of ``capture``, with fresh moments and the sidecar's thresholds."""
         import torch
 
         from fragprune_plugins.storage import sidecar
@@ -358,7 +359,7 @@ class GraphdecoAdapter(ScriptAdapter):
             torch.save((capture, iteration), temporary)
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
-        """The command's, where it holds views out (``--eval``)."""
+        """The command's photographs, if it holds views out (``--eval``)."""
         line = self.command_line(repo)
         flags = line.read(arguments)
         if line.hold_out and not flags.hold_out:
@@ -376,7 +377,7 @@ class GraphdecoAdapter(ScriptAdapter):
         )
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """As vanilla draws."""
+        """No fields: vanilla's rules apply."""
         for flag in ("--antialiasing", "--train_test_exp"):
             if flag in arguments:
                 raise NotComparedError(
@@ -388,11 +389,14 @@ class GraphdecoAdapter(ScriptAdapter):
         return {}
 
     def model_file(self, output: Path, iteration: int) -> Path:
-        """Where ``scene.save`` writes."""
+        """The path to which ``scene.save`` writes."""
         return output / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """``chkpnt*.pth`` and PLYs; the host writes a checkpoint after the PLY of its iteration."""
+        """``chkpnt*.pth`` and PLYs.
+
+        The host writes a checkpoint after the PLY of the same iteration.
+        """
         plys = {
             path: path.parent.name.removeprefix("iteration_")
             for path in output.glob("point_cloud/iteration_*/point_cloud.ply")
@@ -423,11 +427,11 @@ def group_names(function: Function | None) -> tuple[str, ...]:
 
 
 def resolution(repo: HostRepo, asked: int | None) -> Resolution:
-    """What the host makes of its ``-r``: a divisor, 1,600 pixels at most, or else a width.
+    """The resolution for the host's ``-r``: a divisor, at most 1,600 pixels, or a width.
 
     Args:
-        repo: the checkout; which numbers are divisors is read from its source.
-        asked: the flag's value; None where the command has none.
+        repo: the checkout, whose source says which numbers are divisors.
+        asked: the flag's value; None if the command lacks it.
 
     Raises:
         NotComparedError: the host chooses sizes in another way.
@@ -465,8 +469,8 @@ def default(repo: HostRepo, group: str, name: str, otherwise: float) -> float:
     Args:
         repo: the checkout.
         group: class in ``arguments``, such as OptimizationParams.
-        name: of the attribute.
-        otherwise: where it is not spelled so.
+        name: the attribute.
+        otherwise: the result if the source has no such number.
     """
     function = repo.function("arguments", f"{group}.__init__")
     for node in ast.walk(function) if function else ():

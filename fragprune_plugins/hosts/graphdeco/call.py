@@ -1,4 +1,4 @@
-"""The call that a host's drawing functions make of their rasterizer, read from their source."""
+"""Reads the rasterizer calls of a host's drawing functions from their source."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ ARGUMENTS = (
 
 @dataclass(frozen=True)
 class RasterizerCall:
-    """What a drawing function of the host passes its rasterizer, and what it takes back.
+    """The arguments and outputs of a drawing function's rasterizer call.
 
     Attributes:
-        besides: settings passed besides the shared ones.
-        outputs: how many values come back; None where the host keeps the tuple whole.
-        function: of ``gaussian_renderer`` that makes the call.
-        arguments: that may be passed besides the shared ones.
+        besides: settings in addition to the shared ones.
+        outputs: number of returned values; None if the host does not unpack the tuple.
+        function: the function of ``gaussian_renderer`` that makes the call.
+        arguments: allowed arguments in addition to the shared ones.
         package: import name of the rasterizer; "" for the adapter's.
     """
 
@@ -42,7 +42,7 @@ class RasterizerCall:
     package: str = ""
 
     def answers(self, found: RasterizerCall) -> bool:
-        """Whether a dialect for this call can answer one that was found in a source."""
+        """Whether a dialect for this call can answer the call found in a source."""
         passed = replace(found, arguments=self.arguments)
         return found.arguments <= self.arguments and passed == self
 
@@ -60,10 +60,10 @@ class RasterizerCall:
 
 @dataclass(frozen=True)
 class CallInSource:
-    """One such call, where it is written.
+    """A rasterizer call, with its place in the source.
 
     Attributes:
-        call: what it amounts to, its package named.
+        call: the call, with its package filled in.
         settings: names passed by keyword, in order.
         line: where its result is assigned.
     """
@@ -91,7 +91,7 @@ def drawing_functions(repo: HostRepo, module: str) -> list[str]:
 def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]:
     """How a function calls the rasterizer, once for each place that does.
 
-    Empty where the function is absent or passes no settings by keyword.
+    Empty if the function is absent or passes no settings by keyword.
     """
     body = repo.function(module, function)
     made = (node for node in (ast.walk(body) if body else ()) if isinstance(node, ast.Call))
@@ -128,7 +128,7 @@ def _drawn(body: Function) -> Iterator[tuple[int | None, int, frozenset[str]]]:
 
 
 def _package(repo: HostRepo, module: str, body: Function) -> str:
-    """Where the function's rasterizer is imported from; its own imports go before the module's."""
+    """The package of the function's rasterizer, by the function's imports, then the module's."""
     for scope in (body, repo.tree(module)):
         for node in ast.walk(scope) if scope else ():
             if isinstance(node, ast.ImportFrom) and RASTERIZER in (a.name for a in node.names):

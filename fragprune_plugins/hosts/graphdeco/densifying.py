@@ -1,4 +1,4 @@
-"""Whom the densify methods copy, worked out before they draw: the ``how`` of PARENTS seams."""
+"""Computes the rows that densify methods will copy: the ``how`` of PARENTS seams."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ Needy = Callable[[Mapping[str, Any], int, Callable[..., "Tensor"]], "Tensor"]
 
 
 def needy(arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
-    """(rows,) bool: whose gradient on the screen asks a densify method for more Gaussians.
+    """(rows,) bool: rows whose screen gradient makes a densify method add Gaussians.
 
     Args:
         arguments: the method's.
-        rows: of the model now.
-        flat: (n, 1) -> (n,), as the method itself does it: rounded alike, whatever is equal to the
-            threshold for the host is so for us.
+        rows: number of rows of the model now.
+        flat: (n, 1) -> (n,), the method's own reduction, so that rounding agrees at the threshold.
     """
     return reaches(flat(arguments["grads"], dim=-1), arguments["grad_threshold"], rows)
 
 
 def reaches(grads: Tensor, threshold: Any, rows: int) -> Tensor:
-    """(rows,) bool: gradients (n,) at or above it; rows appended just now have none."""
+    """(rows,) bool: gradients (n,) at or above the threshold; rows just appended have none."""
     padded = grads.new_zeros(rows)
     padded[: len(grads)] = grads
     reached: Tensor = padded >= threshold
@@ -35,7 +34,7 @@ def reaches(grads: Tensor, threshold: Any, rows: int) -> Tensor:
 
 
 def clones(call: SeamCall, needy: Needy = needy) -> Tensor:
-    """Rows (n,) that densify_and_clone copies: small ones in need."""
+    """Rows (n,) that densify_and_clone copies: small Gaussians with a large gradient."""
     import torch
 
     size, limit = _sizes(call)
@@ -44,12 +43,12 @@ def clones(call: SeamCall, needy: Needy = needy) -> Tensor:
 
 
 def splits(call: SeamCall, needy: Needy = needy, copies: int | None = None) -> Tensor:
-    """Rows (n,) that densify_and_split copies: large ones in need, N times over.
+    """Rows (n,) that densify_and_split copies N times: large Gaussians with a large gradient.
 
     Args:
         call: of the method.
-        needy: asks who is in need.
-        copies: in place of N.
+        needy: selects the rows with a large gradient.
+        copies: replaces N.
     """
     import torch
 
@@ -60,6 +59,6 @@ def splits(call: SeamCall, needy: Needy = needy, copies: int | None = None) -> T
 
 
 def _sizes(call: SeamCall) -> tuple[Tensor, float]:
-    """Every Gaussian's largest scale, and the one that tells small from large."""
+    """Every Gaussian's largest scale, and the limit between small and large."""
     size: Tensor = call.model.get_scaling.detach().max(dim=1).values
     return size, call.model.percent_dense * call.arguments["scene_extent"]

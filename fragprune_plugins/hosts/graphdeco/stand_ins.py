@@ -1,7 +1,7 @@
-"""Modules of ours under the import names of the hosts' compiled packages.
+"""Stand-ins: our modules under the import names of the hosts' compiled packages.
 
-They answer where the compiled package cannot be imported, or the run has no GPU; the same call, our
-engine.
+They are used if the compiled package cannot be imported or the run has no GPU. The call is the
+same; our engine draws.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def rasterizer(
         package: its import name.
         settings: field names of the settings tuple, in order.
         sparse_adam: whether to offer SparseGaussianAdam.
-        draw: answers a bound call.
-        also: further methods of the rasterizer that are called as ``forward`` is.
+        draw: answers a call with bound arguments.
+        also: further methods of the rasterizer, called like ``forward``.
     """
     fields = [(name, Any) for name in settings]
     settings_type = NamedTuple("GaussianRasterizationSettings", fields)  # type: ignore[misc]
@@ -141,7 +141,7 @@ def compute_relocation(
         n_max: bound of N.
 
     Returns:
-        New opacity (P,) and scales, flat (3 P,), of each of the N.
+        The opacity (P,) and the scales, flat (3 P,), of each of the N Gaussians.
     """
     total, old = N.long(), opacity_old.double()
     opacity = -torch.expm1(torch.log1p(-old) / total)

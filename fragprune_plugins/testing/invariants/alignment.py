@@ -1,4 +1,4 @@
-"""Invariant 3: every Gaussian keeps its own threshold, whatever the host does to its rows."""
+"""Invariant 3: every Gaussian keeps its own threshold through all row operations of the host."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _each_action_works(case: Case, names: list[str]) -> None:
 
 
 def _rows_behind_the_store(case: Case) -> None:
-    """A store that lost rows is refused wherever it is used, with both counts."""
+    """A store that lost rows is refused at every use, with both counts."""
     with joint(**case.options()) as host, TemporaryDirectory() as folder:
         model, camera = host.model(COUNT), host.camera(16, 12)
         host.step(model, camera, 1)

@@ -1,4 +1,4 @@
-"""What a check is given, and what checks share."""
+"""The argument of a check, and helpers that checks share."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ COUNT = 16
 
 @dataclass(frozen=True)
 class Case:
-    """An adapter and a host to try it on.
+    """An adapter and the host to test it on.
 
     Attributes:
         adapter: under test.
         driver: how the host is driven.
-        root: the folder of a miniature, of a checkout or of what is installed; it is only read.
+        root: the folder of a miniature, of a checkout or of installed packages; it is only read.
         examples: sequences of actions to try.
-        longest: order of import, activation and deactivation to try.
+        longest: length of the longest order of import, activation and deactivation to try.
     """
 
     adapter: HostAdapter
@@ -45,16 +45,16 @@ class Case:
 
     @property
     def packages(self) -> tuple[str, ...]:
-        """The host's own in ``root``, where that is the folder of all that is installed."""
+        """The host's packages, if ``root`` is the folder of all installed packages."""
         return packages_of(self.adapter, self.driver)
 
     def source(self, folder: Path) -> HostRepo:
-        """A copy of the host's source, read as the host is."""
+        """A copy of the host's source, as a ``HostRepo``."""
         return HostRepo(folder, self.driver.package)
 
     @property
     def seams(self) -> tuple[Seam, ...]:
-        """Of this revision."""
+        """The seams of this revision of the host."""
         return self.adapter.seams_for(self.repo)
 
     def has(self, role: Role) -> bool:
@@ -62,10 +62,10 @@ class Case:
         return any(seam.role is role for seam in self.seams)
 
     def expect(self, promise: str, *roles: Role) -> None:
-        """Raise NotApplicable where the host says why a promise cannot be asked of it.
+        """Raise NotApplicable if the host gives a reason why it cannot keep a promise.
 
         Raises:
-            AssertionError: it says nothing, and a role has no seam.
+            AssertionError: there is no reason, and a role has no seam.
         """
         if promise in self.driver.lacks:
             raise NotApplicable(f"{NOT_APPLICABLE}{self.driver.lacks[promise]}")
@@ -74,20 +74,20 @@ class Case:
         require(not missing, f"no seam for {' and '.join(missing)}, and no reason in {where}")
 
     def options(self) -> dict[str, Any]:
-        """For ``running`` and ``joint``."""
+        """Keyword arguments for ``running`` and ``joint``."""
         return {"adapter": self.adapter, "path": self.root, "driver": self.driver}
 
 
 def require(condition: object, found: str) -> None:
-    """Raise AssertionError with what was found, unless the condition holds."""
+    """Raise AssertionError with a message unless the condition holds."""
     if not condition:
         raise AssertionError(found)
 
 
 class FixedThresholds:
-    """A plugin that answers with the thresholds it holds and remembers what was drawn.
+    """A plugin that answers with fixed thresholds and records the drawn inputs.
 
-    ``asking`` are the fields of the Gaussians that asked the engine for a gradient.
+    ``asking``: the fields of the Gaussians that required a gradient.
     """
 
     def __init__(self, values: Tensor | None = None) -> None:
@@ -96,7 +96,7 @@ class FixedThresholds:
 
     @hookimpl(tryfirst=True)
     def fragprune_truncate(self, inputs: Any, store: Any) -> Tensor | None:
-        """The thresholds held; those learned when there are none."""
+        """The fixed thresholds; None for the learned ones."""
         self.inputs = inputs
         drawn = vars(inputs.splats)
         self.asking = {name for name, t in drawn.items() if torch.is_tensor(t) and t.requires_grad}
@@ -105,7 +105,7 @@ class FixedThresholds:
 
 
 def open_all(host: Running, model: Any) -> Any:
-    """Thresholds between 0.02 and 0.4, unequal; returns the store."""
+    """Set unequal thresholds between 0.02 and 0.4; returns the store."""
     store = host.store(model)
     with torch.no_grad():
         store.logits.copy_(torch.logit(torch.linspace(0.02, 0.4, len(store))))

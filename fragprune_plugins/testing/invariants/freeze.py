@@ -1,4 +1,4 @@
-"""Invariant 6: stage 2 moves what it names, and nothing else."""
+"""Invariant 6: stage 2 moves the parameters that ``--train`` names, and nothing else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ASKED = {"opacity": {"opacities"}, "appearance": {"opacities", "sh", "colors"}}
 
 
 def freeze(case: Case) -> str:
-    """In stage 2 only what ``--train`` names and the thresholds change, to the bit."""
+    """In stage 2 only the parameters of ``--train`` and the thresholds change, to the bit."""
     driver = case.driver
     moving: dict[str, frozenset[str] | None] = {
         "opacity": driver.opacity,
@@ -62,12 +62,12 @@ def freeze(case: Case) -> str:
 
 
 def _asking(driver: Host, model: Any) -> set[str]:
-    """Parameters for which the host asks for a gradient."""
+    """The parameters that require a gradient."""
     return {name for name, value in driver.parameters(model).items() if value.requires_grad}
 
 
 def _expect_held(before: dict[str, Tensor], after: dict[str, Tensor], what: str) -> None:
-    """Require that a routine of the host changed nothing; its action itself makes rows faint."""
+    """Require that a routine of the host changed nothing; the action may make rows faint."""
     for name, value in before.items():
         same_rows = value.shape == after[name].shape
         require(same_rows, f"{what} made {len(after[name])} rows of {len(value)}")

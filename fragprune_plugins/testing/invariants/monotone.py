@@ -1,4 +1,4 @@
-"""Invariant 4: truncation only takes away, and takes all."""
+"""Invariant 4: a higher threshold never adds fragments, and can remove a Gaussian completely."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, ope
 
 
 def monotone(case: Case) -> str:
-    """A raised threshold adds no fragment; a Gaussian cut to nothing leaves no trace."""
+    """A higher threshold adds no fragment; a completely truncated Gaussian leaves no trace."""
     fragments = 0
     for seed in range(5):
         fixed = FixedThresholds()
@@ -43,7 +43,7 @@ def monotone(case: Case) -> str:
 def _counted(
     host: Running, fixed: FixedThresholds, model: Any, camera: Any, tau: Tensor
 ) -> tuple[Any, Tensor]:
-    """Draw through the host with thresholds, then the same once more, counting; and its radii."""
+    """Draw through the host with thresholds, then again with counts; returns both and the radii."""
     fixed.values = tau
     package = host.render(camera, model)
     assert fixed.inputs is not None
@@ -53,7 +53,7 @@ def _counted(
 
 
 def _no_trace(case: Case) -> None:
-    """Row 0 cut to nothing: picture and gradients are those of a scene where it is invisible."""
+    """A fully truncated row 0 gives the picture and gradients of an invisible row 0."""
     results = []
     for cut in (True, False):
         fixed = FixedThresholds()

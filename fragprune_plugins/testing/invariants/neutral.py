@@ -15,7 +15,7 @@ from fragprune_plugins.testing.invariants.case import COUNT, Case, require
 
 
 class NeverLearning(Schedule):
-    """Follows everything and learns nothing."""
+    """A schedule under which nothing learns."""
 
     def at(self, step: int) -> Any:
         """The plan, without learning."""
@@ -23,7 +23,7 @@ class NeverLearning(Schedule):
 
 
 def neutral_is_the_host(case: Case) -> str:
-    """Followed but not learning, parameters and random streams are the host's own to the bit."""
+    """If nothing learns, parameters and random streams are the host's own, to the bit."""
     never = NeverLearning(Settings(iterations=20))
     with alone(**case.options()) as host:
         own = _lifetime(host)
@@ -40,7 +40,7 @@ _STEPS = 6
 
 
 def _lifetime(host: Running) -> dict[str, Any]:
-    """Steps with everything the training loop does between; what came of it."""
+    """Take steps, with the training loop's other actions between them; returns the results."""
     torch.manual_seed(3)
     np.random.seed(3)
     random.seed(3)
@@ -69,7 +69,7 @@ def _compare(own: dict[str, Any], followed: dict[str, Any]) -> None:
 
 
 def _opened_changes_nothing(case: Case) -> tuple[int, int]:
-    """Freshly opened thresholds change no pixel, and gradients only in their rounding."""
+    """Newly opened thresholds change no pixel, and gradients only by rounding."""
     pictures, gradients = [], []
     for opened in (False, True):
         with joint(Settings(iterations=9, pressure=0.0), **case.options()) as host:

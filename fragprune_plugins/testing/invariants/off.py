@@ -1,4 +1,4 @@
-"""Invariant 1: installed but not active, every object of the host is its own."""
+"""Invariant 1: while fragprune is installed but inactive, every object of the host is its own."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from fragprune_plugins.testing.invariants.case import (
 
 
 def orders(longest: int) -> list[str]:
-    """Orders of I, which imports the host, A, which activates, and D, which deactivates.
+    """All orders of events: I imports the host, A activates, D deactivates.
 
     One import, at most two activations, nothing twice in a row.
     """
@@ -45,7 +45,7 @@ def orders(longest: int) -> list[str]:
 
 
 def off_is_off(case: Case, order: str) -> str:
-    """Whenever we are not active, every object of the host is its own, in this order of events."""
+    """In this order of events, every object of the host is its own whenever we are inactive."""
     dialect = case.adapter.dialect(case.repo)
     compiled = dialect.modules(_never_drawn)
     untold = compiled.keys() - dialect.names()
@@ -72,7 +72,7 @@ def off_is_off(case: Case, order: str) -> str:
 
 
 def _imported(seams: Iterable[Seam]) -> list[Seam]:
-    """The seams, their modules imported; a metric may need a package that is not installed."""
+    """Import the seams' modules; a metric's module may need a package that is not installed."""
     found = []
     for seam in seams:
         try:
@@ -86,7 +86,7 @@ def _imported(seams: Iterable[Seam]) -> list[Seam]:
 
 
 def _activate(session: Session, originals: dict[Seam, Any]) -> bool:
-    """Whether it took hold: not where a seam's module holds another's function by name already."""
+    """Activate; False if refused because a module already holds a seam's function."""
     try:
         session.activate()
     except LateImportError as error:
@@ -115,7 +115,7 @@ def _found(seam: Seam) -> Any:
 
 
 def _pure(seam: Seam, active: bool) -> Any:
-    """What the host itself defined there, below every wrapper of ours."""
+    """The host's own object at a seam, below every wrapper of ours."""
     value = _found(seam)
     while active and isinstance(value, wrapt.FunctionWrapper):
         value = value.__wrapped__
@@ -123,7 +123,7 @@ def _pure(seam: Seam, active: bool) -> Any:
 
 
 def _wrapped_names(case: Case) -> list[str]:
-    """Where the host's modules hold a wrapped function by name, wherever they imported it from."""
+    """The names in the host's modules that refer to wrapped functions."""
     inside = f"{case.repo.root}{os.sep}"
     modules = [
         module
@@ -140,7 +140,7 @@ def _wrapped_names(case: Case) -> list[str]:
 
 
 def nothing_stays(case: Case) -> str:
-    """After a session with learned thresholds the host draws, and computes, as it would alone."""
+    """After a session with learned thresholds the host draws and computes as it does alone."""
     names = list(case.adapter.dialect(case.repo).modules(_never_drawn))
     fixed = FixedThresholds()
     with joint(plugins=[fixed], **case.options()) as host:

@@ -54,7 +54,7 @@ def same_picture(case: Case) -> str:
 def _drawn_by(
     case: Case, engine: str, seed: int, mask: Tensor | None
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Picture and gradients where the mask holds, and drawn fragments (H, W), of one engine."""
+    """One engine's picture and gradients under the mask, and drawn fragments (H, W)."""
     fixed = FixedThresholds()
     settings = Settings(iterations=9, pressure=0.0)
     with joint(settings, plugins=[fixed], engine=engine, **case.options()) as host:

@@ -1,4 +1,4 @@
-"""Invariant 7: a changed host is refused by what changed."""
+"""Invariant 7: a changed host is refused, and the error names the change."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fragprune_plugins.testing.invariants.case import Case, require
 
 
 def refuse(case: Case) -> str:
-    """A host with one thing changed is refused by that thing's name, and nothing stays patched."""
+    """A host with one change is refused by the name of that change, and nothing stays patched."""
     require(case.adapter.match(case.repo).fits, "the adapter does not fit the host it is for")
     _is_chosen(case)
     changes = 0
@@ -50,13 +50,13 @@ def refuse(case: Case) -> str:
 
 
 def _callers(case: Case) -> list[Seam]:
-    """Functions of the host that call its rasterizer, and are not the rasterizer itself."""
+    """The host's functions that call its rasterizer, without the rasterizer itself."""
     drawn = {str(seam) for seam in case.seams if seam.role is Role.RASTERIZE}
     return [seam for seam in case.seams if seam.role is Role.VIEW and str(seam) not in drawn]
 
 
 def _is_chosen(case: Case) -> None:
-    """Of all adapters that are installed, where several could fit."""
+    """The adapter is chosen among all installed adapters."""
     plugins = load_plugins()
     adapters = {each.name: each for each in (*plugins.adapters, case.adapter)}
     tie = partial(select_adapter, plugins=plugins)
@@ -75,7 +75,7 @@ def _expect_refusal(case: Case, repo: HostRepo, seam: Seam, name: str | None) ->
 
 
 def _expect_place(case: Case, repo: HostRepo, seam: Seam, line: int) -> None:
-    """Another number of values from the rasterizer is refused, and the line is said."""
+    """If the rasterizer returns another number of values, the error names the line."""
     errors = [f for f in case.adapter.match(repo).findings if f.level == "error"]
     at = f"{seam} ({repo.at(seam.module, line)})"
     what = f"{seam} takes one value more from its rasterizer in line {line}"
@@ -83,7 +83,7 @@ def _expect_place(case: Case, repo: HostRepo, seam: Seam, line: int) -> None:
 
 
 def _import_is_refused(case: Case, copy: HostRepo) -> None:
-    """Where detection was skipped, the host's own import fails, and the session leaves no trace."""
+    """If detection is skipped, the host's import fails, and the session leaves no trace."""
     seam = next(seam for seam in case.seams if seam.needs and not seam.external)
     mutations.rename_parameter(copy, seam, seam.needs[0])
     with running(**{**case.options(), "path": copy.root}, active=False) as host:

@@ -1,4 +1,4 @@
-"""Invariant 5: what is saved is loaded, bit for bit."""
+"""Invariant 5: saved models and checkpoints are loaded, bit for bit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def model_file(case: Case) -> str:
 
 
 def checkpoint(case: Case) -> str:
-    """A checkpoint is resumed with its thresholds, by the host alone as well."""
+    """A checkpoint resumes with its thresholds, and the host alone can resume it too."""
     case.expect("checkpoint", Role.CAPTURE, Role.RESTORE)
     with TemporaryDirectory() as folder:
         _through_a_checkpoint(case, Path(folder) / "chkpnt3.pth")
@@ -94,7 +94,7 @@ def _through_a_checkpoint(case: Case, path: Path) -> None:
 
 
 def _out_of_stage_two(case: Case, path: Path) -> None:
-    """Resumed without learning, stage 2's checkpoint trains all that the host's own does."""
+    """Resumed without learning, stage 2's checkpoint trains the same parameters as the host's."""
     moved, rates = [], []
     for learn in (False, True):
         with running(learn=learn, **case.options()) as host:
