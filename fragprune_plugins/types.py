@@ -409,7 +409,7 @@ class Moment:
         duration: longest period of the colours' cosines in time; above 0.
         sh_degree_t: how many cosines are used at ``sh_degree`` 3, 0 to 2; None for colours without
             time.
-        prefilter_var: when positive, added to the variance in time that the marginal sees.
+        prefilter_var: if positive, added to the variance in time of the marginal.
         scale_modifier: factor on the scales.
     """
 

@@ -1,13 +1,13 @@
 """The oracle: 3D Gaussian splatting with per-Gaussian truncation, written to be read.
 
 Plain torch, float32 or float64, gradients by autograd, any device; it imports nothing of ours, so
-that what it says about our engines is an independent statement. The rules and the quirks are those
-of the vanilla CUDA rasterizer, down to which derivatives that rasterizer leaves out.
+it is an independent test of our engines. The rules and the quirks are those of the vanilla CUDA
+rasterizer, including the derivatives that it leaves out.
 
     covariance -> project -> (sh) -> fragment -> composite,  all called by ``render``.
 
-``render_footprints`` enters after the projection, for those who project in a way of their own;
-``slice_gaussians`` comes before, for Gaussians in space and time.
+``render_footprints`` starts after the projection, for hosts with their own projection.
+``slice_gaussians`` comes first, for Gaussians in space and time.
 """
 
 from reference_renderer.project import Footprints

@@ -1,8 +1,8 @@
-"""Colour by direction and time: spherical harmonics times cosines, as RT-4DGS has them.
+"""Colour by direction and time: spherical harmonics times cosines, as in RT-4DGS.
 
-The picture is drawn with directions to the means as they are stored. The host's backward pass looks
-elsewhere: from the means where the moment has moved them. It also has slips in what it writes by
-hand for colours in time, named at ``_slope``. Training follows those gradients, so they are ours.
+The picture uses directions to the stored means. The host's backward pass uses directions to the
+moved means instead. Its hand-written gradients of colours in time have further errors, listed at
+``_slope``. Training follows those gradients, so we reproduce them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ BANDS = 16
 
 @dataclass(frozen=True)
 class Clock:
-    """What colours in time depend on.
+    """The quantities on which colours in time depend.
 
     Attributes:
         times: (N,) means in time.
@@ -52,12 +52,12 @@ def colors(
     """(N, 3) RGB, not below 0.
 
     Args:
-        sh: (N, K, 3), K at least (degree + 1)^2, and 16 more for each cosine.
-        means: (N, 3) as stored.
-        moved: (N, 3) where they are at the moment.
+        sh: (N, K, 3), K at least (degree + 1)^2, plus 16 for each cosine.
+        means: (N, 3) the stored means.
+        moved: (N, 3) the means at the moment.
         campos: (3,).
         degree: of the harmonics in use, 0 to 3.
-        clock: None for colours that time leaves alone.
+        clock: None for colours that do not depend on time.
     """
     with torch.no_grad():
         harmonics = sh_basis(_towards(means, campos), degree)
@@ -95,10 +95,10 @@ def _blend(sh: Tensor, harmonics: Tensor, clock: Clock | None) -> Tensor:
 
 
 def _slope(sh: Tensor, harmonics: Tensor, clock: Clock | None) -> Tensor:
-    """(N, 3) has the host's gradient; its value is of no use.
+    """(N, 3) a tensor with the host's gradient; its value is not used.
 
-    Where time modulates colours, the host gives the second coefficient the first one's gradient,
-    and to the means in time only that of the highest cosine, with the opposite sign.
+    If time modulates colours, the host gives the second coefficient the gradient of the first, and
+    the means in time only the gradient of the highest cosine, with the opposite sign.
     """
     if clock is None:
         return _blend(sh, harmonics, None)

@@ -14,8 +14,8 @@ def transmittances(alpha: Tensor) -> Tensor:
 def alive(alpha: Tensor, transmittance_min: float) -> Tensor:
     """(K, P) bool: the pixel has not stopped at or before this fragment.
 
-    It stops at the first fragment that would leave less than transmittance_min; that fragment is
-    not blended, nor is any after it. A fragment of alpha 0 stops nothing.
+    A pixel stops at the first fragment that would leave less than transmittance_min. That fragment
+    and all later ones are not blended. A fragment of alpha 0 stops nothing.
     """
     hard = alpha.detach()
     stops = transmittances(hard)[1:] < transmittance_min

@@ -34,9 +34,9 @@ def covariances(gaussians: Gaussians, scale_modifier: float) -> Tensor:
 
 
 def clamp_to_frustum(lateral: Tensor, depth: Tensor, tan_fov: float) -> Tensor:
-    """(N,) lateral view coordinate with lateral/depth clamped; a constant where it is clamped.
+    """(N,) lateral view coordinate, with lateral/depth clamped; a constant where clamped.
 
-    The host's backward passes nothing through a clamped coordinate, not even to the depth.
+    The host's backward pass gives no gradient through a clamped coordinate, not even to the depth.
     """
     limit = FRUSTUM_MARGIN * tan_fov
     slope = lateral / depth

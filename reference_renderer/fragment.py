@@ -1,4 +1,4 @@
-"""One (Gaussian, pixel) pair: how far, how opaque, drawn or not."""
+"""Fragments, (Gaussian, pixel) pairs: their distance, their alpha, and whether they are drawn."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from reference_renderer.scene import FALLOFF_MIN, RIM_REACH, RIM_WIDTH, Options
 
 @dataclass(frozen=True)
 class Fragments:
-    """K Gaussians at P pixels.
+    """The fragments of The fragments of K Gaussians at P pixels.
 
     Attributes:
-        alpha: (K, P) capped, and times the gate: 0 where not drawn.
+        alpha: (K, P) capped alpha times the gate; 0 where not drawn.
         gate: (K, P) 1 where drawn, else 0 (soft: between), with the thresholds' gradient.
-        drawn: (K, P) bool, before any pixel's stop.
+        drawn: (K, P) bool, without regard to a pixel's stop.
     """
 
     alpha: Tensor
@@ -30,20 +30,21 @@ class Fragments:
 
 
 class Spread(torch.autograd.Function):
-    """Means (K, 2) at each of P pixels, (K, P, 2); ``felt`` (K, 2) changes nothing.
+    """Expand means (K, 2) to P pixels, (K, P, 2); ``felt`` (K, 2) does not change the values.
 
-    The means receive the sum over pixels of the gradient, ``felt`` that of its absolute values.
+    The means receive the sum over pixels of the gradient, and ``felt`` the sum of its absolute
+    values.
     """
 
     @staticmethod
     def forward(ctx: Any, means: Tensor, felt: Tensor, pixels: int) -> Tensor:
-        """(K, P, 2)."""
+        """Return the means as (K, P, 2)."""
         return means[:, None, :].repeat(1, pixels, 1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        """(K, 2) twice."""
+        """Return the gradients of the means and of ``felt``, (K, 2) each."""
         return grad.sum(dim=1), grad.abs().sum(dim=1), None
 
 
@@ -60,14 +61,14 @@ def squared_distances(footprints: Footprints, pixels: Tensor) -> Tensor:
 
 
 def visible_cutoffs(opacity: Tensor, alpha_min: float) -> Tensor:
-    """(K,) largest q at which alpha still reaches alpha_min; negative when it never does."""
+    """(K,) largest q at which alpha reaches alpha_min; negative if it never does."""
     if alpha_min == 0:
         return torch.full_like(opacity, inf)
     return 2 * (opacity.detach() * (1 / alpha_min)).log()
 
 
 def cutoffs(visible: Tensor, thresholds: Tensor | None) -> Tensor:
-    """(K,) largest q that is drawn: the one number that decides, everywhere.
+    """(K,) the cutoff: the largest q that is drawn.
 
     Args:
         visible: (K,) from ``visible_cutoffs``.
@@ -79,13 +80,13 @@ def cutoffs(visible: Tensor, thresholds: Tensor | None) -> Tensor:
 
 
 def rim_cutoffs(visible: Tensor, thresholds: Tensor) -> Tensor:
-    """(K,) largest q at which a threshold still feels a fragment; at least the drawn ones."""
+    """(K,) largest q at which a fragment still contributes to a threshold's gradient."""
     reach = (thresholds.detach() - RIM_REACH * RIM_WIDTH).clamp(min=FALLOFF_MIN)
     return torch.minimum(-2 * reach.log(), visible)
 
 
 def cap(alpha: Tensor, alpha_max: float, with_gradient: bool) -> Tensor:
-    """Alpha, at most alpha_max; the gradient passes as if uncapped, or stops where capped."""
+    """Cap alpha at alpha_max. The gradient passes the cap ``with_gradient``, else it stops there."""
     capped = alpha.clamp(max=alpha_max)
     return alpha + (capped - alpha).detach() if with_gradient else capped
 
@@ -103,7 +104,7 @@ def gates(
     Args:
         q: (K, P) squared distances.
         falloff: (K, P) exp(-q / 2).
-        visible: (K,) cutoffs of alpha_min alone.
+        visible: (K,) the cutoffs by alpha_min alone.
         thresholds: (K,) or None.
         options: ``truncation`` chooses.
     """
@@ -121,7 +122,7 @@ def gates(
 def fragments(
     footprints: Footprints, pixels: Tensor, thresholds: Tensor | None, options: Options
 ) -> Fragments:
-    """Every footprint at every pixel.
+    """The fragments of every footprint at every pixel.
 
     Args:
         footprints: K of them.

@@ -1,4 +1,4 @@
-"""From Gaussians in the world to footprints on the image, and the tiles those touch."""
+"""Projects Gaussians in the world to footprints on the image, and finds their tiles."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Footprints:
         color: (K, 3) RGB.
         radius: (K,) pixels, ceil(3 sigma) of the longer axis; 0 when degenerate.
         features: (K, F) more channels, or None.
-        felt: (K, 2) zeros that receive the means' gradient, absolute pixel by pixel; or None.
+        felt: (K, 2) zeros that receive the sum of absolute values of the means' gradient; or None.
     """
 
     mean2d: Tensor
@@ -78,7 +78,7 @@ def project_means(camera: Camera, means: Tensor) -> Tensor:
 
 
 def hooked(camera: Camera, footprints: Footprints, hook: Tensor, options: Options) -> Footprints:
-    """The same footprints; the hook (K, >= 2) receives their means' gradient in NDC."""
+    """The same footprints, with a hook (K, >= 2) that receives their means' gradient in NDC."""
     half = 0.5 * hook.new_tensor([camera.width, camera.height])
     zero = hook - hook.detach()
     return replace(
@@ -118,10 +118,10 @@ def compensate_antialiasing(before: Tensor, after: Tensor) -> Tensor:
 def compensate_mip(before: Tensor, after: Tensor) -> Tensor:
     """(N,) Mip-Splatting's factor from covariances (N, 3): 0 where a determinant is too small.
 
-    Its derivatives are those of the formula. The host's own backward pass puts small numbers into
-    the denominators elsewhere: with a factor of c and a determinant d after dilation its gradient
-    through the factor is off by 2e-6 / c relative, and the part through d by 1e-6 / d^2, which is
-    1% at worst for the host's kernel size of 0.1 (d >= 0.01) and nothing for larger Gaussians.
+    The derivatives are those of the formula. The host's backward pass adds small numbers to other
+    denominators. With a factor c and a determinant d after dilation, its gradient through the
+    factor has a relative error of 2e-6 / c, and the part through d one of 1e-6 / d^2. That is at
+    most 1% for the host's kernel size of 0.1 (d >= 0.01), and negligible for larger Gaussians.
     """
     sharp, wide = determinant(before), determinant(after)
     draws = (sharp > MIP_FLOOR) & (wide > MIP_FLOOR)

@@ -73,8 +73,8 @@ def render(
         camera: the view.
         gaussians: N of them.
         thresholds: (N,) falloff in (0, 1) below which a fragment is not drawn, or None.
-        means2d_hook: (N, >= 2) or None; adds nothing and receives the gradient of the projected
-            means in NDC units, that of pixels times (W / 2, H / 2).
+        means2d_hook: (N, >= 2) or None. Its values are not used. It receives the gradient of the
+            projected means in NDC units: the gradient in pixels times (W / 2, H / 2).
         options: the dialect; vanilla when None.
     """
     options = options or Options()
@@ -104,16 +104,16 @@ def render_footprints(
     means2d_hook: Tensor | None = None,
     options: Options | None = None,
 ) -> Rendering:
-    """Draw Gaussians that are on the image already, each truncated at its own threshold.
+    """Draw projected Gaussians, each truncated at its own threshold.
 
     Args:
-        camera: of it, size and background count.
-        footprints: N of them; their radius is not looked at, and the rendering's radii are 0.
-            One whose depth is not positive or whose conic is not positive definite is culled.
+        camera: only its size and background are used.
+        footprints: N of them. Their radius is ignored, and the rendering's radii are 0. A footprint
+            is culled if its depth is not positive or its conic is not positive definite.
         tiles: (N, 4) first and past-the-last tile x0, y0, x1, y1 of each.
         thresholds: as in ``render``.
         means2d_hook: as in ``render``.
-        options: as in ``render``; what concerns the projection is not looked at.
+        options: as in ``render``; options of the projection are ignored.
     """
     options = options or Options()
     if means2d_hook is not None:
@@ -129,7 +129,7 @@ def render_footprints(
 def collect(
     camera: Camera, front: Tensor, radii: Tensor, blocks: list[Block], drawings: list[Drawing]
 ) -> Rendering:
-    """The whole image from its blocks.
+    """Assemble the whole image from its blocks.
 
     Args:
         camera: its size and background.
@@ -167,7 +167,7 @@ def collect(
 def cut(
     camera: Camera, footprints: Footprints, rects: Tensor, drawable: Tensor, options: Options
 ) -> Iterator[Block]:
-    """The image's tiles, row by row, or all of it as one block.
+    """Cut the image into tiles, row by row, or take all of it as one block.
 
     Args:
         camera: its size.
@@ -200,9 +200,9 @@ def draw(
     """Blend a block's footprints, front to back, at each of its pixels.
 
     Args:
-        footprints: all K.
+        footprints: all K footprints.
         thresholds: (K,) or None.
-        block: where, and which of them.
+        block: the pixels and the rows of its footprints.
         options: the cuts.
     """
     here = footprints.take(block.rows)

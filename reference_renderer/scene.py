@@ -1,4 +1,4 @@
-"""What the oracle takes and gives."""
+"""The oracle's inputs and outputs."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Options:
-    """The dialect's numbers. Zeroing the three cuts makes the renderer differentiable everywhere.
+    """The numbers of a dialect. With the three cuts at 0 the renderer is differentiable everywhere.
 
     Attributes:
         scale_modifier: factor on the scales; cov3d is used as given.
@@ -95,11 +95,11 @@ class Options:
         alpha_min: fainter fragments are skipped; 0 skips none.
         alpha_max: alpha is capped here.
         cap_gradient: the gradient passes through the cap; else it is 0 where alpha was capped.
-        transmittance_min: a pixel stops before a fragment that would leave less; 0 never stops.
+        transmittance_min: a pixel stops before a fragment that would leave less; 0 for no stop.
         tiles: draw a Gaussian only in the 16x16 tiles of its 3-sigma square; else everywhere.
         sample_offsets: (H, W, 2) pixels, added to where each pixel is sampled; or None.
         absolute_gradient: the hook's third column receives the sum over pixels of the absolute
-            values of what they add to its first two; else 0.
+            values of their contributions to the first two; else 0.
         truncation: "hard" cuts at the threshold, with the surrogate's gradient; "soft" multiplies
             alpha by the surrogate itself, everywhere, and so has true derivatives.
     """

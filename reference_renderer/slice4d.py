@@ -1,9 +1,9 @@
-"""A Gaussian in space and time at one moment: the 3D Gaussian that is drawn there.
+"""Cuts a Gaussian in space and time at one moment: a 3D Gaussian remains.
 
-Space and time have one covariance. At a moment, time is known: the 3D Gaussian is the conditional
-one, its mean moves linearly, and it is as strong as the moment is likely (the marginal). Gradients
-are those of RT-4DGS, whose kernels write them by hand: where they differ from the derivative, so do
-ours, and it says so.
+Space and time have one covariance. At a given moment the 3D Gaussian is the conditional one. Its
+mean moves linearly, and its opacity is multiplied by the likelihood of the moment (the marginal).
+Gradients are those of RT-4DGS's hand-written kernels. Docstrings say where these differ from the
+derivative.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Sliced:
     Attributes:
         means: (N, 3) world.
         cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
-        opacities: (N,) marginal included.
-        present: (N,) bool, those that are not culled for their time.
+        opacities: (N,) multiplied by the marginal.
+        present: (N,) bool, the Gaussians that are not culled by time.
         colors: (N, 3) RGB, or None.
     """
 
@@ -47,7 +47,7 @@ def _rows(*entries: Tensor) -> Tensor:
 def rotation_4d(left: Tensor, right: Tensor) -> Tensor:
     """(N, 4, 4) rotation of x, y, z, t by two quaternions (N, 4) each, used as given.
 
-    With (t, z, y, x) read as a quaternion v, it is v -> left v right*.
+    With (t, z, y, x) as a quaternion v, the rotation is v -> left v right*.
     """
     a, b, c, d = left.unbind(-1)
     p, q, r, s = right.unbind(-1)
@@ -78,7 +78,7 @@ def joint(
     timestamp: float,
     prefilter_var: float = -1.0,
 ) -> Sliced:
-    """Gaussians whose axes lie anywhere in space and time (``rot_4d``).
+    """Cut Gaussians with any axes in space and time (``rot_4d``).
 
     Args:
         means: (N, 3).
@@ -87,7 +87,7 @@ def joint(
         scales: (N, 4) standard deviations, x, y, z, t.
         rotations: left and right quaternions (N, 4).
         timestamp: the moment.
-        prefilter_var: when positive, added to the variance in time that the marginal sees.
+        prefilter_var: if positive, added to the variance in time of the marginal.
     """
     cov4d = covariance(rotation_4d(*rotations), scales)
     in_time, across = cov4d[:, 3, 3], cov4d[:, :3, 3]
@@ -113,10 +113,10 @@ def separate(
     timestamp: float,
     prefilter_var: float = -1.0,
 ) -> Sliced:
-    """Gaussians that come and go where they are (4D without ``rot_4d``).
+    """Cut Gaussians without motion, with a separate extent in time (4D without ``rot_4d``).
 
-    The host takes the scale in time for a variance, unsquared. Its backward pass leaves the
-    marginal out altogether: opacity gets the gradient of what is drawn, time and its scale get
+    The host uses the scale in time as a variance, without squaring it. Its backward pass ignores
+    the marginal: opacity receives the gradient by the drawn opacity, and time and its scale receive
     zeros.
 
     Args:
@@ -140,5 +140,5 @@ def separate(
 
 
 def _marginal(since: Tensor, variance: Tensor, prefilter_var: float) -> Tensor:
-    """(N,) how likely the moment is, 1 at the mean in time."""
+    """(N,) the likelihood of the moment, 1 at the mean in time."""
     return torch.exp(-0.5 * since * since / (variance + max(prefilter_var, 0.0)))

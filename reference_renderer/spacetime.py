@@ -1,4 +1,4 @@
-"""Gaussians in space and time, cut at a moment: what is left is drawn like any others."""
+"""Gaussians in space and time, cut at a moment; the 3D Gaussians are drawn as usual."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from reference_renderer.slice4d import Sliced, covariance, joint, separate, uppe
 
 @dataclass(frozen=True)
 class SpacetimeGaussians:
-    """N of them, given in one of four ways.
+    """N Gaussians in space and time, given in one of four ways.
 
     ``cov3d``: sliced already. ``scales`` and ``rotations``: in space alone. With ``times`` and
     ``scales_t``: in time, apart from space. With ``rotations_r`` too: anywhere in space and time.
@@ -54,15 +54,15 @@ def slice_gaussians(
     prefilter_var: float = -1.0,
     scale_modifier: float = 1.0,
 ) -> Sliced:
-    """Cut at a moment. Who is not there has its mean at the camera, and zeros for all else.
+    """Cut at a moment. Absent Gaussians have their mean at the camera, and zeros elsewhere.
 
     Args:
         given: the Gaussians.
         campos: (3,) the camera.
         timestamp: the moment.
-        duration: of the cosines' longest period.
-        sh_degree_t: cosines in use, 0 to 2; None for colours that time leaves alone.
-        prefilter_var: when positive, added to the variance in time that the marginal sees.
+        duration: the cosines' longest period.
+        sh_degree_t: cosines in use, 0 to 2; None for colours without time.
+        prefilter_var: if positive, added to the variance in time of the marginal.
         scale_modifier: factor on the scales.
     """
     cut = _cut(given, scale_modifier, timestamp=timestamp, prefilter_var=prefilter_var)
@@ -89,7 +89,7 @@ def slice_gaussians(
 def _cut(
     given: SpacetimeGaussians, scale_modifier: float, *, timestamp: float, prefilter_var: float
 ) -> Sliced:
-    """All but colours, and whoever is there or not."""
+    """The cut without colours, for present and absent Gaussians alike."""
     everyone = torch.ones_like(given.opacities, dtype=torch.bool)
     if given.cov3d is not None:
         return Sliced(given.means, given.cov3d, given.opacities, everyone)

@@ -1,8 +1,8 @@
 """maincold2/Compact-3DGS: a learned mask, colours from a hash grid, shapes from codebooks.
 
-Its checkpoints lack the mask and the colour network, so nothing can resume them: stage 2 is the
-later part of one run (``--from-iter``). What it saves is activated already, and in part beside the
-PLY: our own readers refuse it, and the host's own draws it.
+Its checkpoints lack the mask and the colour network, so nothing can resume them. Stage 2 is the
+later part of one run (``--from-iter``). Its files hold activated values and keep the colours
+outside the PLY. Our readers refuse them; the host's own scripts draw them.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ PP = "_pp.npz"
 
 
 def ended(call: SeamCall, by: str) -> Path:
-    """The host leaves endings out."""
+    """The file's path with the ending, which the host leaves out."""
     path = Path(call.first)
     return path.with_name(path.name + by)
 
 
 def most_compressed(call: SeamCall) -> Path:
-    """The host loads the most compressed file there is."""
+    """The most compressed existing file, which is the one that the host loads."""
     files = [ended(call, ending) for ending in (PP, ".npz", ".ply")]
     return next((file for file in files if file.is_file()), files[-1])
 
 
 def optimizers(call: SeamCall) -> list[Any]:
-    """The Gaussians', then the hash grid's and the colour network's."""
+    """The optimizer of the Gaussians, then that of the hash grid and the colour network."""
     return [call.model.optimizer, call.model.optimizer_net]
 
 
 @contextmanager
 def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Row numbers ride along as a second column of the opacities, which sorting only moves.
+    """Store row numbers as a second column of the opacities, which sorting only moves.
 
-    The bits of an integer, not its value: every row number is exact.
+    The column holds the bits of integers, so every row number is exact.
     """
     import torch
 
@@ -75,7 +75,7 @@ def tracing(call: SeamCall) -> Iterator[RowTrace]:
 
 
 class Compact3DGS(GraphdecoAdapter):
-    """Compact-3DGS."""
+    """The adapter of Compact-3DGS."""
 
     name = "compact-3dgs"
     descends_from = ("vanilla-3dgs",)
@@ -110,7 +110,7 @@ class Compact3DGS(GraphdecoAdapter):
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """Nothing can.
+        """Refuse: no command can resume this host's training.
 
         Raises:
             UsageError: always.
@@ -123,7 +123,7 @@ class Compact3DGS(GraphdecoAdapter):
         )
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
-        """Not by us: its colours are a network's."""
+        """Refuse: our engines cannot draw colours from a network."""
         raise NotComparedError(
             "Compact-3DGS",
             "models whose colours are a network's and not in the file",
@@ -132,11 +132,11 @@ class Compact3DGS(GraphdecoAdapter):
         )
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
-        """The network's group has no name of the host's."""
+        """The group's name; the network's group has none in the host, so it gets ours."""
         return str(group.get("name", NETWORK))
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:
-        """Codebooks that are in use learn in the forward pass; they stop, as at the host's end."""
+        """Stop the codebooks in use, which learn in the forward pass, as the host does too."""
         for codebooks in (model.vq_scale, model.vq_rot):
             for layer in codebooks.layers:
                 if bool(layer._codebook.initted):
@@ -145,5 +145,5 @@ class Compact3DGS(GraphdecoAdapter):
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer Compact-3DGS."""
+    """Register the adapter of Compact-3DGS."""
     register(Compact3DGS())

@@ -1,9 +1,9 @@
 """yindaheng98/gaussian-splatting: the pip package, and ``gaussian-splatting-mcmc`` that extends it.
 
-No checkout: an installed package, run as ``python -m gaussian_splatting.train``. Its methods on
-rows belong to trainers and densifiers, which wrap one another. A densifier hands its trainer one
-instruction: rows to replace, then to remove, then to add. There are no checkpoints; a run begins
-from a PLY and counts its steps from 0 again.
+The host is an installed package, run as ``python -m gaussian_splatting.train``. Trainers and
+densifiers, which wrap one another, change rows. A densifier gives its trainer one instruction: rows
+to replace, then to remove, then to add. There are no checkpoints. A run begins from a PLY and
+counts its steps from 0 again.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ class PackageDialect(GraphdecoDialect):
     """Vanilla's call of August 2024, under dotted names."""
 
     def names(self) -> frozenset[str]:
-        """As ``modules`` has them."""
+        """The import names in ``modules``."""
         knn = (f"{PACKAGE}.simple_knn", f"{PACKAGE}.simple_knn._C")
         return frozenset((RASTERIZER, *knn, RELOCATION, *PRUNING))
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """The rasterizer, the neighbour distances and the relocation, inside their packages."""
+        """Stand-ins for the rasterizer, the neighbour distances and the relocation."""
         from fragprune_plugins.adapting import stand_ins
 
         relocation = ModuleType(RELOCATION, "Stand-in of fragprune.")
@@ -79,7 +79,7 @@ class PackageDialect(GraphdecoDialect):
 
 
 class _Unanswered(ModuleType):
-    """Imports, and refuses by name what is called."""
+    """A module that can be imported; every call of its functions is refused by name."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -97,20 +97,20 @@ class _Unanswered(ModuleType):
 
 
 def optimizers(call: SeamCall) -> list[Any]:
-    """One, the trainer's; cameras that are trained join it as further groups."""
+    """The trainer's optimizer; trained cameras are further groups of it."""
     return [call.instance.optimizer]
 
 
 def step_alone(call: SeamCall) -> Any:
-    """The opacity reset sits inside a step: the step itself is still to be made."""
+    """Make the step without the opacity reset that is inside it."""
     return call.instance.base_trainer.optim_step()
 
 
 @contextmanager
 def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Row numbers ride along as one more coefficient of the colour, which densifiers only copy.
+    """Store row numbers as one more coefficient of the colour, which densifiers only copy.
 
-    The bits of an integer, not its value: every row number is exact.
+    The column holds the bits of integers, so every row number is exact.
     """
     import torch
 
@@ -187,11 +187,11 @@ class GaussianSplatting(GraphdecoAdapter):
     noise = Seam(Role.STILL, f"{MCMC}.trainer.noise", "Noiser.add_noise", ("gaussians", "xyz_lr"))
 
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
-        """MCMC's noise where it is installed; its relocation is a densifier like any other."""
+        """The seams, with one for MCMC's noise if MCMC is installed."""
         return (*self.seams, self.noise) if repo.path(f"{MCMC}.trainer") else self.seams
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """The package itself, not a checkout of something that bears its name."""
+        """Check that this is the installed package, not a checkout of the same name."""
         if repo.package in self.installed:
             revision = Finding("info", "revision", repo.package, repo.commit)
             return [revision, *super().fingerprint(repo)]
@@ -207,11 +207,11 @@ class GaussianSplatting(GraphdecoAdapter):
         ]
 
     def dialect(self, repo: HostRepo) -> PackageDialect:
-        """One call: what ``GaussianModel.render`` passes and unpacks."""
+        """The dialect of the only rasterizer call, in ``GaussianModel.render``."""
         return PackageDialect(package=RASTERIZER, settings=SETTINGS, outputs=3)
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """The flags of ``gaussian_splatting.train``, which MCMC's has too."""
+        """The flags of ``gaussian_splatting.train``, which MCMC's script shares."""
         return CommandLine(
             scripts=(f"{PACKAGE}/train.py", f"{MCMC}/train.py"),
             iterations=("-i", "--iteration"),
@@ -224,7 +224,7 @@ class GaussianSplatting(GraphdecoAdapter):
         )
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
-        """None that it has not learned from."""
+        """Refuse: the package trains on every view."""
         raise NotComparedError(
             "gaussian-splatting (pip)",
             "a package that trains on every view",
@@ -233,7 +233,7 @@ class GaussianSplatting(GraphdecoAdapter):
         )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """Where cameras were trained, stage 2 takes them as stage 1 left them."""
+        """The command for stage 2; if cameras were trained, it takes those of stage 1."""
         parser = ArgumentParser(add_help=False)
         parser.add_argument("--mode", default="")
         parser.add_argument("--load_camera")
@@ -244,7 +244,7 @@ class GaussianSplatting(GraphdecoAdapter):
         return script, [*arguments, *(["--load_camera", str(cameras)] if cameras else [])]
 
     def model_of(self, call: SeamCall) -> Any:
-        """Trainers hold the model, or are about to when they are made."""
+        """The model of a trainer, or the argument from which a trainer is being made."""
         model = call.arguments.get("model", call.arguments.get("gaussians"))
         model = getattr(call.instance, "model", call.instance) if model is None else model
         if type(model).__module__.startswith(f"{PACKAGE}.models"):
@@ -254,7 +254,10 @@ class GaussianSplatting(GraphdecoAdapter):
         return model
 
     def view(self, camera: Any) -> int:
-        """Cameras are tuples, copied to change a background; their matrices stay."""
+        """A key of the camera: its matrix.
+
+        Cameras are tuples, which hosts copy to change a background.
+        """
         return id(camera.world_view_transform)
 
 
@@ -263,11 +266,11 @@ def _without_rider(colour: Tensor | None) -> Tensor | None:
 
 
 def _follow(instruct: Any, numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """Origins of the rows an instruction leaves, and which of them are new or made over.
+    """The origins of the rows after an instruction, and which rows are new or overwritten.
 
     Args:
-        instruct: the host's: replace, then remove, then add.
-        numbers: (N,) int32, the rows before it.
+        instruct: the host's instruction: replace, then remove, then add.
+        numbers: (N,) int32, the rows before the instruction.
     """
     import torch
 
@@ -297,5 +300,5 @@ def _follow(instruct: Any, numbers: Tensor) -> tuple[Tensor, Tensor]:
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer the pip package."""
+    """Register the adapter of the pip package."""
     register(GaussianSplatting())

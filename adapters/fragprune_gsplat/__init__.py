@@ -1,4 +1,4 @@
-"""nerfstudio-project/gsplat: a library. The training loop, and so the command line, is the user's.
+"""nerfstudio-project/gsplat: a library. The user writes the training loop and its command line.
 
 A model is a ``ParameterDict`` with an optimizer per key. One function, ``rasterization``, projects
 and draws; strategies change rows through a handful of functions that treat every key alike.
@@ -44,13 +44,13 @@ GROUPS = {
 
 
 def optimizers(call: SeamCall) -> list[Any]:
-    """One for each key."""
+    """The optimizers, one for each key."""
     return list(call.arguments["optimizers"].values())
 
 
 @contextmanager
 def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Row numbers ride along as one more key; without an optimizer gsplat takes it for frozen.
+    """Store row numbers under one more key; gsplat treats a key without an optimizer as frozen.
 
     float64 holds every row number exactly.
     """
@@ -81,7 +81,7 @@ def _operation(name: str, *needs: str) -> Seam:
 
 
 class Gsplat(HostAdapter):
-    """gsplat, the library."""
+    """The adapter of gsplat."""
 
     name = "gsplat"
     info = HostInfo(
@@ -123,7 +123,7 @@ class Gsplat(HostAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """The installed package."""
+        """Check that this is the installed package."""
         if repo.package == PACKAGE:
             return [Finding("info", "revision", PACKAGE, repo.commit)]
         return [
@@ -138,7 +138,7 @@ class Gsplat(HostAdapter):
         ]
 
     def dialect(self, repo: HostRepo) -> Dialect:
-        """Until 1.5 alpha is capped at 0.999 and the antialiasing factor has no floor."""
+        """The version's dialect: until 1.5 alpha's cap is 0.999, and antialiasing has no floor."""
         from fragprune_gsplat.dialect import GsplatDialect
 
         if "1.6" in repo.commit or repo.path(f"{PACKAGE}.cuda._constants"):
@@ -146,7 +146,7 @@ class Gsplat(HostAdapter):
         return GsplatDialect(alpha_max=0.999, floor=0.0)
 
     def model_of(self, call: SeamCall) -> Any:
-        """The dict a strategy changes; the means where a call has only them."""
+        """The dict that a strategy changes, or the means if a call has only them."""
         import torch
 
         params = call.arguments.get("params", call.arguments.get("means"))
@@ -162,12 +162,12 @@ class Gsplat(HostAdapter):
         return params if isinstance(params, torch.nn.ParameterDict | torch.Tensor) else None
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
-        """By the parameter: users name their groups as they like, or not at all."""
+        """The name of the group's parameter, because users name groups freely or not at all."""
         (parameter,) = group["params"]
         return next((GROUPS.get(key, key) for key, own in model.items() if own is parameter), None)
 
     def means(self, model: Any) -> Tensor:
-        """The parameter itself."""
+        """(N, 3) the parameter itself."""
         means: Tensor = model["means"]
         return means
 
@@ -177,11 +177,11 @@ class Gsplat(HostAdapter):
         return opacities.detach().sigmoid().reshape(-1)
 
     def view(self, camera: Any) -> int:
-        """By the numbers: loaders make a new tensor for every step."""
+        """A key from the camera's numbers, because loaders make a new tensor for every step."""
         return hash(camera.detach().cpu().numpy().tobytes())
 
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer gsplat."""
+    """Register the adapter of gsplat."""
     register(Gsplat())

@@ -1,4 +1,4 @@
-"""The call of gsplat's ``rasterization``: one function, any number of cameras."""
+"""The call of gsplat's ``rasterization``, which draws any number of cameras."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ MAX_DEGREE = 3
 
 @dataclass(frozen=True)
 class Cameras(RasterInputs):
-    """The first camera's inputs, and with them those of the others and what all were made of.
+    """The inputs of the first camera, with those of the other cameras and all projections.
 
     Attributes:
-        others: of the further cameras.
-        projections: of every camera.
-        shown: (C, N, 2) the means that the blending starts from, or (nnz, 2) in packed calls; what
-            strategies take gradients of.
+        others: the inputs of the other cameras.
+        projections: the projections of all cameras.
+        shown: (C, N, 2) the projected means, or (nnz, 2) in packed calls. Strategies read their
+            gradients.
     """
 
     others: tuple[RasterInputs, ...] = ()
@@ -65,10 +65,10 @@ class Cameras(RasterInputs):
 
 @dataclass(frozen=True)
 class GsplatDialect(Dialect):
-    """``rasterization`` of one version.
+    """The dialect of ``rasterization`` in one version.
 
     Attributes:
-        alpha_max: its cap on alpha; gradients are zero where it holds.
+        alpha_max: the cap on alpha; gradients are zero where it applies.
         floor: least antialiasing factor.
     """
 
@@ -77,7 +77,7 @@ class GsplatDialect(Dialect):
     floor: float
 
     def unpack(self, call: HostCall) -> Cameras:
-        """Project for every camera; the engine only blends."""
+        """Project for every camera; the engine then only blends."""
         given = call.arguments
         self._refuse(call)
         means, count = given["means"], len(given["viewmats"])
@@ -160,7 +160,7 @@ class GsplatDialect(Dialect):
 
     @staticmethod
     def _refuse(call: HostCall) -> None:
-        """Name what we do not draw."""
+        """Raise an error that names an argument which we do not support."""
         given = call.arguments
         for name, known in ONLY.items():
             value = given.get(name, known[0])
@@ -191,7 +191,7 @@ class GsplatDialect(Dialect):
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
     ) -> Any:
-        """Draw camera after camera."""
+        """Draw one camera after another."""
         assert isinstance(inputs, Cameras)
         drawn = [draw(each, part) for part, each in enumerate((inputs, *inputs.others))]
         return self._pack(drawn, inputs, call)
@@ -217,7 +217,7 @@ class GsplatDialect(Dialect):
 
     @staticmethod
     def _meta(inputs: Cameras, call: HostCall) -> dict[str, Any]:
-        """What strategies read; the lists of intersections of the host's kernels are not there."""
+        """The entries that strategies read, without the intersection lists of gsplat's kernels."""
         given = call.arguments
         stacked = {
             name: torch.stack([getattr(each, name) for each in inputs.projections])
@@ -245,15 +245,15 @@ class GsplatDialect(Dialect):
         }
 
     def stands_in(self, call: HostCall) -> bool:
-        """gsplat has kernels for CUDA alone."""
+        """True for tensors on the CPU: gsplat has kernels only for CUDA."""
         return not call.arguments["means"].is_cuda
 
     def present(self, package: str) -> bool:
-        """Its kernels are compiled where they are first used, which needs a GPU."""
+        """Whether its kernels can run: they are compiled at first use, which needs a GPU."""
         return torch.cuda.is_available()
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """The two kernels that its strategies call beside ``rasterization``."""
+        """Stand-ins for the two kernels that strategies call in addition to ``rasterization``."""
         from fragprune_plugins.adapting import stand_ins
 
         backend = ModuleType(BACKEND, "Stand-in of fragprune for compiled kernels.")

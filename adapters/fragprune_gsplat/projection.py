@@ -1,7 +1,7 @@
-"""gsplat's projection of Gaussians, in torch: what reaches the blending, for one camera.
+"""gsplat's projection of Gaussians in torch, for one camera.
 
-Its own rules: the Jacobian is clamped to the image's real bounds, the principal point included;
-extents are per axis, and end where alpha falls below 1/255 or at 3.33 sigma.
+It differs from vanilla's: the Jacobian is clamped to the image's real bounds with the principal
+point, and extents are per axis and end where alpha falls below 1/255 or at 3.33 sigma.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ MARGIN = 0.3
 
 @dataclass(frozen=True)
 class Rules:
-    """What a call, or the installed version, decides about the projection.
+    """Settings of the projection, from the call and the installed version.
 
     Attributes:
         eps2d: pixels^2 added to the 2D covariance's diagonal.
         near: view depth below which a Gaussian is culled.
-        far: view depth above which it is.
+        far: view depth above which a Gaussian is culled.
         radius_clip: pixels; radii up to it are culled.
         antialiased: opacity is multiplied by sqrt(det before / det after eps2d).
         floor: least value of that factor.
@@ -99,7 +99,7 @@ def project(
         K: (3, 3) intrinsics.
         width: pixels.
         height: pixels.
-        rules: the call's.
+        rules: the settings of this call.
     """
     rotation = viewmat[:3, :3]
     seen = means @ rotation.T + viewmat[:3, 3]

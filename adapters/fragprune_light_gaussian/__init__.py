@@ -1,8 +1,8 @@
 """VITA-Group/LightGaussian: prunes Gaussians by how much they are drawn, then distils their colour.
 
-Its rasterizer can count: with ``f_count`` set it also returns how many fragments each Gaussian drew
-and a score that adds the Gaussian's opacity for each. Pruning follows these, so with thresholds
-active they count what is left after truncation: the picture that is shown.
+With ``f_count`` set, its rasterizer also returns the number of fragments that each Gaussian drew,
+and a score that adds the Gaussian's opacity for each fragment. Pruning follows both. With
+thresholds they count only fragments that remain after truncation, as in the shown picture.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ class LightGaussianDialect(GraphdecoDialect):
     """Vanilla's call of 2023, and its counting form."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Counts are asked for where the host asks for them."""
+        """Translate the call; with counts if the host wants them."""
         inputs = super().unpack(call)
         return inputs.with_counts() if call.settings.f_count else inputs
 
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
         """(colour (3, H, W), radii (P,)); counting, (count (P,) int32, score (P,)) before them.
 
-        The counting form has no gradients. The host adds the opacity fragment by fragment; it is
-        the same for all of a Gaussian's, so the product is that sum, rounded once.
+        The counting form has no gradients. The host adds a Gaussian's opacity once per fragment;
+        the product of count and opacity is the same sum, rounded once.
         """
         drawn = super().pack(outputs, call)
         if not call.settings.f_count:
@@ -62,7 +62,7 @@ class LightGaussianDialect(GraphdecoDialect):
 
 
 class LightGaussian(GraphdecoAdapter):
-    """LightGaussian."""
+    """The adapter of LightGaussian."""
 
     name = "light-gaussian"
     descends_from = ("vanilla-3dgs",)
@@ -91,11 +91,11 @@ class LightGaussian(GraphdecoAdapter):
     )
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """Pruning and distillation are given a checkpoint to work on."""
+        """The flags; the pruning and distillation scripts start from a checkpoint."""
         return replace(super().command_line(repo), continues=(PRUNE, DISTIL))
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """Distillation cannot go on from what it wrote: it would take another SH band away."""
+        """The command for stage 2. Distillation cannot resume: it would remove another SH band."""
         if script.name != DISTIL:
             return script, arguments
         parser = ArgumentParser(add_help=False)
@@ -108,11 +108,11 @@ class LightGaussian(GraphdecoAdapter):
         return script.with_name(TRAIN), [*shared, "--sh_degree", own.new_max_sh]
 
     def view(self, camera: Any) -> int:
-        """Distillation draws through copies of its cameras; they keep their number."""
+        """The camera's number, because distillation draws through copies of its cameras."""
         return int(getattr(camera, "uid", id(camera)))
 
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer LightGaussian."""
+    """Register the adapter of LightGaussian."""
     register(LightGaussian())

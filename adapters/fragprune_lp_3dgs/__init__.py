@@ -40,10 +40,10 @@ class LP3DGSDialect(GraphdecoDialect):
     """Vanilla's call of 2023, and its form that sums blending weights."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Scores are asked for where the host asks for blending weights.
+        """Translate the call; with scores if the host wants blending weights.
 
         Raises:
-            EngineError: another score is wanted.
+            EngineError: the host wants another score.
         """
         foreign = [n for n in SCORES if n != "bw_score" and getattr(call.settings, n)]
         if foreign:
@@ -61,7 +61,7 @@ class LP3DGSDialect(GraphdecoDialect):
         return outputs.image, outputs.radii, None, outputs.weights_per_gaussian
 
     def spares(self) -> dict[str, ModuleType]:
-        """A wandb that keeps no record and names no sweep."""
+        """A wandb that records nothing and names no sweep."""
         module = ModuleType("wandb", "Stand-in of fragprune: records nothing.")
         run = SimpleNamespace(sweep_id=None)
         vars(module).update(init=lambda **_: run, define_metric=_nothing, log=_nothing)
@@ -69,21 +69,21 @@ class LP3DGSDialect(GraphdecoDialect):
 
 
 def _nothing(*_: Any, **__: Any) -> None:
-    """Records nothing."""
+    """Accept any arguments and do nothing."""
 
 
 def nothing_rendered(call: SeamCall) -> dict[str, float]:
-    """The script ends by rendering and evaluating iteration 30,000, which stage 2 is past."""
+    """Skip the rendering of iteration 30,000 at the script's end; stage 2 has none."""
     return dict.fromkeys(("train", "test"), math.nan)
 
 
 def nothing_measured(call: SeamCall) -> dict[str, Any]:
-    """Likewise."""
+    """Skip the evaluation of iteration 30,000 at the script's end."""
     return {path: {"ours_30000": NO_METRICS} for path in call.first}
 
 
 class LP3DGS(GraphdecoAdapter):
-    """LP-3DGS."""
+    """The adapter of LP-3DGS."""
 
     name = "lp-3dgs"
     descends_from = ("vanilla-3dgs",)
@@ -116,7 +116,7 @@ class LP3DGS(GraphdecoAdapter):
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """The same script; one of its models is another.
+        """The same script; refuse the prune method with a model of its own.
 
         Raises:
             UsageError: ``--prune_method compact_3dgs``.
@@ -131,11 +131,11 @@ class LP3DGS(GraphdecoAdapter):
         return script, arguments
 
     def model_of(self, call: SeamCall) -> Any:
-        """What the script calls at its end is about no model in particular."""
+        """The model; None for the functions that the script calls at its end."""
         return self if call.instance is None else call.instance
 
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer LP-3DGS."""
+    """Register the adapter of LP-3DGS."""
     register(LP3DGS())

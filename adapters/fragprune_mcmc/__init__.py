@@ -44,13 +44,13 @@ class MCMCDialect(GraphdecoDialect):
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
         """(colour (3, H, W), radii (P,) int32, is_used (P,) int32).
 
-        The host hands ``is_used`` on and never reads it: here it says "on screen", an upper bound
-        of its own rasterizer's "reached a pixel".
+        The host passes ``is_used`` on and never reads it. Here it means "on screen", an upper bound
+        of the host's "reached a pixel".
         """
         return outputs.image, outputs.radii, (outputs.radii > 0).to(outputs.radii)
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """Vanilla's stand-ins; the host imports the relocation from the rasterizer's."""
+        """Vanilla's stand-ins, with the relocation formula in the rasterizer's module."""
         from fragprune_plugins.adapting import stand_ins
 
         modules = super().modules(draw)
@@ -59,12 +59,12 @@ class MCMCDialect(GraphdecoDialect):
 
 
 def no_noise(call: SeamCall) -> float:
-    """No rate, no noise: the host multiplies what it adds to the positions by it."""
+    """Return a rate of 0: the host multiplies the noise on positions by it."""
     return 0.0
 
 
 class MCMC(GraphdecoAdapter):
-    """3DGS-MCMC."""
+    """The adapter of 3DGS-MCMC."""
 
     name = "mcmc"
     descends_from = ("vanilla-3dgs",)
@@ -88,11 +88,11 @@ class MCMC(GraphdecoAdapter):
     )
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """Vanilla's, and a configuration file whose values win over the flags."""
+        """Vanilla's flags, and a configuration file whose values override them."""
         return replace(super().command_line(repo), config=ConfigFile("--config"))
 
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer 3DGS-MCMC."""
+    """Register the adapter of 3DGS-MCMC."""
     register(MCMC())

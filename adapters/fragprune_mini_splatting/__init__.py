@@ -1,9 +1,9 @@
 """fatPeter/mini-splatting: few Gaussians, placed anew from depth and sampled by importance.
 
-Its training scripts lie in folders of their own, gs, ms and ms_d, and its functions import one of
-two rasterizers at every call: vanilla's, or one that also scores every Gaussian by what it adds to
-the picture and tells where the rays meet them. New points, simplification and splitting follow
-these scores, so with thresholds active they count what is left after truncation.
+Its training scripts have their own folders, gs, ms and ms_d. At every call its functions import one
+of two rasterizers: vanilla's, or one that also scores every Gaussian by its part of the picture and
+finds where rays meet Gaussians. New points, simplification and splitting follow these scores. With
+thresholds the scores count only fragments that remain after truncation.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class MiniSplattingDialect(GraphdecoDialect):
     """Vanilla's call of 2023 in one package, and with scores or depth in the other."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Scores are asked for where the host's own rasterizer gives them."""
+        """Translate the call; with scores if it goes to the scoring rasterizer."""
         inputs = super().unpack(call)
         scoring = call.entry.startswith(SCORING)
         return replace(inputs, counts=True, scores=True) if scoring else inputs
@@ -54,7 +54,7 @@ class MiniSplattingDialect(GraphdecoDialect):
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
     ) -> Any:
-        """``render_depth`` draws some pixels again; see there."""
+        """Draw and pack; ``render_depth`` draws some pixels again."""
         if not call.entry.endswith(DEPTH):
             return super().answer(call, inputs, draw)
         from fragprune_mini_splatting.depth import render_depth
@@ -64,8 +64,9 @@ class MiniSplattingDialect(GraphdecoDialect):
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
         """(colour (3, H, W), radii (P,)); scoring, three more (P,).
 
-        They are the sum of the weights alpha T, how many fragments were drawn (int32), and at how
-        many pixels no other Gaussian weighs more (float32, as the host's). No gradients.
+        These are the sum of the weights alpha T, the number of drawn fragments (int32), and the
+        number of pixels where the Gaussian has the largest weight (float32, as the host's). They
+        have no gradients.
         """
         drawn = super().pack(outputs, call)
         weights, wins = outputs.weights_per_gaussian, outputs.wins_per_gaussian
@@ -75,11 +76,11 @@ class MiniSplattingDialect(GraphdecoDialect):
         return (*drawn, weights, count, wins.float())
 
     def names(self) -> frozenset[str]:
-        """Vanilla's and the scoring rasterizer's."""
+        """The import names of vanilla's packages and of the scoring rasterizer."""
         return super().names() | {SCORING}
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """Vanilla's stand-ins and the scoring rasterizer's."""
+        """Stand-ins for vanilla's packages and for the scoring rasterizer."""
         from fragprune_plugins.adapting import stand_ins
 
         scoring = stand_ins.rasterizer(SCORING, self.settings, False, draw, also=("render_depth",))
@@ -87,7 +88,7 @@ class MiniSplattingDialect(GraphdecoDialect):
 
 
 def masked_splits(call: SeamCall) -> Tensor:
-    """The masked split takes the rows under the mask besides."""
+    """The parents of the masked split, which also takes the rows under the mask."""
     mask = call.arguments["mask"].bool()
     chosen = mask.new_zeros(len(call.model.get_xyz))
     chosen[: len(mask)] = mask
@@ -97,7 +98,7 @@ def masked_splits(call: SeamCall) -> Tensor:
 
 
 def packed(call: SeamCall) -> tuple[Path, Tensor] | None:
-    """What ms_c compresses: one Gaussian a voxel, sorted by position, positions first."""
+    """The Gaussians that ms_c compresses: one for each voxel, sorted by position."""
     import torch
 
     path = Path(str(call.first))
@@ -108,7 +109,7 @@ def packed(call: SeamCall) -> tuple[Path, Tensor] | None:
 
 
 class MiniSplatting(GraphdecoAdapter):
-    """Mini-Splatting and Mini-Splatting-D."""
+    """The adapter of Mini-Splatting and Mini-Splatting-D."""
 
     name = "mini-splatting"
     descends_from = ("vanilla-3dgs",)
@@ -151,5 +152,5 @@ class MiniSplatting(GraphdecoAdapter):
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer Mini-Splatting."""
+    """Register the adapter of Mini-Splatting."""
     register(MiniSplatting())

@@ -1,8 +1,8 @@
-"""``render_depth``: where each pixel's ray passes the Gaussian that weighs most in it.
+"""``render_depth``: where each pixel's ray passes the Gaussian with the largest weight.
 
 The host places new points there. For a Gaussian of mean m, rotation R and scales s it takes the
-ellipsoid at three scales and the middle of the ray's way through it: with W = diag(1 / 3s) R^T and
-a ray o + t d, d reaching view depth 1, that is t = -(W d)(W (o - m)) / |W d|^2.
+ellipsoid at three scales, and the middle of the ray's path through it. With W = diag(1 / 3s) R^T
+and a ray o + t d, where d has view depth 1, the middle is at t = -(W d)(W (o - m)) / |W d|^2.
 """
 
 from __future__ import annotations
@@ -33,11 +33,12 @@ TILE = 16
 def render_depth(
     inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
 ) -> dict[str, Tensor]:
-    """The host's six pictures.
+    """Draw the host's six pictures.
 
-    Where that middle lies behind the camera, the host lets a fragment colour the pixel, but neither
-    win it nor hide what follows. Such fragments are found, and their pixels drawn again without
-    them: winner and transmittance are the host's, only ``render`` lacks their colour.
+    If the middle is behind the camera, the host's fragment colours the pixel, but does not win it
+    and does not hide later fragments. This finds such fragments and draws their pixels again
+    without them. Winner and transmittance are then the host's; only ``render`` lacks the colour of
+    these fragments.
 
     Args:
         inputs: of one view, with scores.
@@ -45,11 +46,11 @@ def render_depth(
 
     Returns:
         ``render`` (3, H, W), ``out_pts`` (3, H, W) world, ``rendered_depth``, ``discriminants`` and
-        ``accum_alpha`` (1, H, W), the latter the transmittance left, despite its name, and
-        ``gidx`` (1, H, W) int32. Where nothing is drawn: zeros, and all of the transmittance.
+        ``accum_alpha`` (1, H, W), which is the remaining transmittance despite its name, and
+        ``gidx`` (1, H, W) int32. Pixels without fragments have zeros, and a transmittance of 1.
 
     Raises:
-        InputError: the host gave covariances in place of scales and rotations.
+        InputError: the host passed covariances instead of scales and rotations.
     """
     splats = inputs.splats
     assert isinstance(splats, Splats)  # what unpack makes of the host's call
@@ -120,11 +121,11 @@ def _whiten(scales: Tensor, rotations: Tensor) -> Tensor:
 def _behind(
     view: View, means: Tensor, radii: Tensor, directions: Tensor, normals: Tensor
 ) -> list[tuple[Tensor, Tensor]]:
-    """Which Gaussians' middles lie behind the camera, and at which pixels.
+    """Find the Gaussians whose middles are behind the camera, and at which pixels.
 
-    t < 0 where the ray's direction has a positive product with a vector of the Gaussian's own: a
-    half plane of the image. A linear function is largest at a corner, so four products rule out
-    nearly all Gaussians.
+    t is negative where the ray's direction has a positive product with a vector of the Gaussian: in
+    a half plane of the image. A linear function is largest at a corner of the image, so four
+    products rule out nearly all Gaussians.
 
     Returns:
         (rows (M,), where (H, W) bool): pixels at which exactly these rows are to be left out.

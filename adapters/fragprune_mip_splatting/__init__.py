@@ -47,7 +47,7 @@ class MipDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with the 2D filter's size and a sampling offset for each pixel."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """The third column of the means' gradient is the absolute one: densification reads it."""
+        """Translate the call; densification reads an absolute third column of the gradient."""
         return replace(
             super().unpack(call),
             dilation=float(call.settings.kernel_size),
@@ -57,7 +57,7 @@ class MipDialect(GraphdecoDialect):
         )
 
     def spares(self) -> dict[str, ModuleType]:
-        """``train.py`` imports these two and uses neither."""
+        """Stand-ins for two packages that ``train.py`` imports and does not use."""
         return {
             name: ModuleType(name, "Stand-in of fragprune: empty.") for name in ("open3d", "cv2")
         }
@@ -68,14 +68,14 @@ ABSOLUTE = ("grads_abs", "grad_abs_threshold")
 
 
 def either(arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
-    """(rows,) bool: either gradient will do, each with its own threshold."""
+    """(rows,) bool: rows where either gradient exceeds its own threshold."""
     absolute = flat(arguments["grads_abs"], dim=-1)
     enough = graphdeco.reaches(absolute, arguments["grad_abs_threshold"], rows)
     return graphdeco.needy(arguments, rows, flat) | enough
 
 
 class MipSplatting(GraphdecoAdapter):
-    """Mip-Splatting."""
+    """The adapter of Mip-Splatting."""
 
     name = "mip-splatting"
     descends_from = ("vanilla-3dgs",)
@@ -116,13 +116,13 @@ class MipSplatting(GraphdecoAdapter):
         return opacities.detach().reshape(-1)
 
     def read_model(self, ply: Path) -> SplatFile:
-        """With the 3D filter, which only this host's own reader asks for."""
+        """Read the host's PLY, including its 3D filter."""
         from fragprune_plugins.adapting import read_ply
 
         return read_ply(ply, filtered=True)
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """By the 2D filter of the command, or its default; ``--load_allres`` mixes resolutions."""
+        """The command's 2D filter, or the default; ``--load_allres`` is refused."""
         parser = ArgumentParser(add_help=False)
         size = graphdeco.default(repo, "ModelParams", "_kernel_size", KERNEL_SIZE)
         parser.add_argument("-k", "--kernel_size", type=float, default=size)
@@ -142,5 +142,5 @@ class MipSplatting(GraphdecoAdapter):
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer Mip-Splatting."""
+    """Register the adapter of Mip-Splatting."""
     register(MipSplatting())

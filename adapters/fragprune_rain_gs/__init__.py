@@ -1,8 +1,8 @@
 """KU-CVLAB/RAIN-GS: 3DGS from random or sparse points, coarse to fine.
 
-While Gaussians are few its rasterizer dilates them widely (``low_pass``), and while it warms up
-every split also throws a copy far out, so one split appends twice. In its newer mode the host sets
-no learning rate before iteration 10,000 and an offset one from there.
+While there are few Gaussians, its rasterizer dilates them widely (``low_pass``). During warm-up
+every split also places a copy far away, so one split appends twice. In its newer mode the host sets
+no learning rate before iteration 10,000, and an offset one afterwards.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class RainDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with a dilation of its own, and depth as third output."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Depth is blended as one more channel; it has no gradient."""
+        """Translate the call; depth is one more channel, without gradient."""
         inputs = super().unpack(call)
         view = inputs.view.viewmatrix
         depth = call["means3D"].detach() @ view[:3, 2:3] + view[3, 2]
@@ -66,19 +66,19 @@ class RainDialect(GraphdecoDialect):
         return outputs.image, outputs.radii, outputs.features.detach()
 
     def spares(self) -> dict[str, ModuleType]:
-        """``train.py`` imports wandb and does not use it."""
+        """A stand-in for wandb, which ``train.py`` imports and does not use."""
         return {"wandb": ModuleType("wandb", "Stand-in of fragprune: empty.")}
 
 
 def far_splits(call: SeamCall) -> Tensor:
-    """A far split appends N - 1 copies of each row before it appends N children."""
+    """The parents of a far split: N - 1 copies of each row, then N children."""
     children = call.arguments["N"]
     far = call.arguments["abe_split"]
     return graphdeco.splits(call, copies=2 * children - 1 if far else children)
 
 
 class RainGS(GraphdecoAdapter):
-    """RAIN-GS."""
+    """The adapter of RAIN-GS."""
 
     name = "rain-gs"
     descends_from = ("vanilla-3dgs",)
@@ -105,9 +105,9 @@ class RainGS(GraphdecoAdapter):
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """Without its modes, which cannot resume: they replace the points and set no dilation.
+        """The command without its modes, which cannot resume.
 
-        Where only ``--exp_name`` says where the output is, the folder is named.
+        If only ``--exp_name`` gives the output folder, the command names the folder.
         """
         parser = ArgumentParser(add_help=False, allow_abbrev=False)
         for flag in ("--ours", "--ours_new", "--paper_random", "--c2f"):
@@ -123,12 +123,12 @@ class RainGS(GraphdecoAdapter):
         return script, rest
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """Vanilla's, but for its own white; views are always held out."""
+        """Vanilla's flags, with this host's flag for white; it always holds views out."""
         line = super().command_line(repo)
         return replace(line, white_background=("--white_bg",), hold_out=())
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
-        """Vanilla's, from the folder that the scene's name stands for."""
+        """Vanilla's photographs, from the image folder that the scene's name implies."""
         read = super().photographs(repo, arguments)
         folders = [folder for name, folder in SMALLER.items() if name in str(read.folder)]
         return replace(read, images=folders[-1]) if folders else read
@@ -136,5 +136,5 @@ class RainGS(GraphdecoAdapter):
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer RAIN-GS."""
+    """Register the adapter of RAIN-GS."""
     register(RainGS())

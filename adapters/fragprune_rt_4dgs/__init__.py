@@ -1,8 +1,9 @@
 """fudan-zvg/4d-gaussian-splatting (RT-4DGS): Gaussians in space and time.
 
-A view is drawn at a moment: the Gaussians are cut there, and the 3D Gaussians that come out are
-splatted as ever. A threshold acts on the falloff of that 3D Gaussian; how likely the moment is only
-scales its opacity. The host has no PLY: its checkpoints are its models, and carry the thresholds.
+A view is drawn at a moment. The Gaussians are cut at that moment, and the resulting 3D Gaussians
+are splatted as usual. A threshold acts on the falloff of the 3D Gaussian; the likelihood of the
+moment only scales its opacity. The host has no PLY: its checkpoints are its models, and carry the
+thresholds.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def with_its_map(call: SeamCall) -> Any:
 
 
 class RT4DGS(GraphdecoAdapter):
-    """RT-4DGS, with and without 4D rotation."""
+    """The adapter of RT-4DGS, with and without 4D rotation."""
 
     name = "rt-4dgs"
     descends_from = ("vanilla-3dgs",)
@@ -75,9 +76,9 @@ class RT4DGS(GraphdecoAdapter):
     # -- its command line ------------------------------------------------------------------------
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """A YAML file wins over flags; models are checkpoints.
+        """The flags, and a YAML file that overrides them; models are checkpoints.
 
-        The first iteration is 2, so that one is left out; the last takes no step.
+        Iterations start at 2, and the last one takes no step, so two are skipped.
         """
         return replace(
             super().command_line(repo),
@@ -88,7 +89,7 @@ class RT4DGS(GraphdecoAdapter):
         )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """The same command, if the host can resume at all what it trains."""
+        """The same command, if the host can resume this configuration."""
         parser = ArgumentParser(add_help=False)
         parser.add_argument("--config", type=Path)
         parser.add_argument("--gaussian_dim", type=int, default=3)
@@ -106,7 +107,7 @@ class RT4DGS(GraphdecoAdapter):
         return script, arguments
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
-        """Our readers know no time."""
+        """Refuse: our readers have no notion of time."""
         raise NotComparedError(
             "RT-4DGS",
             "checkpoints of Gaussians in time for models, and no PLY",
@@ -115,7 +116,7 @@ class RT4DGS(GraphdecoAdapter):
         )
 
     def view(self, camera: Any) -> int:
-        """Every render gets a copy of its camera; copies keep the number."""
+        """The camera's number, because every render gets a copy of its camera."""
         return int(camera.uid)
 
     # -- its models ------------------------------------------------------------------------------
@@ -125,7 +126,7 @@ class RT4DGS(GraphdecoAdapter):
         return [model.env_map] if getattr(model.env_map, "requires_grad", False) else []
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:
-        """Bring the environment map back, where a new one, all black, has taken its place."""
+        """Restore the environment map, which the host replaced by a new black one."""
         import torch
 
         saved = getattr(model, "restored_env_map", None)
@@ -136,11 +137,11 @@ class RT4DGS(GraphdecoAdapter):
     # -- its files -------------------------------------------------------------------------------
 
     def model_file(self, output: Path, iteration: int) -> Path:
-        """What ``scene.save`` writes."""
+        """The path to which ``scene.save`` writes."""
         return output / f"chkpnt{iteration}.pth"
 
     def save_model(self, model: Any, output: Path, iteration: int) -> Path:
-        """As ``scene.save`` does."""
+        """Save the model as ``scene.save`` does."""
         import torch
 
         path = self.model_file(output, iteration)
@@ -148,7 +149,7 @@ class RT4DGS(GraphdecoAdapter):
         return path
 
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> NoReturn:
-        """A PLY holds no time."""
+        """Refuse: a PLY holds no time."""
         raise ModelFileError(
             str(ply),
             "a PLY, which has no place for Gaussians in time",
@@ -159,5 +160,5 @@ class RT4DGS(GraphdecoAdapter):
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer RT-4DGS."""
+    """Register the adapter of RT-4DGS."""
     register(RT4DGS())

@@ -10,10 +10,10 @@ from fragprune_plugins.adapting import ConfigFile
 
 
 class YAMLFile(ConfigFile):
-    """The host walks the file's sections in order and takes every value, whatever section it is in.
+    """A YAML file. The host takes every value of every section, in order.
 
-    The last one wins, so a section at the end overrules the file. It is read with the host's own
-    reader, which knows more numbers than YAML does.
+    The last value wins, so a section at the end overrules the file. The host's own reader is used,
+    because it accepts more number formats than YAML does.
     """
 
     def read(self, path: Path) -> dict[str, Any]:
@@ -30,7 +30,7 @@ class YAMLFile(ConfigFile):
             raise ValueError(str(error)) from error
 
     def overrule(self, text: str, values: dict[str, Any]) -> str:
-        """The file and one more section."""
+        """The file's text with one more section that holds the new values."""
         lines = [f"  {name}: {json.dumps(value)}" for name, value in values.items()]
         return "\n".join([text.rstrip(), "fragprune:", *lines, ""])
 

@@ -40,13 +40,13 @@ OUTPUTS = 6
 
 @dataclass(frozen=True)
 class RT4DGSDialect(GraphdecoDialect):
-    """Slices the 4D Gaussians at the call's moment; an engine draws what is left."""
+    """Cuts the 4D Gaussians at the call's moment; an engine draws the 3D Gaussians."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Depth and optical flow become features; rows that are not there are at the camera.
+        """Translate the call. Depth and flow become features; absent rows are at the camera.
 
-        The host also drops a Gaussian whose integer radius is not above 0.4. With 0.3 pixels^2 of
-        dilation no radius is below 3, so only a covariance that is not finite is meant.
+        The host also drops a Gaussian whose integer radius is not above 0.4. With a dilation of 0.3
+        pixels^2 no radius is below 3, so this drops only covariances that are not finite.
         """
         import torch
 
@@ -67,10 +67,10 @@ class RT4DGSDialect(GraphdecoDialect):
         return replace(inputs, splats=replace(inputs.splats, features=features))
 
     def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
-        """With ``compute_cov3D_python`` the host leaves out who is not there at the moment.
+        """Rows of a call: with ``compute_cov3D_python`` only those present at the moment.
 
-        The same mask, worked out by the host's own function; the opacities of the call, which have
-        the marginal in them, must be those of the rows it keeps.
+        The host's own function gives the mask. The opacities of the call, which include the
+        marginal, must be those of these rows.
         """
         import torch
 
@@ -93,7 +93,7 @@ class RT4DGSDialect(GraphdecoDialect):
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
     ) -> tuple[Tensor, ...]:
-        """What ``pack`` gives, and covs_com (P, 6): the covariances drawn, without gradients."""
+        """The result of ``pack``, and covs_com (P, 6): the drawn covariances, without gradients."""
 
         drawn = self.pack(draw(inputs), call)
         assert isinstance(inputs.splats, Splats)  # unpack made them
@@ -107,7 +107,7 @@ class RT4DGSDialect(GraphdecoDialect):
         return outputs.image, outputs.radii, features[:1], outputs.alpha, features[1:]
 
     def names(self) -> frozenset[str]:
-        """Vanilla's and that of the neighbours."""
+        """The import names of vanilla's packages and of pointops2_cuda."""
         return super().names() | {"pointops2_cuda"}
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
@@ -118,7 +118,7 @@ class RT4DGSDialect(GraphdecoDialect):
 
 
 def at_moment(call: HostCall) -> Sliced:
-    """The Gaussians of a call as 3D Gaussians, by whichever of the host's paths it asks for."""
+    """The Gaussians of a call as 3D Gaussians, by the host's code path for this call."""
     from fragprune_plugins.adapting import slice_at
 
     s, given = call.settings, {}

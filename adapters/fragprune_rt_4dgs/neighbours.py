@@ -1,4 +1,4 @@
-"""pointops2_cuda for a host without it: the nearest neighbours of its rigidity loss."""
+"""A stand-in for pointops2_cuda: the nearest neighbours for the host's rigidity loss."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def modules() -> dict[str, ModuleType]:
-    """The extension under its import name; what the host never calls is missing."""
+    """The stand-in under its import name, with only the functions that the host calls."""
     module = ModuleType("pointops2_cuda", "Stand-in of fragprune.")
     vars(module)["knnquery_cuda"] = knnquery
     return {"pointops2_cuda": module}

@@ -1,8 +1,8 @@
 """j-alex-hanson/speedy-splat: prunes Gaussians by squared gradients, draws them in exact tiles.
 
-Its pruning score is the sum, over a Gaussian's fragments, of the squared gradient of the picture
-by the falloff; the host's rasterizer writes it into a gradient. Our engines do not compute it, so
-stage 1 with its pruning needs the host's own rasterizer. Stage 2 prunes nothing and needs no score.
+Its pruning score is a sum over a Gaussian's fragments of the squared gradient by the falloff. The
+host's rasterizer returns it as a gradient. Our engines do not compute it, so stage 1 with pruning
+needs the host's own rasterizer. Stage 2 does not prune and needs no score.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class SpeedySplatDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with a tensor for scores, and the time taken as third output."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Vanilla's, unless the scores are really wanted: zeros would prune every Gaussian.
+        """Translate the call as vanilla's; refuse a call that needs scores.
 
         Raises:
-            EngineError: the host is about to prune.
+            EngineError: the host is about to prune; zeros as scores would prune every Gaussian.
         """
         scores = call.get("scores")
         if scores is not None and scores.requires_grad:
@@ -55,7 +55,7 @@ class SpeedySplatDialect(GraphdecoDialect):
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
     ) -> Any:
-        """(colour (3, H, W), radii (P,), milliseconds (1,)): the host divides by the time."""
+        """(colour (3, H, W), radii (P,), milliseconds (1,)). The host divides by the time."""
         import torch
 
         begun = time.perf_counter()
@@ -67,7 +67,7 @@ class SpeedySplatDialect(GraphdecoDialect):
 
 
 class SpeedySplat(GraphdecoAdapter):
-    """Speedy-Splat."""
+    """The adapter of Speedy-Splat."""
 
     name = "speedy-splat"
     descends_from = ("vanilla-3dgs",)
@@ -91,11 +91,11 @@ class SpeedySplat(GraphdecoAdapter):
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """The same script, without pruning: its scores would be computed for nothing."""
+        """The same script without pruning, so that it computes no scores."""
         return script, [*arguments, UNTIL, "0"]
 
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer Speedy-Splat."""
+    """Register the adapter of Speedy-Splat."""
     register(SpeedySplat())

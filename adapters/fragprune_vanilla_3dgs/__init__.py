@@ -1,9 +1,9 @@
 """graphdeco-inria/gaussian-splatting: 3D Gaussian Splatting, the host the others descend from.
 
-Its states are told apart by their source alone. Those of 2023 have two rasterizer outputs: the one
-of mid-July no ``debug`` among the settings, that of late July no random background, that of October
-both. That of August 2024 has exposure, depth and antialiasing, that of October 2024 ``separate_sh``
-and sparse Adam. The first ten days of July 2023 knew no checkpoints, and so know no stage 2.
+The source alone tells the states apart. The states of 2023 have two rasterizer outputs. Mid-July
+lacks the setting ``debug``, late July lacks the random background, and October has both. August
+2024 has exposure, depth and antialiasing. October 2024 has ``separate_sh`` and sparse Adam. States
+before mid-July 2023 have no checkpoints, so stage 2 is not possible.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ OUTPUTS = 3
 
 
 class Vanilla3DGS(GraphdecoAdapter):
-    """Vanilla 3DGS, every public state."""
+    """The adapter of vanilla 3DGS, in every public state."""
 
     name = "vanilla-3dgs"
     info = HostInfo(
@@ -45,11 +45,11 @@ class Vanilla3DGS(GraphdecoAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """The revision, where nothing speaks against this host."""
+        """Check the source; a finding names the revision."""
         return super().fingerprint(repo) or [self._state(repo)]
 
     def _state(self, repo: HostRepo) -> Finding:
-        """The revision, for people; an error where it has no checkpoints to resume."""
+        """A finding that names the revision; an error if it has no checkpoints."""
         names = ("training_setup", "capture", "restore")
         there = [name for name in names if repo.function(graphdeco.MODEL, f"GaussianModel.{name}")]
         if there != ["training_setup"]:
@@ -64,7 +64,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         )
 
     def revision(self, repo: HostRepo) -> str:
-        """Which of the public states the source is."""
+        """The public state of the source."""
         dialect = self.dialect(repo)
         if dialect.outputs < OUTPUTS:
             if "debug" not in dialect.settings:
@@ -75,7 +75,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         return "October 2024" if has_separate_sh else "August 2024"
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:
-        """Bring exposures back: the host's checkpoint lacks them and a resumed run starts anew."""
+        """Restore exposures, which the host's checkpoint lacks."""
         import torch
 
         mapping = getattr(model, "exposure_mapping", None)
@@ -91,5 +91,5 @@ class Vanilla3DGS(GraphdecoAdapter):
 
 @hookimpl
 def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer vanilla 3DGS."""
+    """Register the adapter of vanilla 3DGS."""
     register(Vanilla3DGS())
