@@ -86,7 +86,7 @@ def rim_cutoffs(visible: Tensor, thresholds: Tensor) -> Tensor:
 
 
 def cap(alpha: Tensor, alpha_max: float, with_gradient: bool) -> Tensor:
-    """Cap alpha at alpha_max. The gradient passes the cap ``with_gradient``, else it stops there."""
+    """Cap alpha at alpha_max. Without ``with_gradient`` a capped alpha has no gradient."""
     capped = alpha.clamp(max=alpha_max)
     return alpha + (capped - alpha).detach() if with_gradient else capped
 

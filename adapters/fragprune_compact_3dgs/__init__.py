@@ -85,9 +85,9 @@ class Compact3DGS(GraphdecoAdapter):
         states="September 2024",
         limits=(
             "Its checkpoints cannot be resumed: --stage finetune --from-iter N learns in one run.",
-            "It needs tinycudann, and that a GPU; nothing of ours stands in for it.",
-            "fragprune finetune, render and compare refuse its files: values are activated and the "
-            "colours are not in them.",
+            "It needs tinycudann, which needs a GPU; we have no stand-in for it.",
+            "fragprune finetune, render and compare refuse its files, which hold activated values "
+            "and no colours.",
         ),
     )
     groups = ("xyz", "opacity", "scaling", "rotation", "mask")
@@ -127,7 +127,7 @@ class Compact3DGS(GraphdecoAdapter):
         raise NotComparedError(
             "Compact-3DGS",
             "models whose colours are a network's and not in the file",
-            "models that our own readers draw",
+            "models that our readers can draw",
             "Draw and measure with the host's render.py and metrics.py.",
         )
 

@@ -229,7 +229,7 @@ class GaussianSplatting(GraphdecoAdapter):
             "gaussian-splatting (pip)",
             "a package that trains on every view",
             "views that are held out",
-            "Leave some out of the COLMAP model, then fragprune compare on all of them.",
+            "Leave some views out of the COLMAP model, then run fragprune compare on all of them.",
         )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:

@@ -153,9 +153,9 @@ class Gsplat(HostAdapter):
         if isinstance(params, dict):
             raise SessionError(
                 "params",
-                "a dict, of which nothing can be remembered",
+                "a plain dict, which cannot hold a session's state",
                 "torch.nn.ParameterDict",
-                "Make one of it: params = torch.nn.ParameterDict(params).",
+                "Convert it: params = torch.nn.ParameterDict(params).",
             )
         if call.arguments.get("format", "ply") != "ply":
             return None  # other formats sort their rows

@@ -71,7 +71,7 @@ class LightGaussian(GraphdecoAdapter):
         repo="VITA-Group/LightGaussian",
         states="2024, rasterizer of 240618b (score: opacity per fragment)",
         limits=(
-            "VecTree and render.py --load_vq know no thresholds: their pictures are untruncated.",
+            "VecTree and render.py --load_vq ignore thresholds: their pictures are untruncated.",
         ),
     )
     calls = (

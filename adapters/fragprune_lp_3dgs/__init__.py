@@ -94,8 +94,8 @@ class LP3DGS(GraphdecoAdapter):
         limits=(
             "--prune_method compact_3dgs: its model has groups of its own and is refused.",
             "--prune_method rad_splat: pruning needs the host's own rasterizer; stage 2 does not.",
-            "Trained for other than 30,000 iterations the host ends in a KeyError of its own, once "
-            "it has saved: begin stage 2 with --stage finetune then.",
+            "After a training of other than 30,000 iterations the host saves, then ends in a "
+            "KeyError: begin stage 2 with --stage finetune.",
         ),
     )
     calls = (RasterizerCall(frozenset(SCORES), None),)

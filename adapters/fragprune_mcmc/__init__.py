@@ -73,7 +73,7 @@ class MCMC(GraphdecoAdapter):
         repo="ubc-vision/3dgs-mcmc",
         states="January 2025",
         limits=(
-            "Ours clips at 3 sigma, as the rasterizer it pins; that one's branch gs-mcmc at 1.8.",
+            "Our engines clip at 3 sigma like the pinned rasterizer; branch gs-mcmc clips at 1.8.",
         ),
     )
     calls = (RasterizerCall(outputs=3),)

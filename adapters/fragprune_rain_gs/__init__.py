@@ -86,7 +86,7 @@ class RainGS(GraphdecoAdapter):
         "RAIN-GS",
         repo="KU-CVLAB/RAIN-GS",
         states="2024, both of its modes",
-        limits=("Stage 2 leaves its modes out (--ours, --ours_new, --c2f): they cannot resume.",),
+        limits=("Stage 2 leaves out the modes (--ours, --ours_new, --c2f), which cannot resume.",),
     )
     package = PACKAGE
     calls = (RasterizerCall(frozenset({"low_pass"}), 3),)

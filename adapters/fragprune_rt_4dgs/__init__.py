@@ -111,7 +111,7 @@ class RT4DGS(GraphdecoAdapter):
         raise NotComparedError(
             "RT-4DGS",
             "checkpoints of Gaussians in time for models, and no PLY",
-            "models that our own readers draw",
+            "models that our readers can draw",
             "Read the PSNR that the host prints at its test_iterations.",
         )
 

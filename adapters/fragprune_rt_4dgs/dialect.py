@@ -84,7 +84,7 @@ class RT4DGSDialect(GraphdecoDialect):
             raise AlignmentError(
                 "rt-4dgs: compute_cov3D_python",
                 f"{len(call['opacities'])} Gaussians",
-                f"the {len(rows)} of {len(marginal)} that are there at "
+                f"the {len(rows)} of {len(marginal)} that are present at "
                 f"{float(call.settings.timestamp):g}, with their opacities",
                 "Report this with the host's commit, or leave compute_cov3D_python off.",
             )
@@ -123,7 +123,7 @@ def at_moment(call: HostCall) -> Sliced:
 
     s, given = call.settings, {}
     in_time = s.gaussian_dim == 4 or s.rot_4d
-    if call.get("cov3D_precomp") is not None:  # the host sliced, and left out who is not there
+    if call.get("cov3D_precomp") is not None:  # the host sliced, and left out absent rows
         given["cov3d"] = call["cov3D_precomp"]
     else:
         given |= {"scales": call["scales"], "rotations": call["rotations"]}

@@ -45,7 +45,7 @@ class SpeedySplatDialect(GraphdecoDialect):
         if scores is not None and scores.requires_grad:
             raise EngineError(
                 "the rasterizer's scores",
-                "a pruning pass of Speedy-Splat, which wants squared gradients per fragment",
+                "a pruning pass of Speedy-Splat, which needs squared gradients per fragment",
                 "pictures only: our engines do not compute that score",
                 "Train with the host's own rasterizer and start from what it saved with "
                 f"--stage finetune; or give {UNTIL} 0 to train without pruning.",
@@ -76,7 +76,7 @@ class SpeedySplat(GraphdecoAdapter):
         repo="j-alex-hanson/speedy-splat",
         states="December 2024",
         limits=(
-            "Its pruning needs the host's own rasterizer, so a GPU; stage 2 does not.",
+            "Its pruning needs the host's own rasterizer and so a GPU; stage 2 does not.",
             "Our engines clip to the tiles of three sigma, as vanilla does; the host's own "
             "rasterizer also draws fragments beyond, of an alpha below 0.0111.",
         ),

@@ -47,7 +47,7 @@ def read_transforms(path: Path) -> list[Row]:
             raise DatasetError(
                 str(path),
                 f"lens distortion ({', '.join(distortion)})",
-                "undistorted images: rasterization knows no lens distortion",
+                "undistorted images: rasterization has no lens distortion",
                 "Undistort them first (colmap image_undistorter).",
             )
         return [_row(path.parent, content, frame) for frame in content["frames"]]

@@ -63,7 +63,7 @@ def read(folder: Path, images: str = "images") -> tuple[list[Row], list[Row]]:
     """
     model = find_model(folder)
     assert model is not None, "the caller looked"
-    # Binary first, as hosts do: COLMAP writes it, text is somebody's export.
+    # Binary first, as hosts do: COLMAP writes binary files, and text files are an export.
     if (model / "images.bin").exists():
         cameras = _parsed(model / "cameras.bin", _cameras_binary)
         poses = _parsed(model / "images.bin", _images_binary)
@@ -143,7 +143,7 @@ def _intrinsics(model: str, width: int, height: int, values: Sequence[float]) ->
     raise DatasetError(
         "COLMAP camera",
         f"model {model}",
-        "PINHOLE or SIMPLE_PINHOLE: rasterization knows no lens distortion",
+        "PINHOLE or SIMPLE_PINHOLE: rasterization has no lens distortion",
         "Undistort first: colmap image_undistorter.",
     )
 

@@ -37,8 +37,8 @@ _NAMES = (
 
 _SHAPE = frozenset(("scales", "scales_t", "rotations", "rotations_r"))
 
-# What acts on each output; an engine spends nothing on gradients by those that nothing wanted acts
-# on, which in fine-tuning is most.
+# The inputs that affect each output. If none of them needs a gradient, an engine skips the output's
+# part of the backward pass; in fine-tuning that is most of it.
 _FELT_BY = {
     "means": _SHAPE | {"means", "times"},
     "cov3d": _SHAPE | {"cov3d"},

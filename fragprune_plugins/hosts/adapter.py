@@ -134,7 +134,7 @@ class Dialect(ABC):
         """Whether the host can import its own compiled package here."""
         try:
             return find_spec(package) is not None
-        except ValueError:  # a module without a spec is a stand-in somebody else put there
+        except ValueError:  # a module without a spec is another tool's stand-in
             return True
 
     def spares(self) -> dict[str, ModuleType]:
@@ -404,9 +404,9 @@ class ScriptAdapter(HostAdapter):
         """
         raise NotComparedError(
             self.name,
-            "photographs that only the host knows how to read",
-            "an adapter that says how",
-            "Have the adapter define photographs().",
+            "photographs that only the host can read",
+            "an adapter with photographs()",
+            "Define photographs() in the adapter.",
         )
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:

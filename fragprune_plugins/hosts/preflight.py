@@ -184,5 +184,5 @@ def _present(package: str) -> bool:
     """Whether an import would find a package here."""
     try:
         return find_spec(package) is not None
-    except ValueError:  # a module without a spec, which somebody put there
+    except ValueError:  # a module without a spec, put there by hand
         return True

@@ -68,7 +68,7 @@ def visible(
         drawer = engine_for(engine, splats.device) if isinstance(engine, str) else engine
         seen = torch.zeros_like(seen)
         for view in views:
-            # Alpha capped at its least cuts nobody, and hides nobody: light is left behind two
+            # Alpha capped at its least cuts and hides no Gaussian: light is left behind two
             # thousand Gaussians. So those count too that end a pixel without being drawn in it.
             inputs = RasterInputs(view, splats, counts=True, alpha_max=ALPHA_MIN)
             counts = drawer.rasterize(inputs, thresholds).fragments_per_gaussian

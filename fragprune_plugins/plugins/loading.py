@@ -141,7 +141,7 @@ class Plugins:
                 _call(each, hook, given)
             except PluginError as error:
                 self._off.add(key)
-                log.warning("%s Until then it is not told again.", error)
+                log.warning("%s Until then it is not called again.", error)
 
     def answering(self, hook: Hook) -> list[str]:
         """Names of the plugins that are asked, in order."""

@@ -141,9 +141,8 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
     if missing == list(_DC):
         raise ModelFileError(
             str(path),
-            "Gaussians without colours, as codebases save them that keep colours in a network: "
-            "activated already",
-            "a splat that holds its colours, before activation",
+            "activated Gaussians without colours, from a codebase that keeps colours in a network",
+            "a splat with colours and values before activation",
             "Fine-tune with fragprune run inside that host.",
         )
     if missing:
@@ -266,8 +265,8 @@ def _read_vertices(path: Path) -> np.ndarray[Any, Any]:
             str(path),
             "a training codebase's checkpoint, which only that codebase can draw",
             "a trained splat (.ply)",
-            "Pass its PLY; a host without one (4D models among them) is fine-tuned and drawn "
-            "through its own script, with fragprune run.",
+            "Pass its PLY. Fine-tune and draw a host without PLYs (4D models) through its own "
+            "script, with fragprune run.",
         )
     try:
         file = PlyData.read(str(path))

@@ -74,8 +74,8 @@ def find(folder: Path) -> list[Record]:
         raise RecordError(
             str(folder),
             f"no file *{SUFFIX} in it or below",
-            "a folder in which fragprune run, finetune, or compare and profile with --out, worked",
-            "Run one of them, then report.",
+            "an output folder of fragprune run, finetune, or of compare and profile with --out",
+            "Run one of these first.",
         )
     return [_read(path) for path in found]
 

@@ -60,8 +60,8 @@ def lies_beside(model: Path) -> bool:
             str(path),
             f"no such file, though {Path(model).name} was saved with thresholds beside it",
             "its sidecar, under this name",
-            "Bring it along; whoever renames a model renames both. "
-            "Or go without thresholds, where a command takes --no-truncation.",
+            "Copy it here, and always rename both files together. "
+            "Or pass --no-truncation to commands that have it.",
         )
     return path.exists()
 

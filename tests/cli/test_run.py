@@ -93,7 +93,7 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     assert {path: path.read_bytes() for path in kept} == kept
     again = ran(*finetune, *words)
     assert again["control"] == zero["after"]
-    assert "pruning itself makes" in run_json("report", out)["result"]
+    assert "pruning itself adds" in run_json("report", out)["result"]
 
 
 @pytest.mark.parametrize(("size", "read"), [("2", (20, 15)), ("16", (16, 12)), ("-1", (40, 30))])

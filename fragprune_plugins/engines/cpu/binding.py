@@ -281,7 +281,7 @@ def choose() -> Library:
         raise Unavailable(f"switched off by {ENVIRONMENT}={wanted}")
     if wanted and wanted not in BUILDS:
         names = ", ".join(["off", *BUILDS])
-        raise Unavailable(f"{ENVIRONMENT}={wanted} is none of {names}")
+        raise Unavailable(f"{ENVIRONMENT}={wanted} is not one of {names}")
     baseline = open_build("baseline")  # it alone may run anywhere, so it is the one to ask
     features = int(baseline.calls.fragprune_cpu_features())
     if wanted:

@@ -190,6 +190,6 @@ class CudaEngine:
                 raise EngineError(
                     "engine 'cuda'",
                     f"{int(entries)} entries in a captured frame's lists",
-                    "no more than there was room for",
+                    "at most the allocated room",
                     "Capture the graph again: there is more room now.",
                 )

@@ -387,7 +387,7 @@ class Drawing:
         )
         outputs = self._new_outputs()
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
-        # The last pass of sorting entries shall end in `kept`.
+        # The last sorting pass of the entries must end in `kept`.
         keys = [scratch["entry_keys"], scratch["entry_keys_2"]]
         values = [kept["entry_values"], scratch["entry_values_2"]]
         if passes % 2:

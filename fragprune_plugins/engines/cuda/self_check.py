@@ -62,7 +62,7 @@ class Verdict:
             return "Please report it, with fragprune doctor --json."
         return (
             "Free some of the GPU's memory; where its compute mode is exclusive, run fragprune "
-            "doctor once while nothing else uses it. --engine cuda goes without the check."
+            "doctor once while nothing else uses it. --engine cuda skips the check."
         )
 
 

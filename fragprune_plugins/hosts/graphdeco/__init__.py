@@ -1,8 +1,8 @@
-"""What all descendants of the 2023 3DGS training code share.
+"""Code that all descendants of the 2023 3DGS training code share.
 
-call          the rasterizer's call as their source has it
+call          the rasterizer's call in their source
 adapter       the base of their adapters: seams, names, files
-densifying    whom their densify methods copy
+densifying    the rows that their densify methods copy
 stand_ins     modules of ours for their compiled packages; imports torch
 """
 

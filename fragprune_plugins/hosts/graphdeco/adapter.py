@@ -382,7 +382,7 @@ class GraphdecoAdapter(ScriptAdapter):
             if flag in arguments:
                 raise NotComparedError(
                     "the host's command",
-                    f"{flag}, which our own readers do not draw by",
+                    f"{flag}, which our readers do not support",
                     "pictures as the host draws them",
                     "Draw and measure with the host's render.py and metrics.py.",
                 )
@@ -454,7 +454,7 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     if not divisors or not capped or (value < 1 and value != -1):
         raise NotComparedError(
             f"-r {value}" if divisors and capped else repo.place(CAMERAS, "loadCam"),
-            "a size of images that our own readers do not know how to follow",
+            "an image size that our readers cannot reproduce",
             f"a divisor, a width, or -1: at most {WIDEST} pixels wide, as vanilla has it",
             "Measure with fragprune compare --resolution, or with the host's own metrics.py.",
         )
