@@ -27,8 +27,8 @@ when it is registered, and an unknown hook name is an error. A plugin that fails
 out, and the others go on. `FRAGPRUNE_BLOCK` and `FRAGPRUNE_ONLY` take comma-separated entry-point
 names.
 
-Every command asks these hooks, and so does a host under `fragprune run`. Where a hook says that the
-first answer counts, `None` leaves the answer to the next plugin, and ours comes last."""
+Every command asks these hooks, and so does a host under `fragprune run`. If a hook says that
+the first answer counts, `None` leaves the answer to the next plugin. Our own answer comes last."""
     parts = []
     for name, hook in _functions(hookspecs):
         if not name.startswith("fragprune_"):
@@ -50,9 +50,9 @@ adapter lists a host's seams and gives each a role. In every role but RASTERIZE 
 runs unchanged, and fragprune follows. `fragprune check DIR` prints the seams of a checkout with
 file and line.
 
-What only the host can say of a call is the seam's `how`, a function that takes the `SeamCall`. It
-is asked before, around, after or instead of the host's function; in brackets stands what holds for
-a seam without one, and where there are no brackets a seam has to have one."""
+A seam's `how` is a function of the adapter for things that only this host does in its own way. It
+takes the `SeamCall`, and is called before, around, after or instead of the host's function.
+Brackets show the default of a seam without a `how`. Without brackets a `how` is required."""
     cells = [(role.name, _sentence(role.does), role.how and _sentence(role.how)) for role in Role]
     rows = "\n".join(f"| `{name}` | {does} | {_fields(how)} |" for name, does, how in cells)
     table = f"| role | what fragprune does there | `how` |\n|---|---|---|\n{rows}"
@@ -66,7 +66,7 @@ def adapters() -> str:
 
     head, names, *rest = (inspect.getdoc(adapting) or "").split("\n\n")
     intro = f"""An adapter is a class that describes one host. Required methods have no default. See
-[how to write one](../how-to/write-an-adapter.md); [roles](roles.md) says what happens at seams.
+[how to write one](../how-to/write-an-adapter.md), and [roles](roles.md) for the roles of seams.
 
 {_fields(head)}
 
@@ -90,9 +90,7 @@ def python() -> str:
     """The names of the package."""
     import fragprune_plugins
 
-    intro = (
-        "Everything below is imported from `fragprune_plugins`; nothing else is promised to stay."
-    )
+    intro = "Import these names from `fragprune_plugins`. Only these names are stable."
     parts = []
     for name in fragprune_plugins.__all__:
         thing = getattr(fragprune_plugins, name)
@@ -109,8 +107,8 @@ def command_line() -> str:
     """Every command's help."""
     from fragprune_plugins.cli import cli
 
-    intro = """What `fragprune COMMAND --help` prints. Every command takes `--json`: one object on
-stdout, progress on stderr. Exit codes are listed in [errors](errors.md)."""
+    intro = """The output of `fragprune COMMAND --help`. Every command takes `--json`: it
+prints one object on stdout, and progress on stderr. Exit codes are listed in [errors](errors.md)."""
     context = cli.make_context("fragprune", [], resilient_parsing=True)
     context.terminal_width = context.max_content_width = 96
     parts = []

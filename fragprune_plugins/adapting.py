@@ -1,8 +1,8 @@
-"""All that an adapter imports: ``from fragprune_plugins.adapting import ...``.
+"""Everything that an adapter imports: ``from fragprune_plugins.adapting import ...``.
 
 a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo, Finding
 its seams   Seam, Role, SeamCall, RowTrace, revised
-drawing     Dialect, HostCall; RasterInputs and what it is made of, RasterOutputs, slice_at
+drawing     Dialect, HostCall; RasterInputs and what its parts, RasterOutputs, slice_at
 its script  CommandLine, ConfigFile, Photographs
 of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
             share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages

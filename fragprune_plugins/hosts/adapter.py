@@ -107,7 +107,7 @@ class Dialect(ABC):
         """Draw and pack. A dialect may draw several times for one call.
 
         Args:
-            call: the host's.
+            call: the host's call.
             inputs: the result of ``unpack``.
             draw: rasterizes inputs with the thresholds of this call. If one call has several
                 cameras, a second argument numbers them from 0.

@@ -29,41 +29,44 @@ class Role(Enum):
 
     SCENE = "learn where the host writes its output"
     ATTACH = "give the model its threshold store", "after: its optimizers, the main one first"
-    STEP = "count one training step", "in stage 2, after: what the host is told (the call's result)"
+    STEP = (
+        "count one training step",
+        "in stage 2, after: the value to return to the host (the call's result)",
+    )
     VIEW = "remember which model is being rendered"
     RASTERIZE = "draw with thresholds"
     LOSS = "note the host's loss when it goes backward"
-    METRIC = "evaluate a picture; NaN where the weights it downloads are not to be had"
+    METRIC = "evaluate a picture; NaN if the weights cannot be downloaded"
     PARENTS = (
-        "work out the parents of the rows about to be appended",
+        "find the parents of the rows about to be appended",
         "before: rows (n,) int64 that will be copied, one per row appended, in order",
     )
     KEEP = "keep the surviving rows"
     APPEND = "append rows"
-    CHOICE = "note the rows the host has drawn as parents of what it appends or overwrites next"
-    COPY = "overwrite rows with copies of others; stands still in stage 2"
+    CHOICE = "note the rows that the host drew as parents of the rows it appends or overwrites next"
+    COPY = "overwrite rows with copies of others; does nothing in stage 2"
     REARRANGE = (
-        "keep, copy and append rows in one call; stands still in stage 2",
-        "around: a context manager in which the host's own code carries row numbers along; it "
-        "yields a ``RowTrace``, complete once it is left",
+        "keep, copy and append rows in one call; does nothing in stage 2",
+        "around: a context manager that makes the host's own code carry row numbers; it "
+        "yields a ``RowTrace``, which is complete at exit",
     )
     FORGET = "drop the moments of rows"
     STILL = (
-        "stand still in stage 2: what would change frozen parameters or rows",
-        "instead: what the call, which is not made, returns (None)",
+        "do nothing in stage 2: for functions that would change frozen parameters or rows",
+        "instead: the return value of the skipped call (None)",
     )
     SAVE = "write the sidecar beside the model's file", "after: the file (the path as passed)"
     LOAD = "read the sidecar beside the model's file", "after: the file (the path as passed)"
     PACK = (
-        "write the sidecar of a file that holds the model's Gaussians in an order of its own",
-        "after: its path, and the means (M, 3) in it, in its order and bit for bit the model's; "
-        "None where the call was about something else",
+        "write the sidecar of a file with the model's Gaussians in another order",
+        "after: the file's path, and its means (M, 3), in its order and bit for bit the model's; "
+        "None if the call was about something else",
     )
-    UNPACK = "read that sidecar for the model that will be made of the file", "after: as PACK"
+    UNPACK = "read that sidecar for the model that will be made from the file", "after: as PACK"
     CAPTURE = "put thresholds into the host's checkpoint"
     RESTORE = (
         "take thresholds out of the host's checkpoint",
-        "before: the checkpoint, completed where it lacks something (as passed)",
+        "before: the checkpoint, completed if it lacks something (as passed)",
     )
 
     def __init__(self, does: str, how: str = "") -> None:

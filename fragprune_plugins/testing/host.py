@@ -118,7 +118,7 @@ class Host:
         return import_module("scene.gaussian_model").GaussianModel(degree)
 
     def fill(self, model: Any, cloud: Any) -> None:
-        """Fill the model from a cloud: ``points``, ``colors``, ``normals`` (N, 3), ``time`` (N, 1)."""
+        """Fill from a cloud: ``points``, ``colors``, ``normals`` (N, 3) and ``time`` (N, 1)."""
         given = {"pcd": cloud, "cam_infos": [SimpleNamespace(image_name="photo")]}
         names = inspect.signature(model.create_from_pcd).parameters
         model.create_from_pcd(**{name: given.get(name, 1.0) for name in names})

@@ -95,5 +95,5 @@ def test_a_picture_that_is_worse_by_half_a_decibel_is_warned_of(after, control, 
 
 def test_a_control_says_that_it_is_one():
     line = outcome("finetune", data(truncate=False), None)
-    assert "a control, nothing is truncated" in line
+    assert "a control, without truncation" in line
     assert "pruning" not in line
