@@ -108,7 +108,7 @@ def command_line() -> str:
     from fragprune_plugins.cli import cli
 
     intro = """The output of `fragprune COMMAND --help`. Every command takes `--json`: it
-prints one object on stdout, and progress on stderr. Exit codes are listed in [errors](errors.md)."""
+prints one object on stdout, and progress on stderr. [Errors](errors.md) lists the exit codes."""
     context = cli.make_context("fragprune", [], resilient_parsing=True)
     context.terminal_width = context.max_content_width = 96
     parts = []

@@ -2,13 +2,13 @@
 
 a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo, Finding
 its seams   Seam, Role, SeamCall, RowTrace, revised
-drawing     Dialect, HostCall; RasterInputs and what its parts, RasterOutputs, slice_at
+drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs, slice_at
 its script  CommandLine, ConfigFile, Photographs
 of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
             share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages
 files       SplatFile, read_ply
 a plugin    hookimpl
-errors      with where, found, expected and remedy
+errors      each with where, found, expected and remedy
 
 Importing this module imports no torch. SplatFile, read_ply, slice_at and stand_ins load it when
 they are first used: import them inside functions, or under TYPE_CHECKING.

@@ -58,7 +58,7 @@ def untouched(out):
     [
         ("model missing", "model-file", "no such file"),
         ("model cut off", "model-file", "not readable as PLY"),
-        ("a checkpoint", "model-file", "4D models among them"),
+        ("a checkpoint", "model-file", "(4D models)"),
         ("data missing", "dataset", "no such folder"),
         ("image missing", "dataset", "no such image"),
         ("stale sidecar", "sidecar", "thresholds of another model"),
