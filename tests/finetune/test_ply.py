@@ -178,7 +178,7 @@ MESSAGES = {
     "nothing": "not readable as PLY",
     "a picture": "not readable as PLY",
     "points": "without f_dc_0, f_dc_1, f_dc_2, opacity, rot_3",
-    "compact": "keep colours in a network: activated already",
+    "compact": "keeps colours in a network",
     "odd sh": "8 f_rest columns",
     "mip": "Mip-Splatting model",
     "faces only": "without a vertex element",

@@ -96,7 +96,7 @@ def test_a_build_of_another_interface_is_a_reason_with_both_versions(
 
 def test_an_unknown_build_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(binding.ENVIRONMENT, "sse9")
-    assert "none of off, avx512, avx2, baseline" in binding.describe()["reason"]
+    assert "not one of off, avx512, avx2, baseline" in binding.describe()["reason"]
 
 
 @needs_native
