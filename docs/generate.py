@@ -126,9 +126,9 @@ def errors() -> str:
     """Every stated failure."""
     from fragprune_plugins import errors
 
-    intro = """Every stated failure prints `[code] where: found; expected. remedy` and leaves
-existing files as they were. Exit codes: 1 for a stated failure, 2 for usage, 130 for Ctrl-C, 143
-for SIGTERM while something learned. With `--json` the parts come as
+    intro = """Every error below prints `[code] where: found; expected. remedy` and leaves existing
+files as they were. Exit codes: 1 for such an error, 2 for usage, 130 for Ctrl-C, 143 for SIGTERM
+during learning. With `--json` the error is
 `{"error": {"code", "where", "found", "expected", "remedy"}}`."""
     base = errors.FragpruneError
     kinds = [kind for kind in vars(errors).values() if inspect.isclass(kind) and kind is not base]

@@ -16,7 +16,7 @@ from reference_renderer.scene import FALLOFF_MIN, RIM_REACH, RIM_WIDTH, Options
 
 @dataclass(frozen=True)
 class Fragments:
-    """The fragments of The fragments of K Gaussians at P pixels.
+    """The fragments of K Gaussians at P pixels.
 
     Attributes:
         alpha: (K, P) capped alpha times the gate; 0 where not drawn.

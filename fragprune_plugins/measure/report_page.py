@@ -71,7 +71,7 @@ def save_learning(
 
     Args:
         path: the PNG.
-        curves: a dict per step, as a run's summary has them.
+        curves: one dict a step, from a run's summary.
         thresholds: (N,) learned, falloff; None, of a control, leaves out what shows them.
     """
     import numpy as np

@@ -74,8 +74,8 @@ def render_view(
 
     Raises:
         InputError: splat and thresholds differ in length.
-        EngineError: no such engine here.
-        PluginError: a plugin raised, or gave an answer that cannot be used.
+        EngineError: there is no such engine here.
+        PluginError: a plugin raised, or its answer cannot be used.
     """
     splat, store = (model, None) if isinstance(model, SplatFile) else model
     view = (overview(splat) if view is None else view).to(splat.xyz.device)

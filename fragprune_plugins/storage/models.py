@@ -37,14 +37,14 @@ def load(
 
     Args:
         path: of the PLY.
-        truncation: False leaves the thresholds out.
+        truncation: False ignores thresholds.
         filtered: accept a Mip-Splatting model that has its 3D filter; the caller draws it by
             Mip-Splatting's rules.
-        device: where both are to live.
+        device: the device of the result.
 
     Raises:
         ModelFileError: the model cannot be read.
-        SidecarError: the sidecar beside it is lost, broken, another model's, or has other rows.
+        SidecarError: the sidecar is lost, broken, another model's, or has another number of rows.
     """
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.storage import sidecar
@@ -75,7 +75,7 @@ def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = No
         OutputError: the place cannot be written, or is not named as a PLY is; existing files stay
             as they were.
         AlignmentError: splat and thresholds differ in length.
-        DivergedError: what was learned is not finite.
+        DivergedError: learned values are not finite.
     """
     from fragprune_plugins.errors import AlignmentError, OutputError
     from fragprune_plugins.learning.thresholds import ThresholdStore

@@ -65,7 +65,7 @@ def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_pa
     assert result.exit_code == 0, result.stderr
     (line,) = (line for line in result.stdout.splitlines() if "x fewer fragments" in line)
     assert " ms (" in line
-    assert "no control was run; to find out, add --stage finetune --control" in line
+    assert "no control was run; to see, add --stage finetune --control" in line
 
 
 def test_the_host_and_the_engine_take_as_many_threads_as_they_are_given(
@@ -93,7 +93,7 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     assert {path: path.read_bytes() for path in kept} == kept
     again = ran(*finetune, *words)
     assert again["control"] == zero["after"]
-    assert "pruning itself adds" in run_json("report", out)["result"]
+    assert "pruning itself makes" in run_json("report", out)["result"]
 
 
 @pytest.mark.parametrize(("size", "read"), [("2", (20, 15)), ("16", (16, 12)), ("-1", (40, 30))])
