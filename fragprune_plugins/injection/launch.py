@@ -321,14 +321,6 @@ class _Runner:
                     saved = session.save_interrupted() if learn else None
                     raise self._interrupted(error, saved) from error
             session.expect_drawn()
-        except SystemExit as error:
-            if error.code not in (None, 0):
-                raise HostFailed(
-                    host.script.name,
-                    f"ended with exit code {error.code}",
-                    "0",
-                    "Read the host's own message above.",
-                ) from error
         finally:
             self.output = session.output or self.output
             process.forget_modules(self.repo.root, known, self.adapter.installed)

@@ -78,11 +78,28 @@ def host_process(
 
 
 def run_main(script: Path, module: str = "") -> None:
-    """Run a script, or the module that it is, as ``__main__``."""
-    if module:
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
-    else:
-        runpy.run_path(str(script), run_name="__main__")
+    """Run a script as ``__main__``; returns when it ends, also by ``sys.exit(0)``.
+
+    Args:
+        script: the file to run.
+        module: the module's name, if the script runs as ``python -m module``.
+
+    Raises:
+        HostFailed: the script ended with another exit code.
+    """
+    try:
+        if module:
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+        else:
+            runpy.run_path(str(script), run_name="__main__")
+    except SystemExit as error:
+        if error.code not in (None, 0):
+            raise HostFailed(
+                script.name,
+                f"ended with exit code {error.code}",
+                "0",
+                "Read the host's own message above.",
+            ) from error
 
 
 def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) -> None:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from miniatures.runs import OPTIONS, frozen_differences
 from miniatures.vanilla_3dgs import HOST, running
 
 from fragprune_plugins.cli import cli
-from fragprune_plugins.errors import Interrupted, UsageError
+from fragprune_plugins.errors import Interrupted, SessionError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.launch import RunOptions, run
@@ -226,6 +227,19 @@ def test_a_finished_ply_without_a_checkpoint_is_enough(photographs, trained):
     assert torch.equal(old.xyz, new.xyz)
     made = {p.name for p in trained.rglob("*") if p.is_file()} - {p.name for p in before}
     assert made == {"point_cloud.fragprune.safetensors"}
+
+
+@pytest.mark.parametrize("end", ["return", "sys.exit()", "sys.exit(0)"])
+def test_a_host_that_learns_and_draws_nothing_is_an_error_however_it_ends(
+    photographs, tmp_path, end
+):
+    host = Path(shutil.copytree(HOST, tmp_path / "host"))
+    script = host / "train.py"
+    tick = "gaussians.update_learning_rate(iteration)"
+    script.write_text(script.read_text().replace(tick, f"{tick}; {end}"))
+    words = runs.command(script, photographs, tmp_path / "out", 10)
+    with pytest.raises(SessionError, match="no view of the trained model"):
+        run(words, RunOptions(stage="finetune", from_iter=0, device="cpu"))
 
 
 def test_joint_learning_through_densification_keeps_rows_together(photographs, tmp_path):
