@@ -1,13 +1,13 @@
-"""Thresholds injected into a running host: its functions wrapped, its training followed.
+"""Injects thresholds into a running host: wraps its functions and follows its training.
 
-launch       runs a host's command        command      what its flags mean
-starting     what stage 2 goes on from    process      what its script finds around itself
+launch       runs a host's command        command      reads and adds the host's flags
+starting     finds the start of stage 2   process      sets up the process for the script
 cpu_only     runs a CUDA host without CUDA
-api          one line in a fork instead
-session      one host in one process: each call goes to the handler of its role
+api          activates fragprune inside a fork, by one line
+session      hands each call of one host in one process to the handler of its role
 stepping     steps and optimizers         rasterizing  views, rasterizations, the pressure
-aligning     rows that come and go        saving       sidecars and checkpoints
-state        what all handlers share: the run, its models
+aligning     rows added and removed       saving       sidecars and checkpoints
+state        the run and its models, shared by all handlers
 patching     wraps functions and restores them
-stand_ins    take the place of compiled packages
+stand_ins    replace the host's compiled packages
 """

@@ -1,4 +1,4 @@
-"""Rows of a model come, go and move: its thresholds follow, or it is an error."""
+"""Keeps thresholds aligned with rows that the host adds, removes and moves."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ from fragprune_plugins.injection.state import SessionState
 
 
 def on_parents(session: SessionState, call: SeamCall) -> Any:
-    """Know the parents before the host copies them."""
+    """Note the parents before the host copies them.
+
+    Raises:
+        AlignmentError: a parent got no child.
+    """
     state = session.models.get(call.model)
     if state is None:
         return call.run()
@@ -29,7 +33,11 @@ def on_parents(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_append(session: SessionState, call: SeamCall) -> Any:
-    """New rows take their parents' thresholds, or start neutral."""
+    """Append thresholds for new rows: their parents' thresholds, or neutral ones.
+
+    Raises:
+        AlignmentError: the new rows are not copies of the parents.
+    """
     state = session.models.get(call.model)
     if state is None:
         return call.run()
@@ -37,7 +45,7 @@ def on_append(session: SessionState, call: SeamCall) -> Any:
     count, parents = len(next(iter(tensors.values()))), state.pending_parents
     if parents is not None:
         parents, rest = parents[:count], parents[count:]
-        state.pending_parents = rest if len(rest) else None  # of what is appended next
+        state.pending_parents = rest if len(rest) else None  # parents of the next append
         copies = len(parents) == count and are_copies(session, call.model, tensors, parents)
         what = f"{count} new rows that are not copies of the selected parents"
         expect_children(call, what, copies)
@@ -49,7 +57,7 @@ def on_append(session: SessionState, call: SeamCall) -> Any:
 
 
 def expect_children(call: SeamCall, found: str, right: bool) -> None:
-    """Raise AlignmentError unless new rows are what was expected."""
+    """Raise AlignmentError unless new rows are ``right``, one child per parent and repeat."""
     if not right:
         raise AlignmentError(
             str(call.seam),
@@ -62,13 +70,20 @@ def expect_children(call: SeamCall, found: str, right: bool) -> None:
 def are_copies(
     session: SessionState, model: Any, tensors: Mapping[str, Tensor], parents: Tensor
 ) -> bool:
-    """Whether new rows, by param group, have the bits of their parents that children inherit."""
+    """Whether new rows equal their parents to the bit in the adapter's ``inherited`` groups.
+
+    Args:
+        session: the state of the session.
+        model: the model that owns the parents.
+        tensors: (P, ...) new rows by param group.
+        parents: (P,) rows of the parents.
+    """
     known = {name: group["params"][0] for name, group in session.groups(model)}
     return all(torch.equal(tensors[n], known[n][parents]) for n in session.adapter.inherited)
 
 
 def on_choice(session: SessionState, call: SeamCall) -> Any:
-    """Keep the rows that the host drew as parents."""
+    """Keep the rows that the host sampled as parents."""
     result = call.run()
     state = session.models.get(call.model)
     if state is not None:
@@ -78,7 +93,11 @@ def on_choice(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_copy(session: SessionState, call: SeamCall) -> Any:
-    """Rows overwritten by others take those rows' thresholds; not in stage 2."""
+    """Copy thresholds to rows that the host overwrites with others. In stage 2 nothing runs.
+
+    Raises:
+        AlignmentError: the overwritten rows are not copies of the sampled rows.
+    """
     if session.standing_still(call.model):
         return None
     state = session.models.get(call.model)
@@ -98,7 +117,7 @@ def on_copy(session: SessionState, call: SeamCall) -> Any:
     if len(source) != len(target) or not are_copies(session, call.model, rows, source):
         raise AlignmentError(
             str(call.seam),
-            f"{len(target)} overwritten rows that are not copies of the {len(source)} drawn",
+            f"{len(target)} overwritten rows that are not copies of the {len(source)} sampled",
             "one copy per overwritten row, in the host's order",
             "Report this with the host's commit: its relocation differs.",
         )
@@ -108,7 +127,7 @@ def on_copy(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_forget(session: SessionState, call: SeamCall) -> Any:
-    """Zero the moments of rows whose moments the host zeroed."""
+    """Zero the store's moments of rows whose moments the host zeroed."""
     result = call.run()
     state = session.models.get(call.model)
     if state is not None:
@@ -117,7 +136,7 @@ def on_forget(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_keep(session: SessionState, call: SeamCall) -> Any:
-    """Remove what the host removed."""
+    """Remove the thresholds of rows that the host removed."""
     result = call.run()
     state = session.models.get(call.model)
     if state is not None:
@@ -129,7 +148,11 @@ def on_keep(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_rearrange(session: SessionState, call: SeamCall) -> Any:
-    """Follow rows through an operation that keeps, copies and appends at once."""
+    """Follow rows through one operation that keeps, copies and appends. In stage 2 nothing runs.
+
+    Raises:
+        AlignmentError: rows and thresholds differ in number afterwards.
+    """
     if session.standing_still(call.model):
         return None
     state = session.models.get(call.model)
@@ -140,14 +163,14 @@ def on_rearrange(session: SessionState, call: SeamCall) -> Any:
     if trace.origins is not None and trace.fresh is not None:
         before = len(state.store)
         state.store.rearrange(trace.origins, trace.fresh)
-        state.views.clear()  # their calls may hold tensors of the rows before
+        state.views.clear()  # their calls may hold tensors of the old rows
         session.changed(state.store, "rearrange", before)
     session.expect_rows(call.model, state, str(call.seam))
     return result
 
 
 def on_still(session: SessionState, call: SeamCall) -> Any:
-    """Operations that would move a frozen model do not run in stage 2."""
+    """Skip an operation that would move a frozen model in stage 2."""
     if session.standing_still(call.model):
         return call.how()
     return call.run()

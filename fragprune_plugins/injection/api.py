@@ -1,4 +1,4 @@
-"""One line in a fork: ``import fragprune_plugins; fragprune_plugins.activate()``."""
+"""Activates fragprune in a fork: ``import fragprune_plugins; fragprune_plugins.activate()``."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ def activate(
     settings: Settings | None = None,
     engine: str = "auto",
 ) -> Session:
-    """Inject thresholds into the host of this process; call it above the host's imports.
+    """Inject thresholds into the host of this process. Call it above the host's imports.
 
     Args:
-        adapter: name; None detects it from the source.
-        host: the checkout's folder; None takes that of the running script.
-        stage: "finetune" freezes everything but opacities and thresholds, "joint" trains all,
-            "off" only applies thresholds that sidecars bring.
-        from_iter: iterations of this run to let pass first (0 when it was resumed).
-        settings: of the fine-tuning; ``iterations`` is how long it lasts.
-        engine: "auto", "reference", "cpu", "cuda" or the name of a plugin's.
+        adapter: the adapter's name; None detects it from the host's source.
+        host: the checkout's folder; None for the folder of the running script.
+        stage: "finetune" trains only opacities and thresholds (and ``settings.train``), "joint"
+            trains everything, "off" only applies thresholds of sidecars.
+        from_iter: number of iterations of this run before learning begins (0 if it is resumed).
+        settings: settings of the fine-tuning; ``iterations`` is its length.
+        engine: "auto", "reference", "cpu", "cuda" or the name of a plugin's engine.
 
     Raises:
         UnknownHostError: no adapter fits.
-        LateImportError: the host was imported before.
-        SessionError: a session is active already.
+        LateImportError: the host is already imported.
+        SessionError: a session is already active.
     """
     settings = settings or Settings()
     plugins = installed()
@@ -63,14 +63,18 @@ def activate(
 
 
 def deactivate() -> list[Finding]:
-    """Restore every original of the host; returns what could not be. Harmless when inactive."""
+    """Restore every original of the host; does nothing if no session is active.
+
+    Returns:
+        A finding for each function that could not be restored.
+    """
     active = _session.active_session()
     return active.deactivate() if active else []
 
 
 @contextlib.contextmanager
 def paused() -> Iterator[None]:
-    """Inside, the host draws as if fragprune were not active; rows are still followed."""
+    """Inside, the host draws without thresholds; fragprune still follows rows."""
     active = _session.active_session()
     with active.paused() if active else contextlib.nullcontext():
         yield

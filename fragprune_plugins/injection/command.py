@@ -1,4 +1,4 @@
-"""The host's own command: its script, its arguments, and the few flags that we read or add."""
+"""The host's own command: its script, its arguments, and the flags that fragprune reads or adds."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from fragprune_plugins.hosts.source import HostRepo
 
 @dataclass(frozen=True)
 class HostCommand:
-    """A host's command, taken apart; the host parses all of its flags itself.
+    """The parts of a host's command. The host itself parses all of its flags.
 
     Attributes:
-        script: that runs.
-        arguments: as typed.
-        flags: those that we read, by fields of the command line.
-        line: how the host spells them.
-        module: of the script, where it was ``python -m module``.
+        script: the script to run.
+        arguments: the script's arguments, unchanged.
+        flags: values of the flags that fragprune reads, by field of ``CommandLine``.
+        line: the host's spellings of these flags.
+        module: the module's name in ``python -m module``; "" for a script.
     """
 
     script: Path
@@ -34,45 +34,57 @@ class HostCommand:
     def read(
         cls, script: Path, arguments: list[str], line: CommandLine, module: str = ""
     ) -> HostCommand:
-        """Read our flags.
+        """Build from a script and its arguments; reads the flags of ``line``.
 
         Raises:
-            UsageError: the host would not understand one.
+            UsageError: a flag lacks its value, or the configuration file cannot be read.
         """
         return cls(script, arguments, line.read(arguments), line, module)
 
     def of(self, script: Path, arguments: list[str]) -> HostCommand:
-        """The same host's command with another script of the folder, run as this one is."""
+        """A command for another script of the same folder; it runs as a module if this one does."""
         package = self.module.split(".")[:-1]
         module = ".".join([*package, script.stem]) if self.module else ""
         return self.read(script, arguments, self.line, module)
 
     @property
     def output(self) -> Path | None:
-        """The folder that the host writes, where the command names it."""
+        """The host's output folder, or None if the command does not name it."""
         return Path(self.flags.output) if self.flags.output else None
 
     @property
     def iterations(self) -> int:
-        """The last of the host's training."""
+        """The last iteration of the host's training."""
         return int(self.flags.iterations or self.line.default_iterations)
 
     def checkpoints(self, last: int) -> list[int]:
-        """Iterations to write a checkpoint at: those asked for, and the last."""
+        """Iterations at which to write a checkpoint: those in the command, and ``last``."""
         return sorted({*(self.flags.save_checkpoints or []), last})
 
     def saving(self, scratch: Path, last: int, **extra: Any) -> list[str]:
-        """Arguments with flags appended, and the model saved at the last iteration."""
+        """Arguments with flags appended, so that the host also saves its model at ``last``.
+
+        Args:
+            scratch: folder for a copy of the host's configuration file.
+            last: the last iteration of the run.
+            extra: values by field of ``CommandLine``.
+        """
         if self.line.checkpoints_only:
             extra["save_checkpoints"] = self.checkpoints(last)
         return self.with_flags(scratch, **extra) if extra else self.arguments
 
     def with_flags(self, scratch: Path, **extra: Any) -> list[str]:
-        """Arguments with flags appended; argparse lets the last one win.
+        """Arguments with flags appended; argparse takes the last value of a flag.
+
+        A host's configuration file overrides flags. If the command names one, a changed copy
+        replaces it.
 
         Args:
-            scratch: folder for a copy of the host's configuration file, which wins over flags.
-            extra: values by fields of the command line.
+            scratch: folder for that copy.
+            extra: values by field of ``CommandLine``.
+
+        Raises:
+            UsageError: the configuration file cannot hold a value.
         """
         given = {self.line.spellings(name)[-1]: value for name, value in extra.items()}
         out = list(self.arguments)
@@ -87,7 +99,13 @@ class HostCommand:
 
 
 def split(command: list[str]) -> tuple[Path, list[str], str]:
-    """Script, its arguments, and the module where it is one; a leading interpreter is dropped."""
+    """(script, arguments, module) of a command; a leading interpreter is dropped.
+
+    ``module`` is "" unless the command is ``python -m module``.
+
+    Raises:
+        UsageError: the command names no script, or the script does not exist.
+    """
     words = list(command)
     if words and Path(words[0]).name.startswith("python"):
         words = words[1:]
@@ -109,7 +127,13 @@ def split(command: list[str]) -> tuple[Path, list[str], str]:
 
 
 def _script_of(module: str) -> Path:
-    """The file that ``python -m`` runs, found without importing: here, else an installed one."""
+    """The file that ``python -m module`` runs, found without importing it.
+
+    The current folder goes before installed packages.
+
+    Raises:
+        UsageError: there is no such module.
+    """
     for repo in (HostRepo(Path.cwd()), HostRepo.installed(module.split(".")[0])):
         script = repo.path(module) if repo else None
         if script is not None and script.name == "__init__.py":
@@ -119,20 +143,30 @@ def _script_of(module: str) -> Path:
     raise UsageError(
         f"python -m {module}",
         "no such module",
-        "one in this folder, or of an installed package",
+        "a module in this folder or of an installed package",
         "Go to the host's folder, install the package, or check the name.",
     )
 
 
 def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) -> None:
-    """Write a copy of a configuration file with other values, and see that it says so."""
+    """Write a copy of a configuration file with other values, and check it by reading it.
+
+    Args:
+        config: reads and writes the file's format.
+        path: the file.
+        copy: the file to write.
+        given: values by flag.
+
+    Raises:
+        UsageError: the copy does not hold the values.
+    """
     values = {flag.lstrip("-"): value for flag, value in given.items()}
     copy.write_text(config.overrule(path.read_text(encoding="utf-8"), values), encoding="utf-8")
     said = read_config(config, copy)
     if ignored := sorted(name for name in values if said.get(name) != values[name]):
         raise UsageError(
             f"{config.flag} {path}",
-            f"a layout that {', '.join(ignored)} cannot be added to",
-            "that of the host's own examples",
-            "Write it like these.",
+            f"a layout to which {', '.join(ignored)} cannot be added",
+            "the layout of the host's own examples",
+            "Write the file in that layout.",
         )

@@ -1,7 +1,7 @@
-"""``--device cpu``: lets a host that hard-codes CUDA run on a machine without a GPU.
+"""Runs a host that hard-codes CUDA on a machine without a GPU (``--device cpu``).
 
-Device strings are rewritten by a torch function mode, CUDA calls by plain substitutes, for the
-duration of a block. Small scenes, debugging, CI; nothing of it stays afterwards.
+Inside a block, a torch function mode rewrites CUDA devices, and substitutes replace CUDA calls. It
+serves small scenes, debugging and CI.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _CUDA = re.compile(r"cuda(:\d+)?$")
 
 
 def _redirected(value: Any) -> Any:
-    """Replace "cuda", "cuda:0" and their torch.device by the CPU; the rest stays."""
+    """Replace "cuda", "cuda:N" and CUDA's torch.device by the CPU; return other values as given."""
     if isinstance(value, str) and _CUDA.match(value):
         return "cpu"
     if isinstance(value, torch.device) and value.type == "cuda":
@@ -31,7 +31,7 @@ def _redirected(value: Any) -> Any:
 
 
 class _Redirect(TorchFunctionMode):
-    """Every torch call inside has its CUDA devices replaced; ``.cuda()`` returns its tensor."""
+    """Replaces CUDA devices in every torch call inside; ``.cuda()`` returns its tensor."""
 
     def __torch_function__(
         self,
@@ -43,7 +43,7 @@ class _Redirect(TorchFunctionMode):
         kwargs = kwargs or {}
         if func is torch.Tensor.cuda:
             return args[0]
-        if func is torch.Tensor.get_device:  # hosts hand its number on to .to(), and -1 is none
+        if func is torch.Tensor.get_device:  # hosts pass it to .to(), which refuses -1
             return torch.device("cpu")
         if "device" in kwargs or len(args) > 1:
             args = tuple(_redirected(a) for a in args)
@@ -58,23 +58,23 @@ class _Event:
         self._time = 0.0
 
     def record(self, *_: Any) -> None:
-        """Now."""
+        """Store the current time."""
         self._time = time.perf_counter()
 
     def synchronize(self) -> None:
-        """Nothing to wait for."""
+        """Return at once: CPU work is done when a call returns."""
 
     def query(self) -> bool:
-        """Always over."""
+        """Whether the work before the event is done: always."""
         return True
 
     def elapsed_time(self, end: _Event) -> float:
-        """Milliseconds until another event."""
+        """Milliseconds from this event to another."""
         return (end._time - self._time) * 1e3
 
 
 def _nothing(*_: Any, **__: Any) -> None:
-    """Stands for a CUDA call without a meaning on the CPU."""
+    """Replaces a CUDA call that has no meaning on the CPU."""
 
 
 def _zero(*_: Any, **__: Any) -> int:
@@ -99,8 +99,8 @@ _SUBSTITUTES: dict[str, Any] = {
 
 @contextlib.contextmanager
 def cpu_only() -> Iterator[None]:
-    """Inside, torch calls that name CUDA run on the CPU; checkpoints load to the CPU."""
-    # Optimizers import it later, and it would then take our substitutes for torch's functions.
+    """Inside, torch calls that name CUDA run on the CPU, and checkpoints load to the CPU."""
+    # Optimizers import torch._dynamo, which would take our substitutes for torch's functions.
     importlib.import_module("torch._dynamo")
     load = torch.load
 

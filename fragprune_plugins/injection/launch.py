@@ -1,8 +1,8 @@
-"""Runs a host's command in this process, with a session around it.
+"""Runs a host's command in this process, inside a session.
 
-A training run has two halves. Stage 1 is the host's own training, untouched but for being asked to
-write its checkpoint at the end. Stage 2 is the host's own script again, resumed from that
-checkpoint for more iterations, with thresholds.
+A training run has two stages. Stage 1 is the host's own training; fragprune only adds the flag that
+saves a checkpoint at the end. Stage 2 runs the host's script again. It resumes from that checkpoint
+for more iterations, and thresholds learn.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ Stage = Literal["auto", "finetune", "joint", "off"]
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How to run a host.
+    """Options of a run.
 
     Attributes:
-        adapter: name, or None to detect it from the source.
-        stage: "auto" trains and then fine-tunes; "finetune" resumes what the output folder (or
-            ``--start_checkpoint``) holds; "joint" learns inside the host's training; "off" only
-            applies thresholds that are there.
-        settings: of the fine-tuning.
-        from_iter: with "finetune": learn and freeze from this iteration of a run that was not
-            resumed; with "joint": learn from it.
-        alternate: with "joint", learn for so many iterations, hold for as many, and so on.
-        engine: "auto", "reference", "cpu", "cuda", or the name of a plugin's.
-        device: where the host runs: "cpu" lets a CUDA-only host do without a GPU, "cuda" and
-            "cuda:N" insist on one, "auto" takes a GPU where torch sees one.
+        adapter: the adapter's name, or None to detect it from the host's source.
+        stage: "auto" trains and then fine-tunes. "finetune" resumes from a model in the output
+            folder, or from the file that the host's resume flag names. "joint" learns inside the
+            host's training. "off" only applies thresholds of sidecars and checkpoints.
+        settings: settings of the fine-tuning.
+        from_iter: iteration at which learning begins inside one run. "finetune" also freezes the
+            model from there on.
+        alternate: with "joint", learn for this many iterations, hold for as many, and so on.
+        engine: "auto", "reference", "cpu", "cuda", or the name of a plugin's engine.
+        device: the host's device. "cpu" runs a CUDA-only host without a GPU, "cuda" and "cuda:N"
+            require a GPU, "auto" takes a GPU if torch sees one.
     """
 
     adapter: str | None = None
@@ -71,29 +71,30 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a run did.
+    """The result of a run.
 
     Attributes:
-        adapter: its name.
-        engine: that drew stage 2, "" when there was none.
+        adapter: the adapter's name.
+        engine: name of the engine that drew stage 2; "" if none drew.
         device: "cpu", "cuda" or "cuda:N".
-        stage: what was asked for.
-        iterations: learned in stage 2.
-        gaussians: of the trained model.
-        fragments_before: per pixel over training views, untruncated.
-        fragments_after: per pixel over training views, at each view's last visit.
-        model_before: the host's PLY of stage 1, when there is one.
+        stage: the stage of ``RunOptions``.
+        iterations: number of learned iterations.
+        gaussians: number of Gaussians in the trained model.
+        fragments_before: fragments per pixel over training views, untruncated.
+        fragments_after: fragments per pixel over training views, at each view's last visit.
+        model_before: the host's PLY of stage 1, if there is one.
         model_after: the host's PLY after stage 2; its sidecar lies beside it.
-        output: the host's folder, that of stage 1 where stage 2 has another.
         train_seconds: wall time of both stages.
-        target_reached: whether a target speed-up was met within 5% on training views; None
-            without a target.
-        curves: a dict per learned step: step, loss, fragments_per_pixel, pressure,
+        target_reached: whether training views met a target speed-up within 5%; None without a
+            target.
+        curves: one dict per learned step: step, loss, fragments_per_pixel, pressure,
             threshold_median.
-        settings: of the fine-tuning.
-        photographs: by whose held-out views both models can be measured; None where they cannot.
-        drawing: fields of ``RasterInputs`` by which the host draws its models.
-        not_compared: why they cannot, where something was learned.
+        settings: settings of the fine-tuning.
+        output: the host's output folder; stage 1's, if stage 2 has its own.
+        photographs: the data set whose held-out views can measure both models; None if the models
+            cannot be compared.
+        drawing: fields of ``RasterInputs`` with which the host draws its models.
+        not_compared: the reason why learned models cannot be compared; otherwise None.
     """
 
     adapter: str
@@ -120,18 +121,19 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     """Run a host's command with fragment pruning.
 
     Args:
-        command: as typed, ``["python", "train.py", "-s", "scene", ...]``; a leading python may be
-            left out.
-        options: how.
+        command: words of the command, ``["python", "train.py", "-s", "scene", ...]``; a leading
+            python is optional.
+        options: options of the run; None for the defaults.
 
     Raises:
-        UsageError: the command names no script, or there is no such device.
-        EngineError: no such engine here.
+        UsageError: the command names no script, or the device does not exist.
+        EngineError: the engine does not exist or cannot run here.
         UnknownHostError: no adapter fits the script's folder.
         HostNeedsError: packages that the script imports, or its data, are missing.
-        HostFailed: the host raised, or ended with an error code.
-        Interrupted: Ctrl-C in stage 2, or (Terminated) SIGTERM; what was learned has been saved.
-        DivergedError: NaN or infinity in stage 2, of which nothing has been saved.
+        HostFailed: the host raised an exception or ended with an error code.
+        Interrupted: Ctrl-C in stage 2, or SIGTERM (Terminated). Learned thresholds were saved.
+        DivergedError: NaN or infinity in stage 2. Nothing of it was saved.
+        SessionError: steps were counted as learned, and no view was drawn with thresholds.
     """
     from fragprune_plugins.plugins.hooks import engine_for, select_adapter
 
@@ -176,7 +178,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
 
 
 class _Runner:
-    """One command's stages; holds what the summary needs."""
+    """Runs the stages of one command and keeps the figures for the summary."""
 
     def __init__(
         self,
@@ -191,19 +193,19 @@ class _Runner:
         self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
         self.options, self.device, self.scratch = options, device, scratch
         self.output = host.output
-        self.around: Path | None = None  # of stage 1, where stage 2 has a folder of its own
-        self.trained: Start | None = None  # stage 1's end, once it is over
+        self.around: Path | None = None  # stage 1's folder, if stage 2 has its own
+        self.trained: Start | None = None  # the end of stage 1, after stage 1
         self.before: Path | None = None
         self.after: Path | None = None
         self.learned: Summary | None = None
         self.curves: list[dict[str, float]] = []
 
     def observe(self) -> None:
-        """The command as it is; thresholds of sidecars are applied."""
+        """Run the command unchanged; thresholds of sidecars apply, and nothing learns."""
         self._execute(self.host.arguments, learn=False)
 
     def joint(self) -> None:
-        """Thresholds learn beside everything else."""
+        """Run the command once; thresholds learn while the whole model trains."""
         resumed, start, total = self._learning(self.options.from_iter)
         steps = total - resumed - self.host.line.skipped
         settings = replace(self.options.settings, iterations=steps)
@@ -219,7 +221,7 @@ class _Runner:
         self.after = self._model(total)
 
     def train_then_finetune(self) -> None:
-        """Stage 1 with a checkpoint at its end, then stage 2 from there."""
+        """Run stage 1 with a checkpoint at its end, then stage 2 from that checkpoint."""
         if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
             return self.finetune()
         self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
@@ -235,18 +237,18 @@ class _Runner:
             for iteration, path in starting.files(self.adapter, self.output)
             if iteration == total and earlier.get(path) != path.stat().st_mtime_ns
         ]
-        if not ends:  # hosts refuse with exit code 0 too
+        if not ends:  # some hosts refuse a command with exit code 0
             raise HostFailed(
                 self.host.script.name,
                 f"ended without a checkpoint of iteration {total}",
-                "its own training to come to its end",
+                "a training that runs to its end",
                 "Read the host's own message above.",
             )
         self.trained = Start(total, max(ends)[1], "the end of stage 1")
         self.finetune()
 
     def finetune(self) -> None:
-        """Stage 2: resume, or wait for ``from_iter`` inside one run."""
+        """Run stage 2: resume a model, or begin at ``from_iter`` of one run."""
         settings = self.options.settings
         if self.options.from_iter is not None:
             resumed, begins, total = self._learning(self.options.from_iter)
@@ -271,7 +273,7 @@ class _Runner:
             total = first + settings.iterations + line.skipped
             extra = {"iterations": total, "resume": str(checkpoint)}
             own = "finetuned" if line.restarts else ""
-            own = own if settings.truncate else "control"  # what was learned stays where it is
+            own = own if settings.truncate else "control"  # keeps a learned result in its place
             if own and self.output is not None:
                 self.around, self.output = self.output, self.output / own
             if self.output is not None and str(self.output) != self.host.flags.output:
@@ -288,7 +290,7 @@ class _Runner:
         settings: Settings | None = None,
         **options: Any,
     ) -> None:
-        """The host's script with these arguments, in a session with these options."""
+        """Run the host's script with these arguments, in a session with these options."""
         from fragprune_plugins.injection.session import Session
 
         session = Session(
@@ -317,7 +319,7 @@ class _Runner:
                     stack.enter_context(sigterm_interrupts())
                 try:
                     process.run_main(host.script, host.module)
-                except KeyboardInterrupt as error:  # here, where saving still writes the sidecar
+                except KeyboardInterrupt as error:  # the session still writes sidecars
                     saved = session.save_interrupted() if learn else None
                     raise self._interrupted(error, saved) from error
             session.expect_drawn()
@@ -329,21 +331,25 @@ class _Runner:
                 self.curves = session.curves
 
     def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
-        """What to say of Ctrl-C or SIGTERM, and of what was saved then."""
+        """The error that reports Ctrl-C or SIGTERM and names the saved model, if there is one."""
         by_signal = isinstance(error, Terminate)
         stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
-        again = "Start it again."
+        again = "Run the command again."
         if saved:
-            found += f"; thresholds so far are beside {saved}"
+            found += f"; the thresholds learned so far are beside {saved}"
             again = (
-                "Go on from there with fragprune run --stage finetune and "
-                f"{self.host.line.spellings('resume')[-1]} {saved} in the host's command; without, "
-                "stage 2 begins anew."
+                "To continue from there, run fragprune run --stage finetune with "
+                f"{self.host.line.spellings('resume')[-1]} {saved} in the host's command. Without "
+                "that flag, stage 2 starts again."
             )
-        return stated(self.host.script.name, found, "the run to end", again)
+        return stated(self.host.script.name, found, "a run that reaches its end", again)
 
     def summary(self, seconds: float) -> RunSummary:
-        """Everything the command line prints."""
+        """The summary, after all stages have ended.
+
+        Args:
+            seconds: wall time of all stages.
+        """
         learned = self.learned
         photographs, drawing, not_compared = self._comparison()
         return RunSummary(
@@ -368,15 +374,15 @@ class _Runner:
         )
 
     def _comparison(self) -> tuple[Photographs | None, dict[str, Any], NotComparedError | None]:
-        """By which views and how before and after are drawn, or why they cannot be."""
+        """(photographs, drawing, None) to compare both models, or (None, {}, the reason)."""
         if not self.learned:
             return None, {}, None
         try:
             if not (self.before and self.after):
                 raise NotComparedError(
                     f"--stage {self.options.stage}",
-                    f"no model of {'before' if self.after else 'after'} the learning",
-                    "one that the host saved",
+                    f"no model from {'before' if self.after else 'after'} the learning",
+                    "a model that the host saved",
                     "Name two models to fragprune compare.",
                 )
             drawing = self.adapter.drawing(self.repo, self.host.arguments)
@@ -385,10 +391,12 @@ class _Runner:
             return None, {}, error
 
     def _learning(self, from_iter: int | None) -> tuple[int, int, int]:
-        """Iterations of the host: the one this run goes on after, where learning begins, the last.
+        """(resumed, start, last): three iterations of the host.
+
+        The run resumes after iteration ``resumed``, learns after ``start`` and ends with ``last``.
 
         Args:
-            from_iter: as asked for; half of the training where it is not.
+            from_iter: the option; None for half of the training.
 
         Raises:
             UsageError: nothing would be learned.
@@ -402,11 +410,11 @@ class _Runner:
         raise UsageError(
             f"--stage {self.options.stage}",
             f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
-            f"some after {start}, where learning begins",
+            f"iterations after {start}, where learning begins",
             f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
         )
 
     def _model(self, iteration: int) -> Path | None:
-        """The host's PLY of an iteration, if it saved one."""
+        """The host's PLY of an iteration, or None if the host saved none."""
         path = self.adapter.model_file(self.output, iteration) if self.output else None
         return path if path and path.exists() else None

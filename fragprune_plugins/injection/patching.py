@@ -1,8 +1,8 @@
-"""The patch ledger: seams wrapped when their module is imported, undone faithfully.
+"""The patch ledger wraps seams when their modules are imported, and restores them.
 
-wrapt does the wrapping and the way back; the ledger adds what hosts need: the signature is checked
-before anything runs, a host that was imported too early is refused by name, and whatever cannot be
-taken back is reported and turned inert.
+wrapt wraps and unwraps. The ledger adds checks for hosts: it checks a signature before the function
+runs, refuses a host that was imported too early, and reports wrappers that cannot be removed. Such
+a wrapper stays, and only calls the original.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Wrapper = Callable[[Callable[..., Any], Any, tuple[Any, ...], dict[str, Any]], A
 
 
 class PatchLedger:
-    """What we wrapped, in order, and how to take it back.
+    """Keeps the wrapped seams in order and restores them.
 
     Args:
-        root: the host's folder; its modules must come from there. None: from anywhere.
+        root: the host's folder, from which its modules must come; None for any folder.
     """
 
     def __init__(self, root: Path | None = None) -> None:
@@ -36,15 +36,15 @@ class PatchLedger:
         self._wrapped: list[tuple[ModuleType, Seam, Any]] = []
 
     def wrap(self, seam: Seam, wrapper: Wrapper) -> None:
-        """Wrap a seam now if its module is imported, else the moment it is.
+        """Wrap a seam now if its module is imported, else as soon as the module is imported.
 
         Args:
-            seam: where.
-            wrapper: ``wrapper(wrapped, instance, args, kwargs)``, wrapt's convention.
+            seam: the function to wrap.
+            wrapper: ``wrapper(wrapped, instance, args, kwargs)``, as wrapt calls it.
 
         Raises:
-            LateImportError: the module is imported and others hold the function by name.
-            SeamError: the function is missing or lacks a parameter. When the module is imported
+            LateImportError: the module is imported, and other modules hold the function by name.
+            SeamError: the function is missing or lacks a parameter. If the module is imported
                 later, the host's ``import`` raises it.
         """
 
@@ -72,7 +72,11 @@ class PatchLedger:
             wrapt.register_post_import_hook(apply, seam.module)
 
     def undo(self) -> list[Finding]:
-        """Restore every original, newest first; findings name what could not be taken back."""
+        """Restore every original, newest first.
+
+        Returns:
+            A finding for each wrapper that could not be removed.
+        """
         self._live = False
         findings = []
         while self._wrapped:
@@ -88,8 +92,8 @@ class PatchLedger:
                         "not-undone",
                         str(seam),
                         str(error),
-                        "our wrapper outermost",
-                        "fragprune stays in the chain, inactive.",
+                        "fragprune's wrapper outermost",
+                        "The wrapper stays, and only calls the original.",
                     )
                 )
         return findings
@@ -100,12 +104,12 @@ class PatchLedger:
 
     def _check(self, module: ModuleType, seam: Seam) -> None:
         if not seam.external and not self._is_hosts(module):
-            # Hosts have plain names, and some append themselves to the path.
+            # Hosts' modules have common names, and some hosts append their folder to the path.
             raise SeamError(
                 str(seam),
                 f"a module of the same name from {module.__file__}",
-                f"the host's, in {self._root}",
-                "Uninstall the other, or take it from PYTHONPATH.",
+                f"the host's module, in {self._root}",
+                "Uninstall the other module, or remove it from PYTHONPATH.",
             )
         try:
             original = wrapt.resolve_path(module, seam.attribute)[2]
@@ -113,7 +117,7 @@ class PatchLedger:
             raise SeamError(
                 str(seam),
                 "no such function",
-                "one to wrap",
+                "a function to wrap",
                 "Run fragprune check on the host to see which adapter fits.",
             ) from error
         have = tuple(inspect.signature(original).parameters)
@@ -126,13 +130,17 @@ class PatchLedger:
             )
 
     def _refuse_late(self, module: ModuleType, seam: Seam) -> None:
-        """A copy bound by ``from module import name`` would stay unpatched: refuse, name it.
+        """Refuse if a module holds a copy by ``from module import name``, which stays unpatched.
 
-        Of a function that is not the host's, only the host's copies matter.
+        For a function outside the host (``seam.external``), only copies in the host's modules
+        count.
+
+        Raises:
+            LateImportError: names these modules.
         """
         head = seam.attribute.split(".")[0]
         if head != seam.attribute:
-            return  # a method is patched on its class, which every holder shares
+            return  # a method is patched on its class, which all modules share
         original = getattr(module, head, None)
         holders = [
             name
@@ -152,7 +160,7 @@ class PatchLedger:
 
 
 def _rebind(name: str, ours: Any, module: ModuleType) -> None:
-    """Copies that others made by ``from module import name`` become what the module has again."""
+    """Replace other modules' copies of the wrapper ``ours`` by the module's restored function."""
     for other in list(sys.modules.values()):
         if getattr(other, "__dict__", {}).get(name) is ours:
             setattr(other, name, getattr(module, name))

@@ -1,4 +1,4 @@
-"""This process as a host's script expects to find it, and as it was before once the script ends."""
+"""Sets up this process for a host's script, and restores it when the script ends."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _OURS = Path(__file__).parents[1]
 
 @contextlib.contextmanager
 def telling(script: Path, root: Path) -> Iterator[None]:
-    """What a host raises is told in a line; the whole traceback goes to stderr, for who needs it.
+    """Turn an exception of the host into a ``HostFailed``; stderr gets the whole traceback.
 
     Args:
-        script: that runs.
-        root: of the host.
+        script: the script that runs.
+        root: the host's folder.
     """
     try:
         yield
@@ -45,11 +45,11 @@ def telling(script: Path, root: Path) -> Iterator[None]:
         if isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
             remedy = f"Run: {preflight.install([preflight.Missing(lacking, where)])}"
         elif Path(frames[-1].filename).is_relative_to(_OURS):
-            remedy = "It came up in fragprune: report it with the traceback above."
+            remedy = "fragprune raised it. Report it with the traceback above."
         raise HostFailed(
             where,
             f"{type(error).__name__}{f': {message}' if message else ''}",
-            f"{script.name} to come to its end",
+            f"{script.name} to run to its end",
             remedy,
         ) from error
 
@@ -58,7 +58,14 @@ def telling(script: Path, root: Path) -> Iterator[None]:
 def host_process(
     script: Path, arguments: list[str], device: str, folder: Path | None = None
 ) -> Iterator[None]:
-    """What a fresh interpreter would give the script, put back afterwards."""
+    """Inside, argv, the path and devices are those of a fresh interpreter with this command.
+
+    Args:
+        script: the script's file.
+        arguments: the script's arguments.
+        device: "cpu", "cuda" or "cuda:N".
+        folder: the first folder of the module search path; None for the script's folder.
+    """
     from fragprune_plugins.injection.cpu_only import cpu_only
 
     saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
@@ -103,12 +110,12 @@ def run_main(script: Path, module: str = "") -> None:
 
 
 def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) -> None:
-    """Drop the host's own modules, so that its script runs again as if for the first time.
+    """Drop the host's own modules, so that its script can run again from the start.
 
     Args:
-        root: of a checkout, which may hold an environment with packages that are not its own.
-        known: names of modules that were there before the host ran.
-        packages: that are the host, where it is installed; their compiled modules stay.
+        root: the checkout's folder. Packages of an environment inside it are kept.
+        known: names of modules that were imported before the host ran.
+        packages: import names of an installed host; its compiled modules are kept.
     """
     for name in sys.modules.keys() - known:
         file = getattr(sys.modules[name], "__file__", None) or ""
@@ -118,11 +125,19 @@ def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) 
             own = file != "" and Path(file).is_relative_to(root) and "site-packages" not in file
         if own:
             del sys.modules[name]
-    gc.collect()  # closes what module globals held, the viewer's socket among them
+    gc.collect()  # closes objects of module globals, such as the viewer's socket
 
 
 def host_device(wanted: str, engine: str) -> str:
-    """Where the host runs: it was written for a GPU, so "auto" gives it any that there is."""
+    """The host's device, "cpu", "cuda" or "cuda:N"; "auto" takes a GPU if torch sees one.
+
+    Args:
+        wanted: the ``--device`` option.
+        engine: the ``--engine`` option.
+
+    Raises:
+        UsageError: the device does not exist.
+    """
     import torch
 
     from fragprune_plugins.engines import device_for
@@ -134,7 +149,7 @@ def host_device(wanted: str, engine: str) -> str:
 
 @contextlib.contextmanager
 def current_gpu(device: str) -> Iterator[None]:
-    """Where a GPU is named by its number, inside it is "cuda", whichever a host would choose."""
+    """Inside, "cuda" means the GPU of ``device`` ("cuda:N"), and a host cannot choose another."""
     import torch
 
     if not device.startswith("cuda:"):
@@ -146,7 +161,7 @@ def current_gpu(device: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def host_checkpoints() -> Iterator[None]:
-    """Let torch's safe loader read the hosts' checkpoints: they hold NumPy scalars, no more."""
+    """Inside, torch's safe loader reads hosts' checkpoints, which hold NumPy scalars."""
     import numpy as np
     import torch
 
@@ -158,7 +173,10 @@ def host_checkpoints() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _host_pictures() -> Iterator[None]:
-    """Let Pillow take signed bytes, as hosts that read Blender scenes give it; it used to."""
+    """Inside, Pillow accepts int8 arrays, as earlier versions did.
+
+    Hosts that read Blender scenes pass them.
+    """
     import numpy as np
     from PIL import Image
 

@@ -1,4 +1,4 @@
-"""Drawing with thresholds where the host draws, and the fragment pressure in its loss."""
+"""Draws the host's views with thresholds and adds the fragment pressure to its loss."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ log = logging.getLogger("fragprune")
 
 
 class _AddToLoss(torch.autograd.Function):
-    """Passes the image on; in the backward pass the term counts as if added to the loss."""
+    """Returns the image; the backward pass treats ``term`` as a summand of the loss."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, term: Tensor) -> Tensor:
@@ -43,8 +43,8 @@ class _AddToLoss(torch.autograd.Function):
 
 
 def on_view(session: SessionState, call: SeamCall) -> Any:
-    """Remember which model is drawn for which camera while the host's function runs."""
-    own = len(call.seam.needs) > 1  # a function's; a method's is what it was called on
+    """Remember the model and the camera while the host draws a view."""
+    own = len(call.seam.needs) > 1  # a function takes the model; a method belongs to it
     model = call.arguments[call.seam.needs[1]] if own else session.model_of(call)
     if model is None:
         if session.learn and torch.is_grad_enabled():
@@ -57,7 +57,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     if begins and state is not None and not state.begun:
         begin_step(session, model, state)
     again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
-    measured = session.settings.target_speedup is not None  # keeps the model alive: only if needed
+    measured = session.settings.target_speedup is not None  # a kept view keeps its model alive
     learns = state is not None and state.stage is not None and state.stage.plan is not None
     if measured and state is not None and learns and torch.is_grad_enabled():
         state.views[view] = again
@@ -65,16 +65,16 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
 
 
 def warn_unknown(session: SessionState, seam: Seam) -> None:
-    """Say once that a view is drawn without thresholds."""
+    """Warn once that a view of an unknown model is drawn without thresholds."""
     if not session.warned:
         session.warned = True
-        log.warning("%s draws Gaussians that no seam attached: without thresholds", seam)
+        log.warning("%s draws Gaussians that no seam attached; they have no thresholds", seam)
 
 
 def draw_view(
     session: SessionState, render: Any, model: Any, view: int, args: Any, kwargs: Any
 ) -> Any:
-    """The host's function, with its model and view known to the rasterizer's seam."""
+    """Call the host's function; inside, ``session.rendering`` holds its model and view."""
     token = session.rendering.set((model, view))
     try:
         with asking_for_no_gradient(frozen_parameters(session, model)) as cut:
@@ -84,7 +84,11 @@ def draw_view(
 
 
 def on_rasterize(session: SessionState, call: SeamCall) -> Any:
-    """Draw with thresholds, or leave it to the host while there are none."""
+    """Draw with thresholds. Without thresholds the host's rasterizer draws.
+
+    Raises:
+        AlignmentError: the call's Gaussians and the thresholds differ in number.
+    """
     rendering = session.rendering.get()
     state = session.models.get(rendering[0]) if rendering else None
     drawn = HostCall.of(call)
@@ -99,7 +103,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
         raise AlignmentError(
             f"{session.adapter.name}: rasterizer call",
             f"{len(means)} Gaussians",
-            f"{expected} of {len(state.store)}, one per threshold that is drawn",
+            f"{expected} of {len(state.store)}, one per drawn threshold",
             "Report this with the host's commit.",
         )
     if state.store.neutral:
@@ -117,13 +121,13 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
 
 
 def draw(session: SessionState, call: HostCall) -> Any:
-    """The host's picture without thresholds, from our engine."""
+    """Draw a call without thresholds, by our engine."""
     inputs, engine = unpack(session, call)
     return session.dialect.answer(call, inputs, lambda each, _=0: engine.rasterize(each, None))
 
 
 def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Engine]:
-    """The host's call as core values, and the engine that draws them."""
+    """Translate the host's call into ``RasterInputs``, and choose the engine for its device."""
     engine = session.engine(call[session.dialect.means].device)
     return session.dialect.unpack(replace(call, engine=engine)), engine
 
@@ -136,7 +140,7 @@ def rasterize(
     inputs: RasterInputs,
     part: int = 0,
 ) -> RasterOutputs:
-    """With thresholds; learning, with the fragment pressure in the loss."""
+    """Draw with thresholds (N,); while learning, add the fragment pressure to the loss."""
     outputs = engine.rasterize(inputs, thresholds)
     if state.stage is None:
         return outputs
@@ -147,7 +151,7 @@ def rasterize(
 
 
 def on_loss(session: SessionState, call: SeamCall) -> Any:
-    """Keep the host's own loss for the curves."""
+    """Keep the host's own loss, a scalar, for the curves."""
     state = session.last_state
     if state is not None and call.instance.numel() == 1:
         state.begun = False
@@ -157,12 +161,12 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_metric(session: SessionState, call: SeamCall) -> Any:
-    """A metric whose weights cannot be had is NaN, not the end of the run."""
+    """Return NaN for a metric whose weights cannot be loaded, so that the run goes on."""
     if call.seam not in session.absent:
         try:
             return call.run()
-        except OSError as error:  # the download failed; a run of hours should not end on it
-            log.warning("%s: its weights cannot be had (%s); NaN stands for it", call.seam, error)
+        except OSError as error:  # the download failed
+            log.warning("%s: cannot load its weights (%s); returning NaN", call.seam, error)
             session.absent.add(call.seam)
     return torch.tensor(math.nan)
 

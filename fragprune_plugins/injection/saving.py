@@ -1,4 +1,4 @@
-"""Thresholds go where the host's files go: beside its models, inside its checkpoints."""
+"""Saves thresholds with the host's files: beside its models and inside its checkpoints."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger("fragprune")
 
 
 def on_save(session: SessionState, call: SeamCall) -> Any:
-    """Thresholds beside the file that the host wrote; nothing is written that is not finite."""
+    """Write the sidecar of the file that the host wrote. Values that are not finite stop both."""
     check_learned(session, call.model)
     result = call.run()
     if call.model in session.models and call.first is not None:
@@ -33,25 +33,25 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
 
 
 def check_learned(session: SessionState, model: Any) -> None:
-    """Raise DivergedError where a model that learns is not finite: its host is about to save."""
+    """Raise DivergedError, before a save, if a learning model has NaN or infinity."""
     state = session.models.get(model)
     if state is not None and state.stage is not None and state.stage.plan is not None:
         state.stage.check()
 
 
 def on_load(session: SessionState, call: SeamCall) -> Any:
-    """Thresholds from beside the file that the host read."""
+    """Load the sidecar of the file that the host read, if it has one."""
     result = call.run()
     path = Path(call.how(call.first))
     if sidecar.lies_beside(path):
         session.load(call.model, path)
     else:
-        session.models.pop(call.model, None)  # another population: what we knew is not about it
+        session.models.pop(call.model, None)  # the model now has other Gaussians
     return result
 
 
 def on_pack(session: SessionState, call: SeamCall) -> Any:
-    """Thresholds beside a file that holds the Gaussians in an order of its own."""
+    """Write the sidecar of a packed file, with rows in the file's order."""
     result = call.run()
     packed = call.how()
     model = session.last() if session.last else None
@@ -68,7 +68,7 @@ def on_pack(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_unpack(session: SessionState, call: SeamCall) -> Any:
-    """Keep the thresholds of an unpacked file for the model that will be made of it."""
+    """Keep the thresholds of an unpacked file until its model exists."""
     result = call.run()
     packed = call.how()
     if packed is not None and sidecar.path_beside(packed[0]).exists():
@@ -78,13 +78,23 @@ def on_unpack(session: SessionState, call: SeamCall) -> Any:
 
 
 def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdStore) -> None:
-    """Thresholds of an unpacked file go to the model made of it, which is drawn next."""
+    """Give thresholds of an unpacked file to the model that the host draws next.
+
+    Args:
+        session: the state of the session.
+        model: the model that the host draws.
+        expected: (N, 3) means of the unpacked file.
+        store: the file's thresholds.
+
+    Raises:
+        AlignmentError: the model has other means.
+    """
     means = session.adapter.means(model)
     if not torch.equal(means.detach().cpu(), expected):
         raise AlignmentError(
             f"{session.adapter.name}: unpacked model",
-            f"{len(means)} Gaussians that are not the unpacked file's",
-            f"its {len(expected)}, in its order",
+            f"{len(means)} Gaussians that differ from the unpacked file's",
+            f"the file's {len(expected)} Gaussians in its order",
             "Report this with the host's commit: it draws another model after unpacking.",
         )
     placed = ThresholdStore(0, means.device)
@@ -96,7 +106,10 @@ def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdS
 
 
 def on_capture(session: SessionState, call: SeamCall) -> Any:
-    """Thresholds inside the host's checkpoint; in stage 2 always, so that it is known for one."""
+    """Put thresholds into the host's checkpoint.
+
+    Neutral thresholds go in too in stage 2: they mark the checkpoint as one of stage 2.
+    """
     model = call.model
     check_learned(session, model)
     result = call.run()
@@ -108,7 +121,7 @@ def on_capture(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_restore(session: SessionState, call: SeamCall) -> Any:
-    """Thresholds out of the host's checkpoint."""
+    """Take thresholds out of the host's checkpoint, and let the host restore the rest."""
     model, capture = call.model, call.how(call.first)
     saved = session.adapter.checkpoint_state(capture).pop(CHECKPOINT_KEY, None)
     result = call.run(**{call.seam.needs[0]: capture})
@@ -124,10 +137,10 @@ def on_restore(session: SessionState, call: SeamCall) -> Any:
 
 
 def revive(session: SessionState, model: Any) -> None:
-    """Let a restored model train as the host sets it up, where its checkpoint would not.
+    """Restore learning rates and gradients that a checkpoint lacks, as the host set them up.
 
-    What version 0.1 froze it left frozen, in its checkpoints too, and at the rates of stage 2. A
-    checkpoint that was made of a PLY has no rates.
+    Version 0.1 wrote checkpoints with frozen parameters and the rates of stage 2. A checkpoint made
+    from a PLY has no rates.
     """
     groups = [(name, group) for name, group in session.groups(model) if name]
     names, adapter = {name for name, _ in groups}, session.adapter
@@ -142,15 +155,19 @@ def revive(session: SessionState, model: Any) -> None:
             parameter.requires_grad_(True)
     if frozen:
         log.warning(
-            "%s: the checkpoint is of a stage 2 of fragprune 0.1, which left %s unable to train; "
-            "they can again",
+            "%s: fragprune 0.1 wrote the checkpoint in stage 2 and left %s unable to train; "
+            "they train again",
             adapter.name,
             ", ".join(sorted(asleep)),
         )
 
 
 def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
-    """(M,) for each mean (M, 3) the first row among (N, 3) with the same bits."""
+    """(M,) int64: for each mean (M, 3), the first row of ``among`` (N, 3) with the same bits.
+
+    Raises:
+        AlignmentError: a mean has no such row.
+    """
     known, wanted = among.detach().cpu().numpy(), means.numpy()
     both = np.concatenate([known, wanted])
     _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)
@@ -158,7 +175,7 @@ def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
     if (rows >= len(known)).any():
         raise AlignmentError(
             where,
-            f"{int((rows >= len(known)).sum())} of {len(wanted)} positions that no Gaussian has",
+            f"{int((rows >= len(known)).sum())} of {len(wanted)} positions without a Gaussian",
             f"positions of the {len(known)} Gaussians",
             "Report this with the host's commit: it packs another model.",
         )

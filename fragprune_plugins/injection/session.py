@@ -27,12 +27,15 @@ _active: Session | None = None
 
 
 def active_session() -> Session | None:
-    """The session of this process, if any."""
+    """The active session of this process, or None."""
     return _active
 
 
 class Session(SessionState):
-    """Thresholds injected into one host in this process; a context manager."""
+    """Injects thresholds into one host in this process; a context manager that (de)activates.
+
+    ``SessionState`` documents the arguments.
+    """
 
     _ledger: PatchLedger | None = None
 
@@ -41,12 +44,14 @@ class Session(SessionState):
         return StandIns(self.dialect, partial(rasterizing.draw, self), self.drop_in)
 
     def activate(self) -> Session:
-        """Wrap every seam; before the host is imported.
+        """Wrap every seam. Call it before the host's imports.
+
+        If it raises, nothing stays patched.
 
         Raises:
             SessionError: another session is active.
-            LateImportError, SeamError: the host is imported already, or is not what it should be.
-                Nothing stays patched.
+            LateImportError: the host is already imported.
+            SeamError: a function to wrap is missing or lacks a parameter.
         """
         global _active
         if _active is not None:
@@ -64,7 +69,11 @@ class Session(SessionState):
         return self
 
     def deactivate(self) -> list[Finding]:
-        """Restore every original; returns what could not be restored. Harmless when inactive."""
+        """Restore every original; does nothing if the session is inactive.
+
+        Returns:
+            A finding for each function that could not be restored.
+        """
         global _active
         if _active is self:
             _active = None
@@ -88,7 +97,7 @@ class Session(SessionState):
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """Inside, the host draws as if we were not here; rows are still followed."""
+        """Inside, the host draws without thresholds; the session still follows rows."""
         token = self.pausing.set(True)
         try:
             yield
@@ -96,12 +105,12 @@ class Session(SessionState):
             self.pausing.reset(token)
 
     def store(self, model: Any) -> ThresholdStore | None:
-        """The thresholds of a model object, if it has some."""
+        """The thresholds of a model object, or None."""
         state = self.models.get(model)
         return state.store if state else None
 
     def finish(self) -> Summary:
-        """What was gained; observers are told."""
+        """End learning, tell observers, and return the summary."""
         state = self.last_state
         stage = state.stage if state else None
         if stage is not None and stage.taken == stage.steps:
@@ -121,18 +130,26 @@ class Session(SessionState):
         return summary
 
     def expect_drawn(self) -> None:
-        """Raise where steps were counted as learned and no view was drawn with thresholds."""
+        """Check that a run that counted learned steps drew a view with thresholds.
+
+        Raises:
+            SessionError: it drew none.
+        """
         stage = self.last_state.stage if self.last_state else None
         if stage and stage.steps and self.settings.truncate and not stage.viewed:
             raise SessionError(
                 self.adapter.name,
                 f"{stage.steps} steps, and no view of the trained model drawn with its thresholds",
-                "one or more in every step",
-                "Report this with the host's commit: it draws in a way that the adapter misses.",
+                "one view or more in every step",
+                "Report this with the host's commit: the adapter misses how it draws.",
             )
 
     def save_interrupted(self) -> Path | None:
-        """After Ctrl-C: have the host save its model, with what was learned beside it."""
+        """After Ctrl-C, let the host save its model, and write the sidecar beside it.
+
+        Returns:
+            The saved file, or None if there is nothing to save.
+        """
         model = self.last() if self.last else None
         if model is None or self.output is None or not isinstance(self.adapter, ScriptAdapter):
             return None
@@ -142,17 +159,17 @@ class Session(SessionState):
         return self.adapter.save_model(model, self.output, self.start + state.steps)
 
     def install_stand_ins(self) -> None:
-        """Put ours in place of the host's compiled packages, and wrap nothing.
+        """Replace the host's compiled packages by stand-ins, and wrap nothing.
 
-        ``activate`` does it too; ``deactivate`` takes them back after either.
+        ``activate`` does this too. ``deactivate`` removes the stand-ins.
 
         Raises:
-            LateImportError: the host has imported one of its own.
+            LateImportError: the host has already imported one of these packages.
         """
         self._stand_ins.place()
 
     def _enter(self, seam: Seam, function: Any, instance: Any, args: Any, kwargs: Any) -> Any:
-        """Hand a call to the handler of its role: as it is, or with the model it is about."""
+        """Hand a call to the handler of its role; ``_OF_MODELS`` handlers also get its model."""
         call = SeamCall(seam, function, instance, args, kwargs)
         if seam.role in _OF_CALLS:
             return _OF_CALLS[seam.role](self, call)

@@ -1,4 +1,4 @@
-"""Our stand-ins for a host's compiled packages, placed where its imports find them."""
+"""Places stand-ins for a host's compiled packages in ``sys.modules``."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ log = logging.getLogger("fragprune")
 
 
 class StandIns:
-    """A host's compiled packages as its dialect makes them.
+    """The stand-ins that a dialect makes for its host's compiled packages.
 
     Args:
-        dialect: the host's.
-        draw: answers their calls.
-        drop_in: place them: True, False, or None for those that cannot be imported.
+        dialect: makes the stand-ins.
+        draw: answers the host's rasterizer calls.
+        drop_in: whether to place stand-ins; None places those whose packages cannot be imported.
     """
 
     def __init__(
         self, dialect: Dialect, draw: Callable[[HostCall], Any], drop_in: bool | None
     ) -> None:
         self._dialect, self._draw, self._drop_in = dialect, draw, drop_in
-        self._made: dict[str, ModuleType] = {}  # once: a host keeps what it imported
+        self._made: dict[str, ModuleType] = {}  # made once, because a host keeps its imports
         self._placed: dict[str, ModuleType] = {}
 
     def place(self) -> None:
-        """Put them into ``sys.modules``.
+        """Put the stand-ins into ``sys.modules``.
 
         Raises:
-            LateImportError: the host has imported one of its own.
+            LateImportError: the host has already imported one of these packages.
         """
         self._made = self._made or self._dialect.modules(self._draw)
         for name, module in self._made.items():
@@ -61,20 +61,20 @@ class StandIns:
                 sys.modules[name] = self._placed[name] = module
 
     def take_back(self) -> None:
-        """Take them out of ``sys.modules``."""
+        """Remove the stand-ins from ``sys.modules``."""
         for name, module in self._placed.items():
             if sys.modules.get(name) is module:
                 del sys.modules[name]
         self._placed.clear()
 
     def refuse_leftovers(self, root: Path) -> None:
-        """A host imported under an earlier session holds its classes, and draws with them.
+        """Refuse a host that was imported in an earlier session and draws with its classes.
 
         Args:
-            root: of the host.
+            root: the host's folder.
 
         Raises:
-            LateImportError: one of its modules does.
+            LateImportError: a module of the host holds a class of an earlier session's stand-in.
         """
         inside = f"{root}{os.sep}"
         hosts = [
@@ -91,6 +91,6 @@ class StandIns:
                         raise LateImportError(
                             f"{name}.{member}",
                             f"bound in {module.__name__} since an earlier session",
-                            "a host that is imported under this one",
-                            "Activate that session again, or start a fresh process.",
+                            "a host that is imported in this session",
+                            "Activate the earlier session again, or start a new process.",
                         )

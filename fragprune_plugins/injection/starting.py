@@ -1,4 +1,4 @@
-"""Where stage 2 starts: the checkpoint or PLY that it goes on from."""
+"""Finds the checkpoint or PLY from which stage 2 starts."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ log = logging.getLogger("fragprune")
 
 
 class Start(NamedTuple):
-    """A starting point.
+    """The file from which stage 2 starts.
 
     Attributes:
-        iteration: of the host, that the file was written at.
-        path: the file.
-        why: this one.
+        iteration: the host's iteration that wrote the file.
+        path: the file, a checkpoint or a PLY.
+        why: the reason for this file, for a log line.
     """
 
     iteration: int
@@ -33,10 +33,10 @@ class Start(NamedTuple):
 
 
 def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Start:
-    """What the command names; else the newest file of its folder that training alone wrote.
+    """The file that the command names, else the newest file of stage 1 in its output folder.
 
     Raises:
-        UsageError: there is none.
+        UsageError: there is no such file.
         ModelFileError: a checkpoint cannot be read.
     """
     if host.flags.resume:
@@ -52,48 +52,48 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
     if not saved and newer:
         raise UsageError(
             "--stage finetune",
-            f"nothing in {where} but what was learned here, or a control",
-            "what training alone wrote",
-            f"To go on from one of these files, name it with {flag}.",
+            f"only results of stage 2 or of a control in {where}",
+            "a file that the host's own training wrote",
+            f"To continue from one of these files, name it with {flag}.",
         )
     if not saved:
         raise UsageError(
             "--stage finetune",
-            f"nothing to start from in {where}",
+            f"no model in {where}",
             f"{flag} FILE, or {host.line.output[-1]} DIR of a finished training",
-            "Name one of them in the host's command.",
+            "Add one of these flags to the host's command.",
         )
     iteration, path = saved[-1]
     later = [(at, file) for at, file in saved if at > iteration and not _learned(adapter, file)]
     if later:
         log.warning(
-            "%s is of a later iteration, but older than what stage 2 starts from; "
-            "if you meant it, name it with %s",
+            "%s is of a later iteration, but it is older than the file from which stage 2 starts; "
+            "to start from it, name it with %s",
             max(reversed(later), key=lambda each: each[0])[1],
             flag,
         )
-    passed = f"; {newer} newer of stage 2 passed over" if newer else ""
-    return Start(iteration, path, f"what training alone wrote last{passed}")
+    passed = f"; newer files of stage 2 ignored: {newer}" if newer else ""
+    return Start(iteration, path, f"the last file that the host's own training wrote{passed}")
 
 
 def files(adapter: ScriptAdapter, output: Path | None) -> list[tuple[int, Path]]:
-    """Iterations that a folder holds, and their files, the newest last."""
+    """(iteration, file) of every model in an output folder, the newest last."""
     return adapter.saved_iterations(output) if output else []
 
 
 def resumed_at(line: CommandLine, checkpoint: Path) -> int:
-    """The iteration that a run from a checkpoint goes on after.
+    """The iteration after which a run from this checkpoint continues.
 
     Raises:
-        UsageError: there is none.
-        ModelFileError: it cannot be read.
+        UsageError: the checkpoint does not exist.
+        ModelFileError: the checkpoint cannot be read.
     """
     return 0 if line.restarts else _read_checkpoint(checkpoint)[1]
 
 
 @contextlib.contextmanager
 def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterator[Path]:
-    """A file that the host itself can resume; a checkpoint made of a PLY is removed afterwards."""
+    """Yields a file that the host can resume; a checkpoint made from a PLY exists only inside."""
     if start.path.suffix != ".ply" or line.restarts:
         yield start.path
         return
@@ -106,10 +106,10 @@ def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterat
 
 
 def _learned(adapter: ScriptAdapter, path: Path) -> bool:
-    """Whether a file was written while thresholds learned, or by a control: not by stage 1."""
+    """Whether stage 2 or a control wrote the file, and not stage 1."""
     from fragprune_plugins.storage import sidecar
 
-    record = records.beside(path)  # version 0.1 marked its controls by nothing else
+    record = records.beside(path)  # the only mark of a control of version 0.1
     if record is not None and record.command == "run":
         return True
     if path.suffix == ".ply":
@@ -118,7 +118,11 @@ def _learned(adapter: ScriptAdapter, path: Path) -> bool:
 
 
 def _iteration_of_ply(ply: Path) -> int:
-    """By its folder, as hosts save: ``iteration_N/point_cloud.ply``."""
+    """The iteration in the name of a PLY's folder, ``iteration_N/point_cloud.ply``.
+
+    Raises:
+        UsageError: the file is missing, or its folder has another name.
+    """
     number = ply.parent.name.removeprefix("iteration_")
     if ply.is_file() and number.isdigit():
         return int(number)
@@ -131,11 +135,11 @@ def _iteration_of_ply(ply: Path) -> int:
 
 
 def _read_checkpoint(path: Path) -> tuple[Any, int]:
-    """What a checkpoint holds, its tensors still on disk: hosts save (capture, iteration).
+    """Read (capture, iteration) of a checkpoint; tensors are mapped from the file.
 
     Raises:
-        UsageError: there is none.
-        ModelFileError: it cannot be read.
+        UsageError: the checkpoint does not exist.
+        ModelFileError: the checkpoint cannot be read.
     """
     import torch
 
@@ -150,5 +154,5 @@ def _read_checkpoint(path: Path) -> tuple[Any, int]:
             str(path),
             f"not readable as a checkpoint ({str(error).splitlines()[0]})",
             "(capture, iteration), as hosts save it",
-            "It was cut off, or is no checkpoint: remove it, or name another.",
+            "The file is cut off, or is no checkpoint. Remove it, or name another file.",
         ) from error

@@ -1,7 +1,8 @@
-"""What a session knows, of its run and of each model; every handler is given it.
+"""The state of a session: its run and its models. Every handler gets it.
 
-Host first: in every role but RASTERIZE the host's function runs unchanged and we follow. Count
-steps ourselves: hosts pass offset iterations. One store per model object.
+In every role but RASTERIZE, the host's function runs unchanged, and the handler follows it. The
+state counts steps itself, because hosts pass iterations with an offset. Each model object has one
+store.
 """
 
 from __future__ import annotations
@@ -38,49 +39,58 @@ log = logging.getLogger("fragprune")
 
 @dataclass
 class ModelState:
-    """A model's thresholds and everything that is known of its training.
+    """A model's thresholds and the state of its training.
 
     Attributes:
-        store: its thresholds.
-        stage: that learns them; None where those of a sidecar are only applied.
-        steps: of the host, from the first that was seen.
+        store: the thresholds.
+        stage: learns the thresholds; None if thresholds of a sidecar only apply.
+        steps: number of the host's steps since the session saw the model.
+        begun: a step has begun, and its loss has not gone backward.
+        pending_parents: (P,) int64 rows of the parents that the host is about to copy.
+        prepared: the adapter has prepared the model for stage 2.
+        views: by view, a function that draws the view again, from its last visit.
+        loaded: the means with which a sidecar's thresholds were loaded.
+        hooked: the optimizers that carry our hooks.
+        hooks: handles that remove these hooks.
+        stepped: value of ``steps`` at the last step of the store.
+        lent: per running optimizer step, (param group, the host's rate) to restore.
     """
 
     store: ThresholdStore
     stage: Stage2 | None = None
     steps: int = 0
-    begun: bool = False  # a step whose loss has not gone backward yet
+    begun: bool = False
     pending_parents: Tensor | None = None
     prepared: bool = False
-    views: dict[int, Callable[[], Any]] = field(default_factory=dict)  # view -> its last render
-    loaded: weakref.ReferenceType[Any] | None = None  # the means a sidecar's thresholds came with
+    views: dict[int, Callable[[], Any]] = field(default_factory=dict)
+    loaded: weakref.ReferenceType[Any] | None = None
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
-    lent: list[list[tuple[dict[str, Any], float]]] = field(default_factory=list)  # the host's rates
+    lent: list[list[tuple[dict[str, Any], float]]] = field(default_factory=list)
 
     __repr__ = one_line
 
 
 class SessionState:
-    """How one host is followed in this process, and the models that it trains.
+    """The state of one host in this process, and of the models that the host trains.
 
     Args:
         adapter: describes the host.
-        repo: its checkout.
+        repo: the host's checkout or package.
         plugins: loaded plugins.
-        settings: of the fine-tuning.
-        learn: False only observes and applies thresholds that sidecars bring (``--stage off``,
-            render scripts, the host's own stage 1).
-        schedule: replaces the one the plugins create.
-        from_step: steps of the host to let pass before learning and freezing begin.
-        freeze: in learning, everything but what ``settings.train`` names stands still.
-        start: the host's iteration that this run goes on after.
-        engine: name, see ``hooks.engine_for``.
-        drop_in: put our stand-ins in place of the host's compiled packages: True, False, or None
-            for those that cannot be imported.
-        output: the host's output folder, when known.
-        origin: stage 1's, where stage 2 has another.
+        settings: settings of the fine-tuning.
+        learn: whether thresholds learn. False only applies thresholds of sidecars and checkpoints
+            (``--stage off``, render scripts, the host's own stage 1).
+        schedule: replaces the schedule that the plugins create.
+        from_step: number of the host's steps before learning and freezing begin.
+        freeze: while learning, only the parameters that ``settings.train`` names train.
+        start: the host's iteration from which this run resumes; 0 for a fresh run.
+        engine: the engine's name; see ``hooks.engine_for``.
+        drop_in: whether stand-ins replace the host's compiled packages; None replaces those that
+            cannot be imported.
+        output: the host's output folder, if it is known.
+        origin: stage 1's output folder, if stage 2 has its own.
     """
 
     def __init__(
@@ -111,8 +121,8 @@ class SessionState:
         self.engines: dict[torch.device, Engine] = {}
         self.drop_in = drop_in
         self.dialect = adapter.dialect(repo)
-        self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # not yet a model's
-        self.absent: set[Seam] = set()  # metrics without their weights
+        self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # waits for its model
+        self.absent: set[Seam] = set()  # metrics whose weights cannot be loaded
         self.models: weakref.WeakKeyDictionary[Any, ModelState] = weakref.WeakKeyDictionary()
         self.optimizers: weakref.WeakKeyDictionary[Any, list[weakref.ReferenceType[Any]]] = (
             weakref.WeakKeyDictionary()
@@ -120,25 +130,29 @@ class SessionState:
         self.rates: weakref.WeakKeyDictionary[Any, dict[str, float]] = weakref.WeakKeyDictionary()
         self.warned = False
         self.last: weakref.ReferenceType[Any] | None = None
-        self.last_state: ModelState | None = None  # outlives the host's model
+        self.last_state: ModelState | None = None  # stays when the host drops its model
         self.rendering: ContextVar[tuple[Any, int] | None] = ContextVar("rendering", default=None)
         self.pausing: ContextVar[bool] = ContextVar("paused", default=False)
 
     def engine(self, device: torch.device) -> Engine:
-        """The engine for tensors on a device, created at its first use there."""
+        """The engine for tensors on a device, created at the first call.
+
+        Raises:
+            EngineError: the engine does not exist or cannot draw there.
+        """
         if device not in self.engines:
             engine = engine_for(self.engine_name, device, self.plugins)
             if engine.name == "reference":
                 log.warning(
-                    "drawing on %s with the reference engine: exact, and slow; "
-                    "fragprune doctor says why no faster one is used",
+                    "the reference engine draws on %s: it is exact, and slow; "
+                    "fragprune doctor says why no faster engine is used",
                     device,
                 )
             self.engines[device] = engine
         return self.engines[device]
 
     def model_of(self, call: SeamCall) -> Any:
-        """The model a call is about, by its means where the adapter knows no more; or None."""
+        """The model that a call concerns, or None; means from the adapter identify a model too."""
         found = self.adapter.model_of(call)
         if not isinstance(found, Tensor):
             return found
@@ -146,53 +160,66 @@ class SessionState:
         return next((m for m, means in known if means.data_ptr() == found.data_ptr()), None)
 
     def standing_still(self, model: Any) -> bool:
-        """Whether the model is frozen now: stage 2 has begun."""
+        """Whether the model is frozen, because stage 2 has begun."""
         state = self.models.get(model)
         begun = self.from_step == 0 or (state is not None and state.steps > self.from_step)
         return self.learn and self.freeze and begun
 
     def groups(self, model: Any) -> list[tuple[str | None, dict[str, Any]]]:
-        """Param groups of every optimizer, the main one's first, with the adapter's names."""
+        """(name, param group) of all optimizers, the main optimizer's first; adapters name them."""
         known = (each() for each in self.optimizers.get(model, ()))
         optimizers = [optimizer for optimizer in known if optimizer is not None]
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
         return [(self.adapter.group_name(model, group), group) for group in groups]
 
     def follow(self, model: Any, state: ModelState) -> None:
-        """This model is the one that reports and summaries are about."""
+        """Make this the model of reports and summaries."""
         self.last, self.last_state = weakref.ref(model), state
 
     def truncate(self, inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
-        """The thresholds that plugins apply to one rasterization."""
+        """(N,) thresholds for one rasterization, as plugins answer; None for no truncation."""
         return thresholds_for(inputs, store, self.plugins)
 
     def changed(self, store: ThresholdStore, operation: str, before: int) -> None:
-        """Tell observers that rows changed."""
+        """Tell observers that rows changed.
+
+        Args:
+            store: the store after the change.
+            operation: name of the change.
+            before: number of rows before it.
+        """
         change = PopulationChange(operation, before, len(store))
         self.plugins.tell(hookspecs.fragprune_population_changed, store=store, change=change)
 
     def save(self, model: Any, path: Path) -> None:
-        """Write a model's thresholds beside the file ``path`` that holds it.
+        """Write a model's thresholds beside the model's file ``path``.
 
-        Neutral ones only in stage 2, whose files are told by their sidecars: a control's has one.
+        Neutral thresholds are written in stage 2 only. A sidecar identifies files of stage 2, also
+        those of a control.
 
         Raises:
-            SessionError: the model is not one of this session's.
-            AlignmentError: it has other rows than thresholds.
-            DivergedError: they are not finite.
+            SessionError: the session does not know the model.
+            AlignmentError: the model and its thresholds differ in their number of rows.
+            DivergedError: thresholds are not finite.
         """
         state = self.models.get(model)
         if state is None:
-            raise SessionError("save()", "a model without thresholds", "one attached", "Train it.")
+            raise SessionError(
+                "save()", "a model without thresholds", "a trained model", "Train the model first."
+            )
         self.expect_rows(model, state, str(path))
         if state.store.neutral and not self.standing_still(model):
-            # A sidecar of an earlier model under this name would now be refused as stale.
+            # Loading would refuse the sidecar of an earlier model with this name as stale.
             sidecar.path_beside(path).unlink(missing_ok=True)
         else:
             self.write_sidecar(path, state.store)
 
     def write_sidecar(self, path: Path, store: ThresholdStore) -> None:
-        """A store beside a file, and observers told."""
+        """Write a store's sidecar beside a file and tell observers.
+
+        Raises:
+            DivergedError: thresholds are not finite.
+        """
         written = sidecar.save(
             path,
             store,
@@ -203,10 +230,10 @@ class SessionState:
         self.plugins.tell(hookspecs.fragprune_saved, path=written)
 
     def load(self, model: Any, path: Path) -> None:
-        """Take a model's thresholds from beside the file ``path`` that it was just loaded from.
+        """Load a model's thresholds from the sidecar of ``path``, the file that the host just read.
 
         Raises:
-            SidecarError: there are none, or they belong to another file.
+            SidecarError: the sidecar is missing or belongs to another file.
         """
         means = self.adapter.means(model)
         store, _ = sidecar.load(path, self.adapter.rows(model), means.device)
@@ -222,5 +249,5 @@ class SessionState:
                 where,
                 f"{rows} Gaussians",
                 f"{len(state.store)}, one per threshold",
-                "Report this with the host's commit: its rows changed without the store seeing it.",
+                "Report this with the host's commit: its rows changed at no seam.",
             )

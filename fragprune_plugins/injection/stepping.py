@@ -1,4 +1,4 @@
-"""Learning at a host's own pace: steps counted, optimizers watched, thresholds along."""
+"""Counts the host's steps, watches its optimizers, and lets thresholds step with them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fragprune_plugins.plugins import hookspecs
 
 
 def on_scene(session: SessionState, call: SeamCall) -> Any:
-    """Note where the host writes."""
+    """Note the host's output folder."""
     result = call.run()
     if getattr(call.instance, "model_path", None):
         session.output = Path(call.instance.model_path)
@@ -30,10 +30,13 @@ def on_scene(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_attach(session: SessionState, call: SeamCall) -> Any:
-    """A new optimizer: thresholds for a model that has none, else the same rows or new ones."""
+    """After the host makes an optimizer, give the model thresholds and follow the optimizer.
+
+    A model that already has thresholds keeps them if its rows are the same, else gets neutral ones.
+    """
     model = call.model
     state = session.models.get(model)
-    kept = state is not None and is_followed(session, model, state)  # before a new optimizer
+    kept = state is not None and is_followed(session, model, state)  # needs the old optimizer
     result = call.run()
     session.optimizers[model] = [weakref.ref(optimizer) for optimizer in call.how()]
     groups = session.groups(model)
@@ -59,7 +62,7 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
 
 
 def stage2(session: SessionState, model: Any, state: ModelState) -> Stage2:
-    """Learning for a model's thresholds, as the plugins have it."""
+    """Create the ``Stage2`` that learns a model's thresholds with the session's plugins."""
     reference = weakref.ref(model)
 
     def parameters() -> dict[str, Tensor]:
@@ -81,13 +84,13 @@ def stage2(session: SessionState, model: Any, state: ModelState) -> Stage2:
 
 
 def report(session: SessionState, stats: StepStats) -> None:
-    """Tell observers of a step that is over."""
+    """Keep a finished step for the curves, and tell observers."""
     session.curves.append(asdict(stats))
     session.plugins.tell(hookspecs.fragprune_step, stats=stats)
 
 
 def is_followed(session: SessionState, model: Any, state: ModelState) -> bool:
-    """Whether the means are the very tensor that was loaded, or trained until now."""
+    """Whether the model's means are the tensor that was loaded, or that the optimizers train."""
     means = session.adapter.means(model)
     known = [state.loaded() if state.loaded else None]
     known += [each for _, group in session.groups(model) for each in group["params"]]
@@ -95,7 +98,7 @@ def is_followed(session: SessionState, model: Any, state: ModelState) -> bool:
 
 
 def hook_optimizers(session: SessionState, model: Any, state: ModelState) -> None:
-    """See every step of a model's optimizers, before and after."""
+    """Call ``before_step`` and ``after_step`` around every step of a model's optimizers."""
     reference = weakref.ref(model)
     for optimizer in (each() for each in session.optimizers[model]):
         if optimizer is None or optimizer in state.hooked:
@@ -108,9 +111,10 @@ def hook_optimizers(session: SessionState, model: Any, state: ModelState) -> Non
 
 
 def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) -> None:
-    """Stage 2: parameters that do not train get no gradient, so no optimizer touches them.
+    """In stage 2, remove gradients of frozen parameters, so that no optimizer changes them.
 
-    Those that do are lent the rates of stage 2 for the step: the host pickles rates, too.
+    Other parameters get the rates of stage 2 for this step only, because the host saves rates in
+    its checkpoints.
     """
     model = reference()
     state = session.models.get(model) if model is not None else None
@@ -127,13 +131,16 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
         if trained is not None and name not in trained:
             for parameter in group["params"]:
                 parameter.grad = None
-        elif stage is not None and name in rates and name != "xyz":  # the host sets that one
+        elif stage is not None and name in rates and name != "xyz":  # the host sets this rate
             lent.append((group, group["lr"]))
             group["lr"] = stage.rate(name, rates[name])
 
 
 def after_step(session: SessionState, reference: Any, *_: Any) -> None:
-    """The store steps once per counted step, however many optimizers the host steps."""
+    """Restore the host's rates, and let the store step once per counted step.
+
+    A host may step several optimizers in one counted step.
+    """
     model = reference()
     state = session.models.get(model) if model is not None else None
     if state is None:
@@ -148,7 +155,7 @@ def after_step(session: SessionState, reference: Any, *_: Any) -> None:
 
 
 def on_step(session: SessionState, call: SeamCall) -> Any:
-    """The host's clock ticks: plan the step and let nothing move that shall not."""
+    """Begin a step when the host sets its learning rate; in stage 2 the adapter may replace it."""
     result = call.run()
     state = session.models.get(call.model)
     if state is None or not session.learn:
@@ -159,9 +166,9 @@ def on_step(session: SessionState, call: SeamCall) -> Any:
 
 
 def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
-    """Count a step of the host, and let stage 2 begin its own."""
+    """Count a step of the host, and begin a step of stage 2."""
     if state.stage is not None:
-        state.stage.close()  # before the count: whoever watches may end the run here
+        state.stage.close()  # before the count, because an observer may end the run here
     state.begun = True
     state.steps += 1
     if session.standing_still(model):
@@ -174,7 +181,7 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
 
 
 def frozen_parameters(session: SessionState, model: Any) -> list[Tensor]:
-    """Parameters of a model that do not train now."""
+    """Parameters of a model that are frozen in this step; none outside stage 2."""
     trained = session.adapter.trained_groups(session.settings.train)
     if trained is None or not session.standing_still(model):
         return []
@@ -185,11 +192,11 @@ def frozen_parameters(session: SessionState, model: Any) -> list[Tensor]:
 
 @contextlib.contextmanager
 def asking_for_no_gradient(parameters: list[Tensor]) -> Iterator[Callable[[Any], Any]]:
-    """Inside, an engine skips the share of these parameters; outside, they are as the host has it.
+    """Inside, these parameters require no gradient, so an engine does not compute theirs.
 
     Yields:
-        What to pass arguments through that the host worked out before: a tensor that depends on
-        nothing else is cut off from them.
+        A function for arguments that the host computed before. It detaches a tensor that depends
+        on these parameters alone, and returns any other value as given.
     """
     changed = [parameter for parameter in parameters if parameter.requires_grad]
     known = {id(parameter) for parameter in parameters}
@@ -207,7 +214,7 @@ def asking_for_no_gradient(parameters: list[Tensor]) -> Iterator[Callable[[Any],
 
 
 def depends_only_on(known: set[int], value: Any) -> bool:
-    """Whether a value is a tensor worked out with gradients from leaves of these ids alone."""
+    """Whether a value is a tensor whose graph has only leaves with these ids."""
     if not known or not isinstance(value, Tensor) or value.grad_fn is None:
         return False
     waiting: list[Any] = [value.grad_fn]
@@ -226,7 +233,7 @@ def depends_only_on(known: set[int], value: Any) -> bool:
 
 
 def fill_gradients_read(session: SessionState, model: Any) -> None:
-    """Zeros where the host reads a gradient of what stands still: drawing leaves none."""
+    """Set zero gradients on frozen parameters whose gradient the host reads."""
     trained = session.adapter.trained_groups(session.settings.train)
     for name, group in session.groups(model):
         if trained is not None and name not in trained and name in session.adapter.gradients_read:

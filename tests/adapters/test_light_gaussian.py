@@ -397,6 +397,6 @@ def test_flags_of_distillation_are_left_out_of_what_resumes_it():
 
 def test_nothing_to_start_from_is_said(mini, photographs, tmp_path):
     words = command(mini, "prune_finetune.py", photographs, tmp_path, 5)
-    with pytest.raises(UsageError, match="nothing to start from"):
+    with pytest.raises(UsageError, match="no model in"):
         run(words, RunOptions(device="cpu", stage="finetune"))
     assert "train_densify_prune" not in sys.modules

@@ -294,5 +294,5 @@ def test_an_unpacked_file_and_another_model_are_not_paired(mini, compressed):
     _, _, file = compressed
     with joint(**of(mini)) as host:
         np.load(file)["arr_0"]
-        with pytest.raises(AlignmentError, match="not the unpacked file's"):
+        with pytest.raises(AlignmentError, match="differ from the unpacked file's"):
             host.render(host.camera(), host.model(9, setup=False))

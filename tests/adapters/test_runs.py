@@ -177,7 +177,7 @@ def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(
     error = json.loads(result.stdout)["error"]
     (saved,) = trained.glob("point_cloud/*/*.safetensors")
     assert error["code"] == "terminated"
-    assert f"SIGTERM; thresholds so far are beside {saved.parent}" in error["found"]
+    assert f"SIGTERM; the thresholds learned so far are beside {saved.parent}" in error["found"]
     assert sidecar.load(saved.with_name("point_cloud.ply"))[0].steps == 4
     assert signal.getsignal(signal.SIGTERM) is before
 
@@ -293,9 +293,9 @@ def test_a_resumed_run_learns_from_an_iteration_of_the_host(
 @pytest.mark.parametrize(
     ("iterations", "from_iter", "resumed", "words"),
     [
-        (20, 20, False, "iterations 1 to 20; expected some after 20.*or lower --from-iter"),
-        (20, 25, True, "iterations 13 to 20; expected some after 25.*or lower --from-iter"),
-        (12, 0, True, r"no iterations; expected some after 12.*Raise --iterations\.$"),
+        (20, 20, False, "iterations 1 to 20; expected iterations after 20.*or lower --from-iter"),
+        (20, 25, True, "iterations 13 to 20; expected iterations after 25.*or lower --from-iter"),
+        (12, 0, True, r"no iterations; expected iterations after 12.*Raise --iterations\.$"),
     ],
     ids=["never", "never, resumed", "resumed at its end"],
 )

@@ -1,4 +1,4 @@
-"""``--stage finetune`` starts from what training alone wrote last, and says which file that is."""
+"""``--stage finetune`` starts from the last file of the host's own training, and names it."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def started(photographs, caplog):
 def test_what_is_taken_is_said_in_one_line(once, out, started):
     line = started(out, 10)
     assert line == (
-        f"stage 2: 6 iterations from iteration 10, {out / 'chkpnt10.pth'}: what training alone "
-        "wrote last; 1 newer of stage 2 passed over"
+        f"stage 2: 6 iterations from iteration 10, {out / 'chkpnt10.pth'}: the last file "
+        "that the host's own training wrote; newer files of stage 2 ignored: 1"
     )
 
 
@@ -85,7 +85,7 @@ def test_after_a_control_stage_two_starts_where_the_control_did(out, started):
 def test_what_a_control_wrote_is_no_starting_point_in_its_own_folder(photographs, out, started):
     started(out, 10, "--checkpoint_iterations", 13, options=CONTROL)
     assert (out / "control" / "chkpnt13.pth").exists()
-    with pytest.raises(UsageError, match="but what was learned here, or a control"):
+    with pytest.raises(UsageError, match="only results of stage 2 or of a control"):
         run(command(photographs, out / "control", 10), FINETUNE)
 
 
@@ -157,7 +157,7 @@ def test_a_ply_whose_folder_tells_no_iteration_is_a_usage_error(photographs, out
 def test_a_folder_with_nothing_of_stage_one_says_how_to_go_on(photographs, out):
     (out / "chkpnt10.pth").unlink()
     shutil.rmtree(out / ply(10).parent)
-    with pytest.raises(UsageError, match="but what was learned here") as caught:
+    with pytest.raises(UsageError, match="only results of stage 2") as caught:
         run(command(photographs, out, 10), FINETUNE)
     assert "--start_checkpoint" in caught.value.remedy
 

@@ -221,7 +221,7 @@ def test_ctrl_c_before_anything_was_learned_is_stated(host):
     with pytest.raises(Interrupted) as caught:
         run([host("raise KeyboardInterrupt")], CPU)
     assert caught.value.found == "Ctrl-C"
-    assert caught.value.remedy == "Start it again."
+    assert caught.value.remedy == "Run the command again."
 
 
 @pytest.mark.parametrize("arguments", [[], ["-m", "empty"]])
@@ -229,7 +229,7 @@ def test_nothing_to_start_from_says_what_to_name(host, tmp_path, monkeypatch, ar
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError) as caught:
         run([host("raise SystemExit(9)"), *arguments], RunOptions(stage="finetune", device="cpu"))
-    assert "nothing to start from" in caught.value.found
+    assert "no model in" in caught.value.found
     assert "--start_checkpoint" in caught.value.expected
 
 
