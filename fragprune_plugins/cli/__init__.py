@@ -1,4 +1,4 @@
-"""The command line: one module a command, imported when asked for; none imports torch early."""
+"""The command line: one module for each command, imported on use. None imports torch early."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _COMMANDS = {
     "bench": "bench",
     "doctor": "doctor",
 }
-"""Command name to module in this package, which defines ``command``; in the order of --help."""
+"""Modules of this package by command name, in the order of --help; each defines ``command``."""
 
 
 class _LazyGroup(click.Group):
@@ -56,7 +56,7 @@ def _present(name: str) -> bool:
 def cli() -> None:
     """Learned fragment pruning for Gaussian splatting: the same picture from fewer fragments.
 
-    Every Gaussian learns how far it reaches; fragments beyond are neither sorted nor blended.
+    Every Gaussian learns how far it reaches; fragments beyond that are neither sorted nor blended.
 
     \b
     I have a training repository   fragprune run -- python train.py -s scene -m out
@@ -70,7 +70,7 @@ def cli() -> None:
 
 def main() -> None:
     """Entry point of the ``fragprune`` script."""
-    # OpenMP's threads spin while they wait, by default: on a machine that is busy otherwise, torch
-    # on two threads was seen fifty times slower than with waiting threads asleep.
+    # By default, OpenMP's threads spin while they wait. On a busy machine, torch on two threads was
+    # fifty times slower with spinning threads than with sleeping ones.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     cli(prog_name="fragprune")

@@ -1,4 +1,4 @@
-"""``fragprune adapters``: which hosts this installation knows."""
+"""``fragprune adapters``: lists the installed adapters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @click.command("adapters", cls=Command)
 @click.option("--table", is_flag=True, help="Print the support table, in Markdown.")
 def command(table: bool) -> Report:
-    """List the installed adapters and every plugin that was blocked or failed.
+    """List the installed adapters, and every plugin that was blocked or failed.
 
     \b
     Examples:
@@ -56,7 +56,7 @@ def command(table: bool) -> Report:
 
 
 def support(adapters: Sequence[HostAdapter]) -> str:
-    """What is supported, as a page of Markdown, made from the adapters alone."""
+    """The support page in Markdown, made from the adapters alone."""
     from fragprune_plugins.engines import ENGINES
 
     head = ["host", "adapter", "states", "scripts that train"]
@@ -78,9 +78,9 @@ def support(adapters: Sequence[HostAdapter]) -> str:
 
 
 def _scripts(adapter: HostAdapter) -> tuple[str, ...]:
-    """Paths in the checkout, or modules of the package; none for a library.
+    """Training scripts: paths in the checkout or modules of the package; () for a library.
 
-    They do not depend on the revision.
+    They are the same for all revisions.
     """
     from fragprune_plugins.hosts.adapter import ScriptAdapter
     from fragprune_plugins.hosts.source import HostRepo
@@ -94,14 +94,14 @@ _SUPPORT = Template("""# What is supported
 
 <!-- Made by `fragprune adapters --table`; a test compares it with the adapters. -->
 
-Scripts that do not train (render, evaluate) run under `fragprune run` as well, with the thresholds
-that lie beside their models. Every adapter draws with every engine: $engines. `fragprune check DIR`
-says which adapter fits a checkout, and where it does not. Ours pass the
+Scripts that do not train (render, evaluate) also run under `fragprune run`, with the thresholds
+beside their models. Every adapter draws with every engine: $engines. `fragprune check DIR` says
+which adapter fits a checkout, and why others do not. Our adapters pass the
 [conformance kit](conformance.md): $installed on the installed packages, the others on miniatures of
 their hosts.
 
 $table
 
-## What will not work, or is refused
+## What does not work or is refused
 
 $limits""")

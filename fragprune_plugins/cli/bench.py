@@ -1,4 +1,4 @@
-"""``fragprune bench``: how fast the engines are here, and what truncation gives."""
+"""``fragprune bench``: times an engine on this machine, with and without truncation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fragprune_plugins.cli.common import FILE, Command, Report, engine_options, 
 from fragprune_plugins.errors import UsageError
 
 TRUNCATION = 16 / 255
-"""The threshold every Gaussian gets in the truncated rows: 0.63 of the fragments, as learned."""
+"""Threshold of all Gaussians in truncated rows; leaves 0.63 of the fragments, as learning does."""
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -38,14 +38,20 @@ def _size(text: str) -> tuple[int, int]:
     type=click.IntRange(min=1),
     default=(100_000,),
     show_default=True,
-    help="How many the generated scene has; may be given several times.",
+    help="Number of Gaussians in the generated scene; may be given several times.",
 )
-@click.option("--model", type=FILE, help="Time this .ply instead, with its own thresholds.")
-@click.option("--cameras", type=FILE, help="With --model: its first view is drawn.")
-@click.option("--repeats", type=click.IntRange(min=2), default=9, show_default=True)
-@click.option("--forward-only", is_flag=True, help="Leave gradients out.")
+@click.option("--model", type=FILE, help="Time this .ply with its own thresholds instead.")
+@click.option("--cameras", type=FILE, help="With --model: file of cameras; the first one draws.")
 @click.option(
-    "--peers", is_flag=True, help="Also time other rasterizers found installed, at SH degree 0."
+    "--repeats",
+    type=click.IntRange(min=2),
+    default=9,
+    show_default=True,
+    help="Number of timed frames for each row.",
+)
+@click.option("--forward-only", is_flag=True, help="Time the forward pass only.")
+@click.option(
+    "--peers", is_flag=True, help="Also time other installed rasterizers, at SH degree 0."
 )
 @engine_options
 def command(
@@ -60,10 +66,10 @@ def command(
     device: str,
     threads: int | None,
 ) -> Report:
-    """Time rasterization, forward and with every gradient, with and without truncation.
+    """Time rasterization, forward and with all gradients, with and without truncation.
 
     The generated scene is the same on every machine. All rows are timed in turns, so that a busy
-    machine slows them alike; close other programs all the same, and read the load printed below.
+    machine slows them alike. Close other programs anyway, and read the load below the table.
 
     \b
     Examples:
@@ -72,7 +78,9 @@ def command(
       fragprune bench --model point_cloud.ply --cameras cameras.json --size 1280x720
     """
     if (model is None) != (cameras is None):
-        raise UsageError("options", "one of --model and --cameras", "both or none", "Add it.")
+        raise UsageError(
+            "options", "one of --model and --cameras", "both or none", "Add the other."
+        )
 
     import torch
 
@@ -128,7 +136,7 @@ def _scenes(
     sizes: tuple[str, ...],
     device: Any,
 ) -> list[tuple[str, Any, Any, Any]]:
-    """(name, activated splats, view, thresholds' store or None), one a count and size."""
+    """(name, activated splats, view, store or None) for each count of Gaussians and image size."""
     from dataclasses import replace
 
     from fragprune_plugins.bench.scene import make_scene, make_view
@@ -158,7 +166,7 @@ def _scenes(
 def _peers(
     scenes: list[tuple[str, Any, Any, Any]], rasterizer: Any, repeats: int, say: Any
 ) -> list[dict[str, Any]]:
-    """Every scene at SH degree 0: our own row, then one a peer; see ``peers.time_peer``."""
+    """For each scene at SH degree 0, our own row and a row for each peer (``peers.time_peer``)."""
     from dataclasses import replace
 
     from fragprune_plugins.bench.peers import installed, time_peer
@@ -205,7 +213,7 @@ def _table(data: dict[str, Any]) -> str:
     if (prices := data["scaling"]) is not None:
         lines.append(
             f"a fragment costs {prices['least']:.2f} to {prices['most']:.2f} ns: "
-            f"{prices['ratio']:.1f}x from the cheapest scene and size to the dearest"
+            f"{prices['ratio']:.1f}x between the cheapest and the dearest scene and size"
         )
     if others:
         lines.append("forward, SH degree 0, 8 bits from peers:")

@@ -1,4 +1,4 @@
-"""``fragprune check``: which adapter fits a codebase, from its source alone."""
+"""``fragprune check``: tells from its source which adapter fits a host."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ if TYPE_CHECKING:
 
 @click.command("check", cls=Command)
 @click.argument("host", type=FILE)
-@click.option("--adapter", help="Check this adapter only, in full.")
-@click.option("--verbose", is_flag=True, help="Say where every seam is, and what is wrong.")
+@click.option("--adapter", help="Check only this adapter, and show every seam.")
+@click.option("--verbose", is_flag=True, help="Show where every seam is and what is wrong.")
 def command(host: Path, adapter: str | None, verbose: bool) -> Report:
-    """Read HOST, a training repository, and say which adapter fits and what speaks against it.
+    """Read HOST, a training repository, and say which adapter fits it.
 
-    Nothing is imported or run; no GPU is needed. Packages that the host imports and that are not
-    installed are listed. --verbose says of every seam in which file and line it was found, changed,
-    or expected, and what will not work. Exit code 0 when exactly one adapter fits.
+    Nothing is imported or run, and no GPU is needed. The output lists packages that the host
+    imports and that are not installed. --verbose shows for every seam the file and line where it
+    was found, changed or expected, and lists what does not work. The exit code is 0 if exactly one
+    adapter fits.
 
     \b
     Examples:
@@ -43,7 +44,7 @@ def command(host: Path, adapter: str | None, verbose: bool) -> Report:
         raise UnknownHostError(
             str(host),
             "neither a folder nor an installed package",
-            "a host's checkout, or the import name of a host that is installed",
+            "a host's checkout, or the import name of an installed host",
             "Name the folder of train.py.",
         )
     adapters = load_plugins().adapters
@@ -79,7 +80,7 @@ def command(host: Path, adapter: str | None, verbose: bool) -> Report:
 
 
 def _in_short(tried: list[Tried], fitting: list[Tried]) -> list[str]:
-    """A line for each adapter that fits, or where none does, that finds something of its host."""
+    """A line for each adapter that fits. If none fits, for each that finds a seam of its host."""
     shown = fitting or [each for each in tried if each.held]
     if not shown:
         return [f"None of {len(tried)} adapters finds anything of its host."]
@@ -94,7 +95,7 @@ def _in_short(tried: list[Tried], fitting: list[Tried]) -> list[str]:
 
 
 def _aside(tried: Tried, fitting: list[Tried]) -> str:
-    """Why an adapter is not among those that fit best."""
+    """The reason why an adapter is not among the best fits."""
     nearer = ", ".join(each.adapter.name for each in fitting)
     return str(tried.errors[0]) if tried.errors else f"{nearer} descends from it"
 
@@ -103,7 +104,7 @@ _SIGNS = {"missing": "MISSING in", "changed": "CHANGED at", "at import": "(check
 
 
 def _in_full(tried: list[Tried], fitting: list[Tried]) -> list[str]:
-    """Every seam of the adapters that fit, or of the nearest; of the others what is wrong first."""
+    """All seams of the adapters that fit, or of the nearest; the first error of each other one."""
     shown = fitting or tried[:1]
     lines = []
     for each in shown:
@@ -116,14 +117,14 @@ def _in_full(tried: list[Tried], fitting: list[Tried]) -> list[str]:
                 at += f": {state.finding.found}; expected {state.finding.expected}"
             lines.append(f"  {state.seam.role.name.lower():<10} {state.seam!s:<62} {at.strip()}")
         if each.match.fits and info.limits:
-            lines += ["  What will not work:", *(f"  - {limit}" for limit in info.limits)]
+            lines += ["  What does not work:", *(f"  - {limit}" for limit in info.limits)]
     others = [each for each in tried if each not in shown]
     lines += ["", "Others:"] if others else []
     return [*lines, *(f"  {each.verdict()}; {_aside(each, fitting)}" for each in others)]
 
 
 def _as_dict(tried: Tried) -> dict[str, Any]:
-    """Everything, for --json."""
+    """All findings and seams of one adapter, for --json."""
     return {
         "adapter": tried.adapter.name,
         "confidence": tried.match.confidence,
@@ -144,7 +145,7 @@ def _as_dict(tried: Tried) -> dict[str, Any]:
 
 
 def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
-    """What the training scripts import and is not here; a host without scripts is its user's."""
+    """Packages that the training scripts import and that are not installed; [] for a library."""
     from fragprune_plugins.hosts.adapter import ScriptAdapter
     from fragprune_plugins.hosts.preflight import missing_imports
 
@@ -156,7 +157,7 @@ def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
 
 
 def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:
-    """The checkout that the folder is or lies in, or the package; else the folder itself."""
+    """The checkout that contains the folder, or the installed package; else the folder itself."""
     from fragprune_plugins.errors import UnknownHostError
     from fragprune_plugins.hosts.choosing import locate
     from fragprune_plugins.hosts.source import HostRepo
@@ -176,4 +177,4 @@ def _conclusion(repo: HostRepo, fitting: list[Tried]) -> str:
     if fitting:
         names = ", ".join(each.adapter.name for each in fitting)
         return f"Several adapters fit: {names}. Name one with fragprune run --adapter."
-    return "No adapter fits. docs/how-to/write-an-adapter.md says how to write one."
+    return "No adapter fits. docs/how-to/write-an-adapter.md tells how to write an adapter."

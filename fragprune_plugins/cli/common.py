@@ -1,4 +1,4 @@
-"""What all commands share: --json, errors and exit codes, the options for scenes and engines."""
+"""Shared by all commands: --json, errors, exit codes, and the options of scenes and engines."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ FILE = click.Path(path_type=Path)
 
 
 class OutFile(click.Path):
-    """A file to write, refused before any work unless its name says what will be in it.
+    """Type of an option for a file to write; refuses a name without the suffix before any work.
 
     Args:
-        suffix: that its name must have, in lower or upper case.
+        suffix: required suffix, such as ".ply"; upper and lower case are equal.
     """
 
     def __init__(self, suffix: str) -> None:
@@ -46,41 +46,43 @@ class OutFile(click.Path):
         self.suffix = suffix
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """The path, if its name fits."""
+        """The option's value as a path; a usage error if it lacks the suffix."""
         path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
         if path.suffix.lower() != self.suffix:
-            self.fail(f"'{path}' is no name for it: a {self.suffix} file is written.", param, ctx)
+            self.fail(f"'{path}' does not end with {self.suffix}.", param, ctx)
         return path
 
 
 def require_place(out: Path, model: Path) -> None:
-    """Prove, before any work, that a model can be written at ``out``, and is not ``model`` again.
+    """Check, before any work, that ``out`` can be written and is not ``model``.
 
     Raises:
-        UsageError: both have one name, and so one sidecar.
-        OutputError: it cannot be written.
+        UsageError: ``out`` and ``model`` have the same name, and so the same sidecar.
+        OutputError: ``out`` cannot be written.
     """
     from fragprune_plugins.storage.atomic import writable_folder
 
     if out.resolve().with_suffix("") == model.resolve().with_suffix(""):
-        raise UsageError("--out", f"{out}, named as the model is", "another name", "Choose one.")
+        raise UsageError(
+            "--out", f"{out}, the model's name", "another name", "Choose another name."
+        )
     writable_folder(out.parent)
     if out.is_dir():
-        raise OutputError(str(out), "a folder", "a .ply file", "Name a file in it.")
+        raise OutputError(str(out), "a folder", "a .ply file", "Name a file in the folder.")
 
 
 JSON = "fragprune.json"
-"""Key in the context's meta: whether stdout is kept for one JSON object."""
+"""Key of a bool in the context's ``meta``: stdout gets only one JSON object."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a command has to say.
+    """The output of a command.
 
     Attributes:
-        data: for --json.
-        text: for a person.
-        exit_code: 0, or 1 when what was asked for was not reached, or 130 or 143.
+        data: the object that --json prints.
+        text: the text for a person.
+        exit_code: 0; 1 if the check failed; 130 or 143 if learning was interrupted and saved.
     """
 
     data: dict[str, Any]
@@ -89,10 +91,10 @@ class Report:
 
 
 class Command(click.Command):
-    """A command that returns a ``Report``: prints it, as JSON if asked; turns errors into codes.
+    """A command whose function returns a ``Report``: prints it and sets the exit code.
 
-    1 for a stated failure, 2 for usage, 130 for Ctrl-C, 143 for SIGTERM while something learned.
-    Anything unforeseen keeps its traceback.
+    A ``FragpruneError`` gives exit code 1, a usage error 2, Ctrl-C 130, SIGTERM during learning
+    143. Any other exception keeps its traceback.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -110,7 +112,7 @@ class Command(click.Command):
         parent: click.Context | None = None,
         **extra: Any,
     ) -> click.Context:
-        """Read the words; what is wrong with them is said as JSON where that was asked for."""
+        """Parse the words; with --json among them, a usage error is printed as JSON."""
         words = list(args)
         try:
             return super().make_context(info_name, args, parent, **extra)
@@ -118,7 +120,7 @@ class Command(click.Command):
             raise usage_error(error, words) from error
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run, print, and leave with the right exit code."""
+        """Run the command, print its report or error, and exit with its code."""
         as_json = ctx.meta[JSON] = bool(ctx.params.pop("as_json"))
         try:
             report: Report = super().invoke(ctx)
@@ -141,25 +143,25 @@ class Command(click.Command):
 
 
 def usage_error(error: click.UsageError, words: list[str]) -> Exception:
-    """What to raise for a usage error: itself, or an exit once it was printed as JSON.
+    """The exception to raise for a usage error. With --json, prints the error and returns an exit.
 
     Args:
-        error: click's.
-        words: as typed; those after ``--`` are the host's, ``--json`` among them.
+        error: click's error.
+        words: words of the command line. Words after ``--`` belong to the host's command.
     """
     ours = words[: words.index("--")] if "--" in words else words
     if "--json" not in ours:
         return error
     where = error.ctx.command_path if error.ctx else "fragprune"
     stated = UsageError(
-        where, error.format_message(), "options it understands", f"Run {where} --help."
+        where, error.format_message(), "options of this command", f"Run {where} --help."
     )
     click.echo(json.dumps({"error": stated.as_dict()}))
     return click.exceptions.Exit(2)
 
 
 def _together(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:
-    """Several options as one decorator, shown in this order."""
+    """Several options as one decorator; --help shows them in this order."""
 
     def decorate(function: Function) -> Function:
         return functools.reduce(lambda f, option: option(f), reversed(options), function)
@@ -194,22 +196,22 @@ data_options = _together(
 
 
 def _device(ctx: click.Context, param: click.Parameter, value: str) -> str:
-    """A word that ``engines.device_for`` knows; whether the device is here is for it to say."""
+    """Check that a word has the form of a device; ``engines.device_for`` checks that it exists."""
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,2})?", value):
         raise click.BadParameter(f"{value!r} is not one of auto, cpu, cuda, cuda:N.")
     return value
 
 
 def engine_option(what: str) -> Callable[[Function], Function]:
-    """``--engine``; what it does here."""
-    names = "auto (the fastest that runs here), reference, cpu, cuda, or the name of a plugin's."
+    """The option ``--engine``; ``what`` tells its use in the command's help."""
+    names = "auto (the fastest that runs here), reference, cpu, cuda, or a plugin's engine."
     return click.option(
         "--engine", metavar="NAME", default="auto", show_default=True, help=f"{what}: {names}"
     )
 
 
 def device_option(what: str, default: str = "auto") -> Callable[[Function], Function]:
-    """``--device``; what it does here."""
+    """The option ``--device``; ``what`` is its help."""
     return click.option(
         "--device",
         metavar="auto|cpu|cuda[:N]",
@@ -221,12 +223,12 @@ def device_option(what: str, default: str = "auto") -> Callable[[Function], Func
 
 
 threads_option = click.option(
-    "--threads", type=click.IntRange(min=1), help="CPU threads; all cores when left out."
+    "--threads", type=click.IntRange(min=1), help="Number of CPU threads; default: all cores."
 )
 
 engine_options = _together(
-    engine_option("What rasterizes"),
-    device_option("Where; auto takes a GPU on which our cuda engine may be used, else the CPU."),
+    engine_option("Engine that rasterizes"),
+    device_option("Device; auto takes a GPU if our cuda engine can draw on it, else the CPU."),
     threads_option,
 )
 
@@ -239,12 +241,12 @@ views_option = click.option(
     type=click.Choice(["test", "train", "all"]),
     default="test",
     show_default=True,
-    help="Which views to use; test are those held out (COLMAP: every 8th).",
+    help="Views to use; test means the held-out views (COLMAP: every 8th).",
 )
 
 
 def bound_threads(threads: int | None) -> None:
-    """Let torch, and the engines with it, take so many CPU threads; None leaves them all."""
+    """Limit torch and the engines to this many CPU threads; None sets no limit."""
     if threads is not None:
         import torch
 
@@ -252,13 +254,19 @@ def bound_threads(threads: int | None) -> None:
 
 
 def open_engine(engine: str, device: str, threads: int | None) -> tuple[Engine, torch.device]:
-    """The engine that was asked for, and the device to put models and views on.
+    """Open the engine of the options.
 
-    Bounds the CPU threads of torch and of the engines, which follow torch.
+    Args:
+        engine: the ``--engine`` option.
+        device: the ``--device`` option.
+        threads: limit on CPU threads; None for no limit.
+
+    Returns:
+        The engine, and the device for models and views.
 
     Raises:
-        UsageError: there is no such device.
-        EngineError: there is no such engine.
+        UsageError: the device does not exist.
+        EngineError: the engine does not exist or cannot run here.
     """
     from fragprune_plugins.engines import device_for
     from fragprune_plugins.plugins.hooks import engine_for
@@ -277,7 +285,15 @@ def load_shots(
     images: str = "images",
     device: torch.device | str = "cpu",
 ) -> Sequence[Shot]:
-    """The views of a scene folder that were asked for, on a device.
+    """Load the views of a scene folder onto a device.
+
+    Args:
+        folder: the scene.
+        views: "test", "train" or "all".
+        resolution: divisor of the images' sides, or a rule.
+        white_background: whether transparent images lie over white.
+        images: name of the images' folder in a COLMAP scene.
+        device: the device of the views.
 
     Raises:
         DatasetError: the folder cannot be read as a scene.
@@ -295,7 +311,14 @@ def load_shots(
 
 
 def dropping(out: Path, bytes_before: int, before: int, after: int) -> dict[str, int]:
-    """What leaving Gaussians out of a file did: to its bytes, and to their count."""
+    """Counts of dropped Gaussians and bytes, for --json.
+
+    Args:
+        out: the file without the dropped Gaussians.
+        bytes_before: size of the file with all Gaussians.
+        before: number of all Gaussians.
+        after: number of Gaussians left.
+    """
     return {
         "gaussians": before - after,
         "of": before,
@@ -305,7 +328,7 @@ def dropping(out: Path, bytes_before: int, before: int, after: int) -> dict[str,
 
 
 def describe_dropped(dropped: dict[str, int], why: str) -> str:
-    """The same in a line."""
+    """The counts of ``dropping`` as a line of text; ``why`` describes the dropped Gaussians."""
     return (
         f"Dropped {dropped['gaussians']:,} of {dropped['of']:,} Gaussians, {why}: "
         f"{dropped['bytes_before']:,} -> {dropped['bytes_after']:,} bytes."

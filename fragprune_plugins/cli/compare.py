@@ -1,4 +1,4 @@
-"""``fragprune compare``: two splats on the same photographs."""
+"""``fragprune compare``: measures two splats on the same photographs."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 @click.option(
     "--data",
     type=FILE,
-    help="Scene folder: COLMAP (sparse/, images/) or Blender (transforms_*.json). Left out: that "
-    "of the run or fine-tuning that left the models.",
+    help="Scene folder: COLMAP (sparse/, images/) or Blender (transforms_*.json). Default: the "
+    "scene of the run or fine-tuning that wrote the models.",
 )
 @image_options
 @click.option("--out", type=FILE, help="Folder for side-by-side pictures.")
@@ -58,9 +58,9 @@ def command(
 ) -> Report:
     """Measure A and B on the same photographs.
 
-    Each is drawn with the thresholds stored beside it; frames are timed in turns. Where a run or a
-    fine-tuning left one of them, its record says which photographs were used, at what size and on
-    what background, and how models are drawn: that is followed, but for what is given here.
+    Each model is drawn with the thresholds stored beside it, and frames are timed in turns. If a
+    run or a fine-tuning wrote one of the models, its record gives the photographs, their size and
+    background, and how models are drawn. Options given here override the record.
 
     \b
     Examples:
@@ -123,7 +123,7 @@ def command(
 
 
 def _records(*models: Path) -> dict[Path, dict[str, Any]]:
-    """How the commands that left the models read photographs and draw, by model, where known."""
+    """By model, the "photographs" of the record of the command that wrote it, if there is one."""
     from fragprune_plugins.storage import records
 
     known: dict[Path, dict[str, Any]] = {}
@@ -138,7 +138,11 @@ def _records(*models: Path) -> dict[Path, dict[str, Any]]:
 
 
 def _scene(data: Path | None, known: dict[Path, dict[str, Any]]) -> Photographs:
-    """The photographs asked for, read as those of the models' runs were."""
+    """The photographs to measure on: those of the records, in the folder ``data`` if given.
+
+    Raises:
+        UsageError: there is no folder, and the records are missing or differ.
+    """
     from fragprune_plugins.datasets.photographs import Photographs
 
     read = {Photographs.from_dict(how) for how in known.values()}
@@ -148,9 +152,9 @@ def _scene(data: Path | None, known: dict[Path, dict[str, Any]]) -> Photographs:
     if data is None:
         raise UsageError(
             "--data",
-            "none, and the models' runs read photographs in two ways"
+            "no folder, and the models' runs read photographs in two ways"
             if read
-            else "none, and no record of a run beside the models",
+            else "no folder, and no record of a run beside the models",
             "a scene folder",
             "Name it with --data.",
         )

@@ -1,4 +1,4 @@
-"""``fragprune demo``: see it work, without a GPU, a download or a repository."""
+"""``fragprune demo``: shows fragprune at work without a GPU, a download or a repository."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ from fragprune_plugins.cli.common import (
     type=FILE,
     default="fragprune-demo",
     show_default=True,
-    help="Folder for the scene, the models, the pictures and index.html: a new one, or an earlier "
-    "demo's, which is emptied.",
+    help="Folder for the scene, the models, the pictures and index.html: a new folder, or the "
+    "folder of an earlier demo, which is emptied.",
 )
 @click.option(
     "--iters",
     type=click.IntRange(min=100),
     default=2000,
     show_default=True,
-    help="Iterations of the training; the fine-tuning takes half as many.",
+    help="Iterations of the training; the fine-tuning runs half as many.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of scene and training.")
-@engine_option("What rasterizes")
-@device_option("Where; the scene is small enough for any CPU.", default="cpu")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of scene and training.")
+@engine_option("Engine that rasterizes")
+@device_option("Device; the scene is small enough for any CPU.", default="cpu")
 @threads_option
 def command(
     out: Path, iters: int, seed: int, engine: str, device: str, threads: int | None
 ) -> Report:
-    """Make a small scene, train on it, prune its fragments, show before and after.
+    """Make a small scene, train a model on it, prune its fragments, and show before and after.
 
-    Takes a few minutes on a laptop; nothing is downloaded.
+    It takes a few minutes on a laptop and downloads nothing.
 
     \b
     Example:
       fragprune demo --out fragprune-demo
     """
-    # Read when torch loads: idle threads sleep instead of spinning against other programs' work.
+    # torch reads this when it loads. Idle threads sleep, and leave the CPU to other programs.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from fragprune_plugins.demo.demo import DemoSettings, run_demo
     from fragprune_plugins.measure.wording import describe, outcome

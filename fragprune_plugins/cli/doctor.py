@@ -1,4 +1,4 @@
-"""``fragprune doctor``: what this installation has, lacks, and lost."""
+"""``fragprune doctor``: reports the versions, engines and plugins of this installation."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ _AGREES = {"agrees": True, "fails": False, "could not run": None}
 @click.option(
     "--build-cuda",
     metavar="ARCHITECTURES",
-    help="Compile the GPU's kernels beforehand, for compute capabilities like 80,90; needs no GPU.",
+    help="Compile the GPU kernels in advance for these compute capabilities, such as 80,90; needs "
+    "no GPU.",
 )
 def command(build_cuda: str | None) -> Report:
-    """Report versions, engines, the native build and plugins; paste it into a bug report.
+    """Report versions, engines, the native build and plugins, for a bug report.
 
-    Where there is a GPU, the cuda engine is checked there: what it draws and learns is compared
-    with what the other engines make of the same. Exit code 1 when something is wrong that has a
+    If there is a GPU, the cuda engine is checked on it: its pictures and gradients are compared
+    with those of the other engines. The exit code is 1 if something is wrong; the output names the
     remedy.
 
     \b
@@ -44,7 +45,7 @@ def command(build_cuda: str | None) -> Report:
 
     packages = {name: _version(name) for name in _PACKAGES}
     native = binding.describe()
-    # First of all: a GPU may be one process's alone.
+    # This comes first, because a GPU may allow only one process.
     verdict = self_check.check_in_subprocess("cuda") if driver.missing() is None else None
     gpu = driver.describe()
     gpu["agrees"] = None if verdict is None else _AGREES[verdict.outcome]
@@ -79,17 +80,17 @@ def command(build_cuda: str | None) -> Report:
     wrong = not binding.available() or any(f.level == "error" for f in plugins.findings)
     if not binding.available():
         lines.append(
-            "The cpu engine is missing: rasterization on the CPU uses the slow reference engine. "
+            "The cpu engine is missing, so the slow reference engine draws on the CPU. "
             "Install a C++17 compiler and install fragprune-plugins again."
         )
     if verdict is not None and verdict.outcome != "agrees":
         wrong = True
-        lines.append(f"{verdict}. Until then --engine auto does without it. {verdict.remedy}")
+        lines.append(f"{verdict}. Until then, --engine auto does not use it. {verdict.remedy}")
     return Report(data, "\n".join(lines), exit_code=1 if wrong else 0)
 
 
 def _build(architectures: str) -> Report:
-    """Compile the usual kernels for some architectures and keep them."""
+    """Compile the kernels for a comma-separated list of architectures into the cache."""
     from fragprune_plugins.engines.cuda import kernels
     from fragprune_plugins.engines.cuda.frame import MACROS, VARIANTS
 
@@ -120,7 +121,7 @@ def _build(architectures: str) -> Report:
     lines = [f"{data['compiler']}, kept in {folder}"]
     lines += [
         f"{k['target']} {k['kernel']}: {k['registers']} registers, {k['shared']} bytes shared, "
-        f"{k['spills']} spilled{', was there' if k['kept'] else ''}"
+        f"{k['spills']} spilled{', already there' if k['kept'] else ''}"
         for k in built
     ]
     return Report(data, "\n".join(lines))

@@ -1,4 +1,4 @@
-"""``fragprune export``: one PLY that carries the thresholds, for other tools."""
+"""``fragprune export``: writes a PLY with a column of thresholds, for other tools."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ from fragprune_plugins.storage import models
 
 @click.command("export", cls=Command)
 @click.argument("model", type=FILE)
-@click.option("--out", type=OutFile(".ply"), required=True, help="The PLY to write.")
+@click.option("--out", type=OutFile(".ply"), required=True, help="PLY to write.")
 @click.option(
     "--drop-invisible",
     "drop",
     is_flag=True,
-    help="Leave out Gaussians that no view can draw: opacity under 1/255.",
+    help="Leave out Gaussians that no view can draw, with an opacity below 1/255.",
 )
 def command(model: Path, out: Path, drop: bool) -> Report:
-    """Write MODEL with its thresholds as one more column.
+    """Write MODEL with a further column for its thresholds.
 
-    The column, trunc_threshold, holds the threshold itself, a falloff in (0, 1): a renderer that
-    draws a fragment only where exp(-q/2) >= trunc_threshold (q the squared Mahalanobis distance)
-    draws what we draw. Tools that do not know the column ignore it, if they read columns by name.
+    The column trunc_threshold holds the threshold, a falloff in (0, 1). A renderer gets the same
+    picture as fragprune if it draws a fragment only where exp(-q/2) >= trunc_threshold, with q the
+    squared Mahalanobis distance. Tools that read columns by name ignore a column that they do not
+    know.
 
     \b
     Example:
@@ -52,7 +53,7 @@ def command(model: Path, out: Path, drop: bool) -> Report:
             "a sidecar beside it, written by fragprune",
             "Run fragprune finetune first.",
         )
-    thresholds = splat.thresholds  # a column's own bits
+    thresholds = splat.thresholds  # a column keeps its bits
     if thresholds is None or sidecar.path_beside(model).exists():
         thresholds = store.values.detach()
     write_ply(out, splat, thresholds)

@@ -1,4 +1,4 @@
-"""``fragprune finetune``: thresholds and opacities for a trained splat, from its photographs."""
+"""``fragprune finetune``: learns thresholds and opacities of a trained splat on its photographs."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ if TYPE_CHECKING:
 @click.command("finetune", cls=Command)
 @click.argument("model", type=FILE)
 @click.option(
-    "--out", type=OutFile(".ply"), required=True, help="The new .ply; its sidecar goes beside it."
+    "--out", type=OutFile(".ply"), required=True, help="New .ply; its sidecar goes beside it."
 )
 @data_options
 @learning_options
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the order of views.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
 @click.option(
-    "--curves", type=OutFile(".png"), help="Write a picture of the learning curves here (.png)."
+    "--curves", type=OutFile(".png"), help="File for a picture of the learning curves (.png)."
 )
 @click.option(
     "--drop-invisible",
     "drop",
     is_flag=True,
-    help="Leave out Gaussians that reach no pixel of any view in --data, training or held out.",
+    help="Leave out Gaussians that reach no pixel of any training or held-out view in --data.",
 )
 @engine_options
 def command(
@@ -65,11 +65,11 @@ def command(
 ) -> Report:
     """Learn how far each Gaussian of MODEL must reach.
 
-    Thresholds and opacities adapt to each other on the photographs in --data; positions, shapes
-    and colours stay bit for bit (but see --train). OUT has the columns of MODEL; the thresholds go
-    beside it, into OUT.fragprune.safetensors. The table compares both on views that were not
-    learned from, and a line below it says what OUT is without its thresholds, as other viewers draw
-    it. Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
+    Thresholds and opacities adapt to each other on the photographs in --data. Positions, shapes
+    and colours stay bit for bit (but see --train). OUT has the columns of MODEL, and the thresholds
+    go beside it into OUT.fragprune.safetensors. The table compares both models on held-out views.
+    A line below it measures OUT without its thresholds, as other viewers draw it. Ctrl-C (exit code
+    130) and SIGTERM (143) save the thresholds learned so far.
 
     \b
     Examples:
@@ -91,13 +91,13 @@ def command(
     truncation = settings.truncate and not no_truncation
     splat, store = models.load(model, truncation=truncation, device=where)
     dataset = load_dataset(data, resolution=resolution, white_background=white_background)
-    start = Candidate(splat, deepcopy(store))  # the store itself learns
+    start = Candidate(splat, deepcopy(store))  # learning changes the store
 
     with sigterm_interrupts():
         result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
         save(out, result)
     done = result.progress
-    if result.terminated:  # whoever sends SIGTERM does not wait for measurements
+    if result.terminated:  # after SIGTERM there is no time for measurements
         return _terminated(model, out, result)
     dropped = None
     if drop:
@@ -165,7 +165,7 @@ def command(
 
 
 def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:
-    """What is known when there was time to save and no more."""
+    """The report after SIGTERM: the model is saved, and nothing is measured."""
     done, asked = result.progress, result.settings
     data = {
         "model": str(model),
@@ -183,7 +183,12 @@ def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:
 
 
 def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
-    """What is left of a model for who does not know its thresholds."""
+    """A line on the fine-tuned model without its thresholds.
+
+    Args:
+        before: measurement of the model before fine-tuning.
+        plain: measurement of the fine-tuned model without thresholds.
+    """
     return (
         f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
         f"({plain['psnr'] - before['psnr']:+.2f}), {plain['fragments_per_pixel']:.1f} fragments "

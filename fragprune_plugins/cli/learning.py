@@ -1,4 +1,4 @@
-"""The options of everything that learns, ``run`` and ``finetune`` alike."""
+"""The options of learning, for ``run`` and ``finetune``."""
 
 from __future__ import annotations
 
@@ -16,29 +16,33 @@ _OPTIONS = (
     click.option(
         "--iters", type=int, help=f"Iterations of stage 2; default {FINETUNE_ITERATIONS}."
     ),
-    click.option("--quick", is_flag=True, help=f"{QUICK_ITERATIONS} iterations: most of the gain."),
+    click.option(
+        "--quick", is_flag=True, help=f"Run {QUICK_ITERATIONS} iterations, for most of the gain."
+    ),
     click.option(
         "--train",
         type=click.Choice(["opacity", "appearance", "all"]),
         default="opacity",
         show_default=True,
-        help="What learns beside the thresholds; appearance adds SH, all adds shapes and "
+        help="Parameters that learn with the thresholds; appearance adds SH, all adds shapes and "
         "positions.",
     ),
     click.option(
         "--pressure",
         type=float,
-        help=f"Weight of drawn fragments per pixel in the loss; default {ELASTICITY:g} of the loss "
-        f"per fragment, {LEAST_PRESSURE:g} or more.",
+        help="Weight of drawn fragments per pixel in the loss; default: "
+        f"{ELASTICITY:g} of the loss per fragment, and at least {LEAST_PRESSURE:g}.",
     ),
     click.option(
         "--target-speedup",
         type=float,
-        help="Steer for this many times fewer fragments: those of the untruncated model as it came "
-        "in over those drawn now, on the training views that calibration measures.",
+        help="Target for the ratio of fragments: those of the untruncated model at the start, "
+        "divided by those drawn now, on the training views that calibration measures.",
     ),
     click.option(
-        "--control", is_flag=True, help="Same iterations without truncation: the honest zero."
+        "--control",
+        is_flag=True,
+        help="Run the same iterations without truncation, to compare with.",
     ),
 )
 
@@ -51,10 +55,12 @@ _EXCLUDE = (
 
 
 def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options; the command gets one ``settings`` for them (and for ``seed``, if it has it).
+    """Add the options of learning to a command.
+
+    The command gets their values, and its own ``seed`` if it has one, as ``settings``.
 
     Raises:
-        UsageError: options that contradict each other, or values out of range.
+        UsageError: options contradict each other, or a value is out of range.
     """
 
     @functools.wraps(function)
@@ -77,7 +83,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
         }
         for one, other in _EXCLUDE:
             if asked[one] and asked[other]:
-                raise UsageError("options", f"{one} with {other}", "one of the two", "Drop one.")
+                raise UsageError("options", f"{one} with {other}", "one of the two", "Remove one.")
         default = QUICK_ITERATIONS if quick else FINETUNE_ITERATIONS
         settings = Settings(
             iterations=default if iters is None else iters,

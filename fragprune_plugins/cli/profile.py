@@ -1,4 +1,4 @@
-"""``fragprune profile``: what a splat costs and how good it looks."""
+"""``fragprune profile``: measures the quality, fragments and frame time of a splat."""
 
 from __future__ import annotations
 
@@ -102,7 +102,17 @@ def command(
 def draw_panels(
     out: Path, columns: dict[str, Candidate], shots: Sequence[Shot], engine: Engine
 ) -> list[Path]:
-    """One picture for some of the views: photograph, renders, fragment densities on one scale."""
+    """Draw evenly spread views: photograph, renders, and fragment densities on one scale.
+
+    Args:
+        out: folder for the PNGs.
+        columns: candidates by name.
+        shots: the views; ``PANELS`` of them at most are drawn.
+        engine: draws the views.
+
+    Returns:
+        The files, one for each drawn view.
+    """
     import torch
 
     from fragprune_plugins.measure.pictures import save_panel

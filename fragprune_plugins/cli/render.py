@@ -1,4 +1,4 @@
-"""``fragprune render``: pictures of a splat, truncated as its sidecar says."""
+"""``fragprune render``: draws pictures of a splat with the thresholds of its sidecar."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fragprune_plugins.storage import models
 @click.command("render", cls=Command)
 @click.argument("model", type=FILE)
 @click.option("--cameras", type=FILE, help="cameras.json of a 3DGS model, or transforms_*.json.")
-@click.option("--data", type=FILE, help="Scene folder whose cameras to use, instead of --cameras.")
+@click.option("--data", type=FILE, help="Scene folder whose cameras draw, instead of --cameras.")
 @click.option("--out", type=FILE, required=True, help="Folder for the PNG files.")
 @click.option("--heatmap", is_flag=True, help="Also draw fragments per pixel, on one shared scale.")
 @views_option
@@ -45,9 +45,9 @@ def command(
     device: str,
     threads: int | None,
 ) -> Report:
-    """Render MODEL from many cameras, one PNG each.
+    """Render MODEL from many cameras, with one PNG for each camera.
 
-    The thresholds beside MODEL are applied when there are any; --no-truncation draws without.
+    The thresholds beside MODEL apply, if there are any; --no-truncation ignores them.
 
     \b
     Examples:

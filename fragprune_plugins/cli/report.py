@@ -1,4 +1,4 @@
-"""``fragprune report``: what a folder's runs gained, as one page."""
+"""``fragprune report``: writes an HTML page of the results in a folder."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
 PAGE = "report.html"
 
 _ONLY_CONTROLS = (
-    "Only controls lie here: no run or fine-tuning that truncates. "
+    "This folder holds only controls, and no run or fine-tuning that truncates. "
     "Run the same command without --control, then report again."
 )
 
-_SLIDERS = """Views that were held out. Drag the sliders: left of the handle before, right of it
-after; beside it the photograph; below, the fragments that each pixel draws."""
+_SLIDERS = """Held-out views. Drag the sliders: the model before is left of the handle, the model
+after is right of it. The photograph is beside them. The fragments of each pixel are below."""
 
 
 @click.command("report", cls=Command)
 @click.argument("folder", metavar="DIR", type=FILE)
-@click.option("--out", type=OutFile(".html"), help=f"The page; DIR/{PAGE} when left out.")
-@click.option("--data", type=FILE, help="Scene folder, where the one that was used has moved.")
+@click.option("--out", type=OutFile(".html"), help=f"HTML file to write; default: DIR/{PAGE}.")
+@click.option("--data", type=FILE, help="Scene folder, if the scene has moved since the run.")
 @engine_options
 def command(
     folder: Path,
@@ -54,12 +54,12 @@ def command(
     device: str,
     threads: int | None,
 ) -> Report:
-    """Make one page of what was gained in DIR: a sentence, tables, sliders over views, curves.
+    """Make an HTML page of the results in DIR: a sentence, tables, sliders over views, curves.
 
-    DIR is where run or finetune wrote their models, or compare and profile their pictures (--out).
-    The page is a single file without references to others: it can be mailed. The newest run or
-    fine-tuning that is no control comes first; where its photographs are still there, some held-out
-    views are drawn.
+    DIR is the folder where run or finetune wrote models, or where compare or profile wrote pictures
+    (--out). The page is a single file without references to other files, so it can be mailed. The
+    newest run or fine-tuning that is no control comes first. If its photographs are still there,
+    the page shows some held-out views.
 
     \b
     Example:
@@ -115,7 +115,7 @@ def command(
 
 
 def _columns(record: Record) -> dict[str, dict[str, Any]]:
-    """What a record measured on held-out views, by name."""
+    """A record's measurements on held-out views, by name of the model."""
     data = record.data
     if record.command == "compare":
         return {"A": data["a"], "B": data["b"]}
@@ -126,7 +126,7 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
 
 
 def _table(record: Record) -> str:
-    """The measurements, else what was seen on training views."""
+    """A table of the measurements, else of the figures on training views."""
     from fragprune_plugins.measure.wording import describe
 
     columns = _columns(record)
@@ -141,7 +141,7 @@ def _number(value: float | None) -> str:
 
 
 def _sentence(record: Record, among: Sequence[Path]) -> str:
-    """The outcome in a line one can quote; ``among`` are files that may record its control."""
+    """The outcome as a sentence to quote; ``among`` are the files that may record its control."""
     from fragprune_plugins.measure.wording import IS_CONTROL, fewer, gain, missed, outcome
     from fragprune_plugins.storage.records import control_of
 
@@ -166,7 +166,7 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
 
 
 def _block(record: Record, among: Sequence[Path]) -> list[str]:
-    """Another record under its heading."""
+    """A record as HTML: heading, sentence and table."""
     from html import escape
 
     from fragprune_plugins.measure import report_page
@@ -180,7 +180,7 @@ def _block(record: Record, among: Sequence[Path]) -> list[str]:
 
 
 def _facts(record: Record) -> str:
-    """Settings and provenance."""
+    """The settings and files of a record, one a line."""
     keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
     facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
     facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
@@ -193,10 +193,17 @@ def _draw(
     data: Path | None,
     opened: Callable[[], tuple[Engine, torch.device]],
 ) -> tuple[list[str], list[tuple[str, str]], str]:
-    """Held-out views and learning curves, drawn into the folder.
+    """Draw held-out views and learning curves into a folder.
+
+    Args:
+        record: the record of the models.
+        folder: the folder for the pictures.
+        data: the scene folder, if it differs from the record's.
+        opened: opens the engine; called only if there is something to draw.
 
     Returns:
-        Names of the views, headed pictures besides, and what is missing and why.
+        Names of the views, (heading, file) of further pictures, and a sentence that tells why
+        views are missing ("" if none are).
     """
     from dataclasses import replace
 
@@ -225,7 +232,7 @@ def _draw(
         scene = Photographs.from_dict(drawn)
         dataset = load_photographs(replace(scene, folder=data or scene.folder))
     except (DatasetError, ModelFileError, SidecarError) as error:
-        if data is not None:  # they were asked for
+        if data is not None:  # the user asked for the views
             raise
         return [], learning, f"No views are shown: {error}"
     views = report_page.draw_views(folder, before, after, dataset.test, engine)
@@ -233,7 +240,7 @@ def _draw(
 
 
 def _files(records: list[Record], folder: Path) -> list[tuple[str, str]]:
-    """Pictures that compare and profile have drawn, copied into the folder."""
+    """Copy pictures of compare and profile into the folder; returns (heading, file) of each."""
     found = []
     for record in records:
         for number, name in enumerate(record.data.get("files", ())):

@@ -1,4 +1,4 @@
-"""``fragprune run``: a host's own training command, with learned truncation."""
+"""``fragprune run``: runs a host's training command and learns thresholds."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
     context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
 )
 @click.argument("host_command", nargs=-1, type=click.UNPROCESSED, metavar="-- python train.py ...")
-@click.option("--adapter", help="Name of the host's adapter; detected from its source by default.")
+@click.option("--adapter", help="Name of the host's adapter; default: detected from its source.")
 @click.option(
     "--stage",
     type=click.Choice(["auto", "finetune", "joint", "off"]),
     default="auto",
     show_default=True,
-    help="auto: train, then fine-tune. finetune: only that, from what the output folder holds. "
-    "joint: learn inside the training. off: only apply thresholds that are there.",
+    help="auto: train, then fine-tune. finetune: only fine-tune the model in the output folder. "
+    "joint: learn inside the training. off: only apply stored thresholds.",
 )
 @click.option(
     "--from-iter", type=click.IntRange(min=0), help="finetune, joint: learn from this iteration on."
@@ -51,14 +51,14 @@ if TYPE_CHECKING:
     "--alternate", type=click.IntRange(min=1), help="joint: learn N iterations, hold N, and so on."
 )
 @learning_options
-@engine_option("What rasterizes where thresholds apply or the host's own rasterizer is missing")
-@device_option("Where the host runs; cpu runs a CUDA-only host without a GPU.")
+@engine_option("Engine that rasterizes with thresholds, or if the host's own rasterizer is missing")
+@device_option("Device of the host; cpu runs a CUDA-only host without a GPU.")
 @threads_option
 @click.option(
     "--evaluate/--no-evaluate",
     default=True,
     show_default=True,
-    help="Compare before and after on the views the host held out (--eval).",
+    help="Compare before and after on the views that the host holds out (--eval).",
 )
 @click.pass_context
 def command(
@@ -77,9 +77,9 @@ def command(
     """Train with a host's own command, then learn truncation thresholds.
 
     Put the unmodified command after --. Stage 1 is the host's own training. Stage 2 resumes it for
-    a few thousand iterations in which only opacities and thresholds move (but see --train), and
-    the host saves its model as always; the thresholds go beside it as a sidecar. In stage 2 Ctrl-C
-    (exit code 130) and SIGTERM (143) save what was learned so far.
+    a few thousand iterations, in which only opacities and thresholds change (but see --train). The
+    host saves its model as usual, and the thresholds go beside it as a sidecar. In stage 2, Ctrl-C
+    (exit code 130) and SIGTERM (143) save the thresholds learned so far.
 
     \b
     Examples:
@@ -89,7 +89,7 @@ def command(
       fragprune run -- python render.py -m out                       (renders with thresholds)
     """
     if alternate is not None and stage != "joint":
-        raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Add or drop it.")
+        raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Change one of them.")
 
     from fragprune_plugins.injection.launch import RunOptions, run
     from fragprune_plugins.injection.process import current_gpu
@@ -105,7 +105,7 @@ def command(
         engine=engine,
         device=device,
     )
-    # A host prints as it likes; with --json stdout is kept for the one object.
+    # A host prints to stdout; with --json, stdout gets only our object.
     to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None
     with to_stderr or contextlib.nullcontext():
         summary = run(list(host_command), options)
@@ -116,7 +116,7 @@ def command(
             try:
                 with current_gpu(device):
                     before, after = _measure(photographs, engine, device)
-            except FragpruneError as error:  # after hours of training: what was learned is saved
+            except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
     data: dict[str, Any] = {
         "adapter": summary.adapter,
@@ -153,7 +153,10 @@ def _text(path: Path | None) -> str | None:
 
 
 def _photographs(summary: RunSummary) -> dict[str, Any] | None:
-    """What our own readers need to draw what the host would; None where they cannot."""
+    """The record's "photographs": how to read the host's data and draw its models.
+
+    None if the models cannot be compared.
+    """
     if not (summary.photographs and summary.model_before and summary.model_after):
         return None
     return {
@@ -167,7 +170,16 @@ def _photographs(summary: RunSummary) -> dict[str, Any] | None:
 def _measure(
     photographs: dict[str, Any], engine: str = "auto", device: str = "auto"
 ) -> list[dict[str, Any]]:
-    """Before and after on held-out views, where the host ran if our engine may draw there."""
+    """Measure both models on held-out views, on the host's device if an engine can draw there.
+
+    Args:
+        photographs: the dict of ``_photographs``.
+        engine: the ``--engine`` option.
+        device: the ``--device`` option.
+
+    Returns:
+        The measurements before and after.
+    """
     from fragprune_plugins.datasets.dataset import load_photographs
     from fragprune_plugins.datasets.photographs import Photographs
     from fragprune_plugins.measure import Candidate, measure

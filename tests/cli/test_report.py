@@ -105,8 +105,8 @@ def test_a_folder_of_controls_alone_is_named_as_one(folder, tmp_path):
     run_json("finetune", out / "pruned.ply", *words)
     text = run("report", zero).stdout
     assert ": a control, nothing is truncated." in text.splitlines()[0]
-    assert "Only controls lie here" in text
-    assert "Only controls lie here" in (zero / "report.html").read_text()
+    assert "This folder holds only controls" in text
+    assert "This folder holds only controls" in (zero / "report.html").read_text()
     report = run_json("report", zero)
     assert report["control"] is True
     assert report["pictures"] == 4 * len(report["views"]) + 1  # what it learned, too
