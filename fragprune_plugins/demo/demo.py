@@ -1,4 +1,4 @@
-"""The demo from beginning to end: photographs, training, fine-tuning, before and after."""
+"""Runs the demo: photographs, training, fine-tuning, measurement, pictures."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ if TYPE_CHECKING:
     from fragprune_plugins.storage.ply import SplatFile
 
 HOST = Path(__file__).with_name("host") / "train.py"
-"""The training script that the demo runs, as a user runs their own."""
+"""The training script of the demo's host."""
 
 REPORT = "report.json"
-"""Written last."""
+"""The report's file in the demo's folder; the demo writes it last."""
 
 
-_REPEATS = 20  # timed frames a view: small frames are quick, and laptops are noisy
+_REPEATS = 20  # timed frames for each view: small frames are fast, and laptops are noisy
 
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """How long a demo to run.
+    """Settings of a demo.
 
     Attributes:
-        iterations: of the host's own training.
-        finetune: iterations of stage 2.
+        iterations: number of iterations of the host's own training.
+        finetune: number of iterations of stage 2.
         pressure: weight of drawn fragments per pixel; None for the default.
-        seed: of the scene and of the training.
-        engine: what rasterizes.
-        device: where everything runs, "cpu" or a CUDA device.
-        scene: the photographs.
+        seed: seed of the scene and of the training.
+        engine: name of the engine that rasterizes.
+        device: "cpu" or a CUDA device.
+        scene: settings of the photographs.
     """
 
     iterations: int = 2000
@@ -53,7 +53,15 @@ class DemoSettings:
 
 
 def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
-    """What one would type to train the host on the scene; the timetable scaled to its length."""
+    """The command that trains the host on the scene.
+
+    Its flags scale the timetable of densification to the number of iterations.
+
+    Args:
+        scene: the scene's folder.
+        model: the output folder.
+        settings: the demo's settings.
+    """
     n = settings.iterations
     flags: dict[str, object] = {
         "-s": scene,
@@ -64,7 +72,7 @@ def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
         "--densify_from_iter": n // 10,
         "--densify_until_iter": int(n * 0.65),
         "--densification_interval": max(1, n // 20),
-        "--opacity_reset_interval": 10 * n,  # too short a training to recover from one
+        "--opacity_reset_interval": 10 * n,  # never: the training is too short to recover
         "--densify_grad_threshold": 0.0009,
         "--test_iterations": -1,
         "--save_iterations": n,
@@ -79,19 +87,19 @@ def run_demo(
     settings: DemoSettings | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Make a scene, train the host on it, fine-tune, measure, draw; progress bars on stderr.
+    """Make a scene, train the host on it, fine-tune, measure and draw. Progress goes to stderr.
 
     Args:
-        out: folder for everything: ``scene/``, ``model/``, ``pictures/``, ``index.html``.
-        settings: how long.
-        say: told one line at the start of each part.
+        out: folder for ``scene/``, ``model/``, ``pictures/``, ``index.html`` and ``report.json``.
+        settings: the demo's settings; None for the defaults.
+        say: called with one line of text at the start of each part.
 
     Returns:
-        The report: "before", "after" and "control" (opacities alone, as long) as measured on the
-        held-out views, seconds by part.
+        The report. "before", "after" and "control" are measurements on held-out views; the control
+        trains opacities alone for as many iterations. "seconds_by_part" are wall times.
 
     Raises:
-        OutputError: the folder cannot be written, or holds what no demo wrote.
+        OutputError: the folder cannot be written, or holds files that no demo wrote.
     """
     from fragprune_plugins.demo.page import write_page
     from fragprune_plugins.injection.launch import run
@@ -116,7 +124,7 @@ def run_demo(
         )
         summary = run(command, _run_options(settings))
     with clock.part("control"):
-        say(f"3/5  The honest zero: the same {settings.finetune} iterations with opacities alone")
+        say(f"3/5  The control: the same {settings.finetune} iterations with opacities alone")
         control = _control(scene, summary, settings)
     with clock.part("measure"):
         say("4/5  Measuring on the held-out views")
@@ -210,14 +218,14 @@ def _measure(
 
 
 class _Clock:
-    """Seconds by part."""
+    """Measures wall time; ``seconds`` holds the seconds of each part by name."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Time the block."""
+        """Time the block as the part of this name."""
         started = time.perf_counter()
         yield
         self.seconds[name] = round(time.perf_counter() - started, 3)

@@ -1,4 +1,4 @@
-"""The demo's folder: a marker in it lists what the demo wrote, and nothing else is ever deleted."""
+"""The demo's folder. A marker lists the files that a demo wrote; only these are ever deleted."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from fragprune_plugins.errors import OutputError
 from fragprune_plugins.storage.atomic import digest, replacing, writable_folder
 
 MARKER = ".fragprune-demo"
-"""JSON: "files", the SHA-256 of each file that the demo wrote, by its path in the folder."""
+"""JSON with "files": SHA-256 of each file that the demo wrote, by path in the folder."""
 
-_REMEDY = "Choose another --out, or move away what you want to keep and delete the rest yourself."
+_REMEDY = "Choose another --out, or move your files away and delete the others yourself."
 
 
 def clear(out: Path) -> None:
-    """Make the folder, or empty it of an earlier demo, whose checkpoints would be taken up again.
+    """Make the folder, or delete an earlier demo's files, from which training would resume.
 
-    Files whose names begin with a dot, as file managers leave them, neither count nor go.
+    Files whose names begin with a dot, such as those of file managers, are ignored and kept.
 
     Raises:
-        OutputError: it cannot be written, or holds a file that no demo wrote or that was changed
-            since; nothing is deleted then.
+        OutputError: the folder cannot be written, or holds a file that no demo wrote or that was
+            changed since. Then nothing is deleted.
     """
     writable_folder(out)
     ours, found = _listed(out), _files(out)
@@ -36,16 +36,20 @@ def clear(out: Path) -> None:
         path.unlink()
     for folder in sorted({up for path in found.values() for up in path.parents}, reverse=True):
         if folder.is_relative_to(out) and folder != out:
-            with contextlib.suppress(OSError):  # a hidden file is in it
+            with contextlib.suppress(OSError):  # the folder holds a hidden file
                 folder.rmdir()
     _list(out, {})
 
 
 @contextlib.contextmanager
 def claiming(out: Path, *names: str) -> Iterator[None]:
-    """The demo writes files and folders of these names in the block: they are its own afterwards.
+    """After the block, list files and folders with these names in the marker.
 
-    Also when the block fails, so that the next demo may delete them.
+    This happens also if the block fails, so that the next demo can delete them.
+
+    Args:
+        out: the demo's folder.
+        names: names in ``out`` that the block writes.
     """
     try:
         yield
@@ -57,7 +61,7 @@ def claiming(out: Path, *names: str) -> Iterator[None]:
 
 
 def _files(out: Path) -> dict[str, Path]:
-    """All that is not a folder and not hidden, by its path in ``out``; links are not followed."""
+    """All files that are not hidden, by path in ``out``; links count as files."""
     found = {p.relative_to(out).as_posix(): p for p in out.rglob("*")}
     return {
         name: path
@@ -68,7 +72,7 @@ def _files(out: Path) -> dict[str, Path]:
 
 
 def _listed(out: Path) -> dict[str, str]:
-    """What the marker says; nothing where there is none, or a broken one."""
+    """SHA-256 by path, as the marker lists them; {} if the marker is missing or broken."""
     try:
         files = json.loads((out / MARKER).read_text(encoding="utf-8"))["files"]
         return {str(name): str(sha) for name, sha in files.items()}

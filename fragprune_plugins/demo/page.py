@@ -1,4 +1,4 @@
-"""The demo's page: its own words around what every report shows."""
+"""Writes the demo's page from the parts of every report and an introduction."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 from fragprune_plugins.storage.atomic import replacing
 
 _INTRODUCTION = """A small training repository learned this room from ray-traced photographs. Then
-every Gaussian learned how far it reaches; what lies beyond is neither sorted nor blended. No line
-of the repository was changed. Drag the sliders: left of the handle before, right of it after;
-beside it the photograph, which neither has seen."""
+every Gaussian learned how far it reaches; fragments beyond that are neither sorted nor blended. No
+line of the repository was changed. Drag the sliders: the model before is left of the handle, the
+model after is right of it. Beside them is the photograph, from which neither model learned."""
 
 _YOUR_OWN = """fragprune run -- python train.py -s scene -m out
 fragprune finetune point_cloud.ply --data scene --out pruned.ply"""
@@ -24,15 +24,18 @@ def write_page(
     engine: str,
     device: str,
 ) -> list[str]:
-    """Write ``pictures/`` and ``index.html``; returns the files, relative to ``out``.
+    """Write ``pictures/`` and ``index.html``.
 
     Args:
         out: the demo's folder.
-        report: as measured.
-        scene: the photographs.
-        curves: of the run.
-        engine: what draws.
-        device: where.
+        report: the measurements.
+        scene: folder of the photographs.
+        curves: the run's learning curves, one dict per step.
+        engine: name of the engine that draws.
+        device: device of the models.
+
+    Returns:
+        The files as paths relative to ``out``.
     """
     from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.measure import Candidate, report_page

@@ -1,4 +1,4 @@
-"""The demo's still life: the corner of a room, with fine poles, sharp shadows and real textures."""
+"""The demo's room: a corner with a still life, thin poles, sharp shadows and real textures."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from fragprune_plugins.demo.textures import (
 from fragprune_plugins.demo.tracer import Ball, Box, Material, Pole, Shape, World
 
 CENTRE = (-0.15, -0.15, 0.6)
-"""What the cameras look at, world units; z is up."""
+"""The point at which the cameras look, in world units; z is up."""
 
-_TEXELS = 192  # per repeat: about what the views resolve, so that nothing shimmers
+_TEXELS = 192  # per repeat: about the resolution of the views, so that nothing shimmers
 
 
 def furnish(seed: int = 0) -> World:
-    """The room; the seed varies grain, stains and the order of the books."""
+    """Build the room; the seed varies grain, stains and the order of the books."""
     rng = np.random.default_rng(seed)
     wood = planks(_TEXELS, rng)
     brick = photograph("brick.png", _TEXELS, rng).transpose(1, 0, 2)  # courses lie flat
@@ -126,7 +126,7 @@ def _floor_things(wood: Texture, brick: Texture, rng: np.random.Generator) -> li
 
 
 def _screen() -> list[Shape]:
-    """A railing of thin poles: the sharpest thing in the room, and its shadow."""
+    """A railing of thin poles, the finest shapes in the room."""
     rod, start, step = _paint(0.95, 0.93, 0.88), np.array([-1.0, 1.2]), np.array([0.1, 0.045])
     shapes: list[Shape] = []
     for index in range(10):

@@ -1,4 +1,4 @@
-"""Posed photographs of the demo room, as a COLMAP dataset in text form."""
+"""Makes posed photographs of the demo room, as a COLMAP data set in text form."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from fragprune_plugins.storage.atomic import replacing, writable_folder
 
 @dataclass(frozen=True)
 class Photo:
-    """One camera.
+    """The camera of one photograph.
 
     Attributes:
-        name: of the image file.
-        width: pixels.
-        height: pixels.
-        focal: pixels, the same both ways; the principal point is the image's centre.
-        rotation: (3, 3) world to camera, x right, y down, z forward.
-        translation: (3,).
+        name: name of the image file.
+        width: width in pixels.
+        height: height in pixels.
+        focal: focal length in pixels, in x and y; the principal point is the image's centre.
+        rotation: (3, 3) world to camera; x right, y down, z forward.
+        translation: (3,) world to camera.
     """
 
     name: str
@@ -39,12 +39,12 @@ class Photo:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """(3,) where the camera stands."""
+        """(3,) position of the camera in the world."""
         centre: NDArray[np.float64] = -self.rotation.T @ self.translation
         return centre
 
     def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Pixel coordinates (n, 2), centres at half integers, and depths (n,) of points (n, 3)."""
+        """Pixel coordinates (n, 2) and depths (n,) of points (n, 3); pixel centres end in .5."""
         local = points @ self.rotation.T + self.translation
         flat = local[:, :2] / local[:, 2:] * self.focal
         return flat + np.array([self.width / 2, self.height / 2]), local[:, 2]
@@ -59,15 +59,15 @@ class Photo:
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """How much scene to make.
+    """Settings of a scene.
 
     Attributes:
-        views: photographs.
-        width: pixels.
-        height: pixels.
-        supersample: rays per pixel are this number squared.
-        points: surface points, what COLMAP would have triangulated.
-        seed: of textures, cameras and points.
+        views: number of photographs.
+        width: width in pixels.
+        height: height in pixels.
+        supersample: square root of the number of rays per pixel.
+        points: number of surface points, which stand for COLMAP's triangulated points.
+        seed: seed of textures, cameras and points.
     """
 
     views: int = 56
@@ -79,10 +79,10 @@ class SceneSettings:
 
 
 def photos(settings: SceneSettings) -> list[Photo]:
-    """Cameras on a quarter of a sphere around the still life, evenly spread in every order.
+    """Cameras on a quarter of a sphere around the still life.
 
-    An additive low-discrepancy sequence whose every eighth element is one as well, so that the
-    held-out views cover the arc too.
+    The positions are an additive low-discrepancy sequence. Every eighth position, a held-out view,
+    is such a sequence too, so held-out views cover the same arc.
     """
     rng = np.random.default_rng([settings.seed, 1])
     focal = settings.width / 2 / math.tan(math.radians(29))
@@ -115,7 +115,7 @@ def photos(settings: SceneSettings) -> list[Photo]:
 
 
 def photograph(world: World, photo: Photo, supersample: int) -> NDArray[np.uint8]:
-    """The picture (height, width, 3), box-filtered over supersample^2 rays a pixel."""
+    """The picture (height, width, 3), with a box filter over supersample^2 rays per pixel."""
     n = supersample
     x = (np.arange(photo.width * n) + 0.5) / n
     y = (np.arange(photo.height * n) + 0.5) / n
@@ -129,7 +129,7 @@ def photograph(world: World, photo: Photo, supersample: int) -> NDArray[np.uint8
 def surface_points(
     world: World, cameras: list[Photo], count: int, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points (n, 3) that the cameras see and their colours (n, 3), evenly over all pixels."""
+    """Points (n, 3) that the cameras see, spread evenly over pixels, and their colours (n, 3)."""
     rng = np.random.default_rng([seed, 2])
     positions, colours = [], []
     for index, photo in enumerate(cameras):
@@ -150,12 +150,12 @@ def make_scene(
     settings: SceneSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Photo]:
-    """Write ``images/`` and ``sparse/0/`` in COLMAP's text form, and its points as PLY too.
+    """Write ``images/`` and ``sparse/0/`` in COLMAP's text form, and the points also as PLY.
 
     Args:
-        folder: where to; made if need be.
-        settings: how much.
-        progress: told after each photograph how many of how many are done.
+        folder: folder of the scene; made if it is missing.
+        settings: the scene's settings; None for the defaults.
+        progress: called with (done, total) after each photograph.
 
     Returns:
         The cameras, in the order of their names.
@@ -198,7 +198,7 @@ def _cameras_text(photo: Photo) -> str:
 
 
 def _images_text(cameras: list[Photo]) -> str:
-    """Two lines an image; the second, its 2D points, stays empty."""
+    """Two lines for each image; the second line, for 2D points, is empty."""
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] (none)"]
     for number, photo in enumerate(cameras, start=1):
         numbers = [*quaternion(photo.rotation), *photo.translation]
@@ -231,7 +231,7 @@ def _write_point_cloud(path: Path, points: NDArray[np.float64], colours: NDArray
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) w, x, y, z of a rotation matrix, w not negative."""
+    """Quaternion (4,) w, x, y, z of a rotation matrix (3, 3), with w >= 0."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)

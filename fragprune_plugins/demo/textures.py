@@ -1,4 +1,4 @@
-"""Textures of the demo room: photographs from scikit-image's wheel, or seeded noise."""
+"""Makes textures of the demo room from scikit-image's photographs and from seeded noise."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 Texture = NDArray[np.float32]
-"""(H, W, 3) linear RGB, wraps around."""
+"""(H, W, 3) linear RGB that wraps around."""
 
 
 def linear(srgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Display values to linear light, by a plain power: both directions are exact inverses."""
+    """Convert display values to linear light by a power of 2.2; ``displayed`` is the inverse."""
     return np.power(srgb, np.float32(2.2))
 
 
 def displayed(light: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Linear light to display values in [0, 1]."""
+    """Convert linear light to display values in [0, 1]."""
     return np.power(np.clip(light, 0, 1), np.float32(1 / 2.2))
 
 
@@ -27,9 +27,9 @@ def colour(red: float, green: float, blue: float) -> Texture:
 
 
 def photograph(name: str, size: int, rng: np.random.Generator) -> Texture:
-    """A photograph from scikit-image's wheel, (size, size, 3); noise where the wheel lacks it.
+    """A photograph from scikit-image's package, (size, size, 3); noise if the file is missing.
 
-    Only the file in the installation is read; nothing is fetched.
+    It reads the installed file and downloads nothing.
     """
     import skimage
     from PIL import Image
@@ -46,7 +46,7 @@ def photograph(name: str, size: int, rng: np.random.Generator) -> Texture:
 
 
 def noise(size: int, rng: np.random.Generator, contrast: float = 0.5) -> Texture:
-    """Fractal noise around 1, (size, size, 3) grey, seamless."""
+    """Seamless grey fractal noise around 1, (size, size, 3)."""
     total = np.zeros((size, size), dtype=np.float32)
     cells, weight = 4, 1.0
     while cells <= size:
@@ -58,13 +58,13 @@ def noise(size: int, rng: np.random.Generator, contrast: float = 0.5) -> Texture
 
 
 def planks(size: int, rng: np.random.Generator, count: int = 6) -> Texture:
-    """Wooden boards along the first axis, with grain, knots' worth of waviness and dark joints."""
+    """Wooden boards along the first axis, with wavy grain and dark joints, (size, size, 3)."""
     v, u = np.mgrid[0:size, 0:size].astype(np.float32) / size
     board = np.floor(u * count).astype(int)
     shade = rng.uniform(0.7, 1.15, count).astype(np.float32)[board]
     wave = noise(size, rng, 1.0)[..., 0] - 1
     shift = rng.uniform(0, 1, count).astype(np.float32)[board]
-    # Grain of a whole number of periods: seamless along the board.
+    # A whole number of periods makes the grain seamless along the board.
     along = np.sin(2 * np.pi * (v + shift))
     grain = 0.88 + 0.12 * np.sin(2 * np.pi * (u * count * 5 + 0.5 * along + 1.5 * wave))
     across = u * count - board
@@ -76,7 +76,7 @@ def planks(size: int, rng: np.random.Generator, count: int = 6) -> Texture:
 
 
 def stripes(size: int, colours: list[Texture], rng: np.random.Generator) -> Texture:
-    """Equal woven stripes across the first axis."""
+    """Woven stripes of equal width across the first axis, (size, size, 3)."""
     index = np.arange(size) * len(colours) // size
     rows = np.stack([c[0, 0] for c in colours])[index]
     cloth: Texture = rows[:, None, :] * noise(size, rng, 0.45)
@@ -84,7 +84,7 @@ def stripes(size: int, colours: list[Texture], rng: np.random.Generator) -> Text
 
 
 def checker(size: int, first: Texture, second: Texture, count: int = 2) -> Texture:
-    """Squares, ``count`` a side (even, so that they continue when the texture wraps)."""
+    """A chequerboard (size, size, 3) of ``count`` squares a side; an even count wraps around."""
     cell = np.arange(size) * count // size
     odd = ((cell[:, None] + cell[None, :]) % 2).astype(bool)
     squares: Texture = np.where(odd[..., None], first[0, 0], second[0, 0])
@@ -92,7 +92,7 @@ def checker(size: int, first: Texture, second: Texture, count: int = 2) -> Textu
 
 
 def sample(texture: Texture, u: NDArray[np.float32], v: NDArray[np.float32]) -> Texture:
-    """Bilinear look-up at u (right) and v (up), one repeat per unit; returns (n, 3)."""
+    """Sample (n, 3) bilinearly at u (n,) to the right and v (n,) up; a repeat is one unit."""
     height, width = texture.shape[:2]
     if height == width == 1:
         return np.broadcast_to(texture[0, 0], (len(u), 3))
@@ -109,7 +109,7 @@ def sample(texture: Texture, u: NDArray[np.float32], v: NDArray[np.float32]) -> 
 
 
 def _enlarge(grid: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Resample a wrapping grid to (size, size), smoothly."""
+    """Resample a grid that wraps around to (size, size) with smooth interpolation."""
     at = np.arange(size) / size * len(grid)
     low = np.floor(at).astype(int)
     part = (at - low).astype(np.float32)

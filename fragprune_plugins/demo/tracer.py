@@ -1,7 +1,7 @@
-"""A small ray caster: boxes, balls and poles, one sun, hard shadows. Vectorised over rays.
+"""A small ray caster for boxes, balls and poles under one sun, with hard shadows.
 
-Rays are kept as (3, n) float32, coordinate first; every shape is intersected with all rays at
-once, which numpy does without holding the interpreter, so views trace in parallel threads.
+Rays are (3, n) float32, coordinate first. Each shape is intersected with all rays at once. numpy
+releases the interpreter's lock meanwhile, so several threads can trace views in parallel.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ _SKIN = np.float32(1e-3)  # a shadow ray starts this far off the surface, world 
 
 
 def times(matrix: Array, rays: Array) -> Array:
-    """``matrix @ rays``, (m, 3) or (3,) by (3, n), without BLAS: its threads would fight ours."""
+    """``matrix @ rays``, (m, 3) or (3,) by (3, n), without BLAS and its many threads."""
     product: Array = np.einsum("...j,jn->...n", matrix, rays)
     return product
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a surface looks like.
+    """The look of a surface.
 
     Attributes:
-        texture: linear RGB.
+        texture: (H, W, 3) linear RGB.
         repeat: world units per repeat; 0 stretches the texture once over each face.
         gloss: strength of the sun's highlight; 0 is matt.
-        glow: light given off, times the texture.
+        glow: additional brightness, as a factor of the texture.
     """
 
     texture: Texture
@@ -43,17 +43,17 @@ class Material:
 
 
 class Shape(Protocol):
-    """Something rays hit."""
+    """A shape that rays can hit."""
 
     @property
     def material(self) -> Material:
-        """What it looks like."""
+        """The look of the surface."""
 
     def bound(self) -> tuple[Array, float]:
-        """A ball that holds the shape: its centre (3,) and radius."""
+        """Centre (3,) and radius of a ball that contains the shape."""
 
     def distance(self, origin: Array, direction: Array) -> Array:
-        """Where rays (3, n) enter the shape, (n,); FAR where they miss it."""
+        """Distance (n,) at which rays (3, n) enter the shape; FAR for rays that miss it."""
 
     def surface(self, point: Array) -> tuple[Array, Array, Array]:
         """Normal (3, n) and texture coordinates u (n,), v (n,) of points on the surface."""
@@ -61,13 +61,13 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class Box:
-    """A cuboid turned about the vertical.
+    """A cuboid, rotated about the vertical.
 
     Attributes:
-        centre: (x, y, z).
-        half: half the edges.
-        material: of all six faces.
-        yaw: degrees.
+        centre: (x, y, z) in world units.
+        half: half of each edge in world units.
+        material: look of all six faces.
+        yaw: angle of the rotation in degrees.
     """
 
     centre: tuple[float, float, float]
@@ -85,11 +85,11 @@ class Box:
         return times(self._turn, point - np.array(self.centre, dtype=np.float32)[:, None])
 
     def bound(self) -> tuple[Array, float]:
-        """The ball through the corners."""
+        """Centre (3,) and radius of the ball through the corners."""
         return np.array(self.centre, dtype=np.float32), float(np.linalg.norm(self.half))
 
     def distance(self, origin: Array, direction: Array) -> Array:
-        """Slab test."""
+        """Distance (n,) by the slab test; FAR for rays that miss the box."""
         start, half = self._local(origin), np.array(self.half, dtype=np.float32)[:, None]
         ray = times(self._turn, direction)
         inverse = 1 / np.where(np.abs(ray) < 1e-9, np.float32(1e-9), ray)
@@ -98,14 +98,14 @@ class Box:
         return np.where((enter < leave) & (enter > 0), enter, FAR)
 
     def surface(self, point: Array) -> tuple[Array, Array, Array]:
-        """The face is the one whose plane is nearest."""
+        """Normal (3, n) and texture coordinates u, v of the nearest face."""
         local, half = self._local(point), np.array(self.half, dtype=np.float32)[:, None]
         axis = np.argmin(np.abs(np.abs(local) - half), axis=0)
         every = np.arange(point.shape[1])
         sign = np.sign(local[axis, every])
         normal = np.zeros_like(local)
         normal[axis, every] = sign
-        # Upright texture on the sides, seen from above on the top.
+        # The texture is upright on the sides, and seen from above on the top.
         across, up = np.where(axis == 0, 1, 0), np.where(axis == 2, 1, 2)
         mirror = np.where(axis == 0, sign, np.where(axis == 1, -sign, 1.0))
         u, v = local[across, every] * mirror, local[up, every]
@@ -122,9 +122,9 @@ class Ball:
     """A sphere.
 
     Attributes:
-        centre: (x, y, z).
-        radius: world units.
-        material: wrapped twice around, once from pole to pole.
+        centre: (x, y, z) in world units.
+        radius: radius in world units.
+        material: the look; its texture repeats twice around, and once from pole to pole.
     """
 
     centre: tuple[float, float, float]
@@ -132,11 +132,11 @@ class Ball:
     material: Material
 
     def bound(self) -> tuple[Array, float]:
-        """The ball itself."""
+        """Centre (3,) and radius of the ball."""
         return np.array(self.centre, dtype=np.float32), self.radius
 
     def distance(self, origin: Array, direction: Array) -> Array:
-        """Nearest root of the quadratic; directions are unit vectors."""
+        """Distance (n,) by the quadratic's nearest root; directions are unit vectors."""
         start = origin - np.array(self.centre, dtype=np.float32)[:, None]
         b = (start * direction).sum(axis=0)
         c = (start * start).sum(axis=0) - np.float32(self.radius**2)
@@ -145,7 +145,7 @@ class Ball:
         return np.where((inside > 0) & (t > 0), t, FAR)
 
     def surface(self, point: Array) -> tuple[Array, Array, Array]:
-        """Longitude and latitude."""
+        """Normal (3, n), and longitude and latitude as u, v."""
         normal = (point - np.array(self.centre, dtype=np.float32)[:, None]) / self.radius
         u = np.arctan2(normal[1], normal[0]) / np.pi
         v = np.arcsin(np.clip(normal[2], -1, 1)) / np.pi
@@ -154,13 +154,13 @@ class Ball:
 
 @dataclass(frozen=True)
 class Pole:
-    """A cylinder without caps, of any direction.
+    """A cylinder without caps, in any direction.
 
     Attributes:
-        start: one end.
-        end: the other end.
-        radius: world units.
-        material: ``repeat`` world units per repeat along it, once around.
+        start: (x, y, z) of one end.
+        end: (x, y, z) of the other end.
+        radius: radius in world units.
+        material: the look; its texture repeats every ``repeat`` units along, and once around.
     """
 
     start: tuple[float, float, float]
@@ -175,12 +175,12 @@ class Pole:
         return base, along / length, length
 
     def bound(self) -> tuple[Array, float]:
-        """The ball around the middle."""
+        """Centre (3,) and radius of a ball around the middle."""
         base, axis, length = self._axis()
         return (base + axis * (length / 2))[:, 0], float(length) / 2 + self.radius
 
     def distance(self, origin: Array, direction: Array) -> Array:
-        """The quadratic in the plane across the axis, then a test of the height."""
+        """Distance (n,) by the quadratic across the axis and a test of the height."""
         base, axis, length = self._axis()
         start = origin - base
         rise, height = (direction * axis).sum(axis=0), (start * axis).sum(axis=0)
@@ -194,7 +194,7 @@ class Pole:
         return np.where((inside > 0) & (t > 0) & (at > 0) & (at < length), t, FAR)
 
     def surface(self, point: Array) -> tuple[Array, Array, Array]:
-        """Angle around and way along."""
+        """Normal (3, n), and the angle and the height along the axis as u, v."""
         base, axis, _ = self._axis()
         height = ((point - base) * axis).sum(axis=0)
         normal = (point - base - axis * height) / self.radius
@@ -207,11 +207,11 @@ class World:
     """Shapes under a sun.
 
     Attributes:
-        shapes: in any order.
-        sun: (3,) unit vector towards it.
-        sun_colour: linear RGB.
-        sky_colour: ambient light from above, linear RGB.
-        ground_colour: ambient light from below, linear RGB.
+        shapes: the shapes, in any order.
+        sun: (3,) unit vector towards the sun.
+        sun_colour: (3,) linear RGB.
+        sky_colour: (3,) ambient light from above, linear RGB.
+        ground_colour: (3,) ambient light from below, linear RGB.
     """
 
     shapes: tuple[Shape, ...]
@@ -221,10 +221,10 @@ class World:
     ground_colour: Array
 
     def hit(self, origin: Array, direction: Array) -> tuple[Array, NDArray[np.int32]]:
-        """Where rays (3, n) from one point (3, 1) end.
+        """Trace rays (3, n) from one point (3, 1) to the first surface.
 
         Returns:
-            Distance to the first surface (n,), and which shape it is (n,), -1 for none.
+            Distances (n,), FAR for none, and indices of the shapes (n,), -1 for none.
         """
         nearest = np.full(direction.shape[1], FAR, dtype=np.float32)
         which = np.full(direction.shape[1], -1, dtype=np.int32)
@@ -240,7 +240,7 @@ class World:
         return nearest, which
 
     def colour(self, origin: Array, direction: Array) -> Array:
-        """Linear RGB (3, n) that rays (3, n) from one point (3, 1) see; sky where they miss."""
+        """Linear RGB (3, n) along rays (3, n) from one point (3, 1); the sky if nothing is hit."""
         t, which = self.hit(origin, direction)
         seen = np.repeat(self.sky_colour[:, None], direction.shape[1], axis=1)
         drawn = np.flatnonzero(which >= 0)
@@ -250,7 +250,7 @@ class World:
         return seen
 
     def shade(self, point: Array, which: NDArray[np.int32], ray: Array) -> Array:
-        """Linear RGB (3, n) of surface points, seen along ray (3, n)."""
+        """Linear RGB (3, n) of surface points (3, n) of shapes (n,), seen along ``ray`` (3, n)."""
         normal, albedo, extra = np.empty_like(point), np.empty_like(point), np.empty_like(point)
         for index in np.unique(which):
             mine, shape = which == index, self.shapes[index]
@@ -271,8 +271,10 @@ class World:
         return seen
 
     def shadowed(self, point: Array) -> NDArray[np.bool_]:
-        """Whether anything stands between the points (3, n) and the sun."""
-        across = np.linalg.svd(self.sun[None])[2][1:]  # the plane that the sun sees, (2, 3)
+        """(n,) bool: whether a shape is between the points (3, n) and the sun."""
+        across = np.linalg.svd(self.sun[None])[2][
+            1:
+        ]  # (2, 3): the plane across the sun's direction
         flat = times(across, point)
         dark = np.zeros(point.shape[1], dtype=bool)
         for shape in self.shapes:

@@ -13,7 +13,7 @@ from utils.general_utils import safe_state
 
 
 def render_set(model_path, name, iteration, views, gaussians, pipeline, background):
-    """One folder of renders and one of photographs, numbered alike."""
+    """Write a folder of renders and a folder of photographs, with the same numbers."""
     folder = Path(model_path) / name / f"ours_{iteration}"
     for index, view in enumerate(tqdm(views, desc=f"Rendering {name}")):
         image = render(view, gaussians, pipeline, background)["render"]
@@ -22,7 +22,7 @@ def render_set(model_path, name, iteration, views, gaussians, pipeline, backgrou
 
 
 def render_sets(dataset, iteration, pipeline, skip_train, skip_test):
-    """Both sets of views."""
+    """Render the training views and the test views."""
     with torch.no_grad():
         gaussians = GaussianModel(dataset.sh_degree)
         scene = Scene(dataset, gaussians, load_iteration=iteration, shuffle=False)
@@ -35,7 +35,7 @@ def render_sets(dataset, iteration, pipeline, skip_train, skip_test):
 
 
 def write(image, path):
-    """Save (3, H, W) in [0, 1]."""
+    """Save an image (3, H, W) with values in [0, 1]."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = (image.clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0)
     Image.fromarray(pixels.cpu().numpy()).save(path)

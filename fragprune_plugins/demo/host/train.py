@@ -24,7 +24,7 @@ def training(
     checkpoint,
     debug_from,
 ):
-    """The loop. Iterations count from 1; the last one takes no step."""
+    """Run the training loop. Iterations count from 1, and the last one takes no step."""
     first_iter = 0
     prepare_output_and_logger(dataset)
     gaussians = GaussianModel(dataset.sh_degree)
@@ -74,7 +74,7 @@ def training(
 
 
 def densify(iteration, opt, dataset, gaussians, scene, package):
-    """Gather statistics; now and then clone, split, prune, or reset opacities."""
+    """Gather statistics, and at intervals clone, split, prune, or reset opacities."""
     seen, radii = package["visibility_filter"], package["radii"]
     gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
     gaussians.add_densification_stats(package["viewspace_points"], seen)
@@ -88,14 +88,14 @@ def densify(iteration, opt, dataset, gaussians, scene, package):
 
 
 def prepare_output_and_logger(args):
-    """Make the model's folder and leave the options in it."""
+    """Make the model's folder and write the options into it."""
     args.model_path = args.model_path or "output"
     Path(args.model_path).mkdir(parents=True, exist_ok=True)
     (Path(args.model_path) / "cfg_args").write_text(str(Namespace(**vars(args))))
 
 
 def training_report(iteration, testing_iterations, scene, renderFunc, renderArgs):
-    """At the testing iterations, say how good the held-out views are."""
+    """At the testing iterations, print the PSNR of the held-out views."""
     cameras = scene.getTestCameras()
     if iteration not in testing_iterations or not cameras:
         return

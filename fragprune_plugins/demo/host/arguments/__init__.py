@@ -8,7 +8,7 @@ from pathlib import Path
 class ParamGroup:
     """Turns the attributes set before ``super().__init__`` into flags.
 
-    A leading underscore gives the flag its first letter as a shorthand as well.
+    An attribute with a leading underscore also gets its first letter as a short flag.
     """
 
     def __init__(self, parser: ArgumentParser, title: str, fill_none: bool = False):
@@ -23,13 +23,13 @@ class ParamGroup:
                 group.add_argument(*flags, default=default, type=type(value))
 
     def extract(self, args: Namespace) -> Namespace:
-        """Only this group's options."""
+        """A namespace of this group's options."""
         names = {key.removeprefix("_") for key in vars(self)}
         return Namespace(**{key: value for key, value in vars(args).items() if key in names})
 
 
 class ModelParams(ParamGroup):
-    """Where the data are and what is made of them."""
+    """Options of the data and the model's folder."""
 
     def __init__(self, parser: ArgumentParser, sentinel: bool = False):
         self.sh_degree = 3
@@ -43,14 +43,14 @@ class ModelParams(ParamGroup):
         super().__init__(parser, "Loading", sentinel)
 
     def extract(self, args: Namespace) -> Namespace:
-        """The group, its source folder absolute."""
+        """A namespace of this group's options, with an absolute source folder."""
         group = super().extract(args)
         group.source_path = str(Path(group.source_path).resolve())
         return group
 
 
 class PipelineParams(ParamGroup):
-    """What render() computes in Python."""
+    """Options of render(): the parts to compute in Python."""
 
     def __init__(self, parser: ArgumentParser):
         self.convert_SHs_python = False
@@ -83,7 +83,7 @@ class OptimizationParams(ParamGroup):
 
 
 def get_combined_args(parser: ArgumentParser) -> Namespace:
-    """The options a model was trained with (its cfg_args), overlaid with those given now."""
+    """The options of a model's training (its cfg_args), overridden by those of the command."""
     given = parser.parse_args()
     call = ast.parse((Path(given.model_path) / "cfg_args").read_text(), mode="eval").body
     merged = {word.arg: ast.literal_eval(word.value) for word in call.keywords}

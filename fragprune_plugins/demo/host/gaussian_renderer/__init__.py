@@ -1,4 +1,4 @@
-"""One view of the model."""
+"""Draws one view of the model."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The photographs, and the model's place on disk."""
+"""The photographs, and the model's folder."""
 
 import json
 import random
@@ -47,11 +47,11 @@ class Scene:
         self.gaussians.save_ply(self._ply(iteration))
 
     def getTrainCameras(self, scale=1.0):  # noqa: N802 - the name callers use
-        """The views to train on."""
+        """The training views."""
         return self.train_cameras[scale]
 
     def getTestCameras(self, scale=1.0):  # noqa: N802 - the name callers use
-        """The views held out: every eighth, when evaluating."""
+        """The held-out views: every eighth with ``--eval``, else none."""
         return self.test_cameras[scale]
 
     def _ply(self, iteration):

@@ -1,4 +1,4 @@
-"""A photograph and where it was taken."""
+"""A photograph and its camera."""
 
 import numpy as np
 import torch
@@ -21,5 +21,5 @@ class Camera:
 
     @property
     def position(self):
-        """(3,) in the world."""
+        """Position (3,) of the camera in the world."""
         return -self.R.T @ np.asarray(self.T)

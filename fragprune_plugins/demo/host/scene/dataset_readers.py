@@ -1,4 +1,4 @@
-"""COLMAP's text files."""
+"""Reads COLMAP's text files."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from scene.cameras import Camera
 
 
 def read_cameras(args):
-    """Every photograph with its camera, sorted by name."""
+    """Read every photograph with its camera, sorted by name."""
     sparse = Path(args.source_path) / "sparse" / "0"
     lenses = {}
     for fields in map(str.split, _lines(sparse / "cameras.txt")):
@@ -42,7 +42,7 @@ def read_cameras(args):
 
 
 def read_points(args):
-    """The sparse reconstruction."""
+    """Read the points of the sparse reconstruction."""
     lines = _lines(Path(args.source_path) / "sparse" / "0" / "points3D.txt")
     table = np.array([[float(x) for x in line.split()[1:7]] for line in lines])
     return BasicPointCloud(table[:, :3], table[:, 3:] / 255, np.zeros_like(table[:, :3]))

@@ -20,7 +20,7 @@ class GaussianModel:
     """N Gaussians; the underscored tensors are raw, the ``get_`` properties activated."""
 
     def setup_functions(self):
-        """Activations and their inverses."""
+        """Set the activations and their inverses."""
         self.scaling_activation, self.scaling_inverse_activation = torch.exp, torch.log
         self.opacity_activation, self.inverse_opacity_activation = torch.sigmoid, inverse_sigmoid
         self.rotation_activation = nn.functional.normalize
@@ -36,7 +36,7 @@ class GaussianModel:
         self.setup_functions()
 
     def capture(self):
-        """Everything that training goes on from: 12 entries."""
+        """The 12 entries of a checkpoint, from which training resumes."""
         return (
             self.active_sh_degree,
             self._xyz,
@@ -53,7 +53,7 @@ class GaussianModel:
         )
 
     def restore(self, model_args, training_args):
-        """Take up what ``capture`` returned."""
+        """Restore the entries that ``capture`` returned."""
         (
             self.active_sh_degree,
             self._xyz,
@@ -94,21 +94,21 @@ class GaussianModel:
 
     @property
     def get_opacity(self):
-        """(N, 1) in (0, 1)."""
+        """Opacities (N, 1) in (0, 1)."""
         return self.opacity_activation(self._opacity)
 
     def get_covariance(self, scaling_modifier=1):
-        """Upper triangles (N, 6)."""
+        """Upper triangles (N, 6) of the covariances."""
         return self.covariance_activation(self.get_scaling, scaling_modifier, self._rotation)
 
     def oneupSHdegree(self):  # noqa: N802 - the name callers use
-        """Use one more band."""
+        """Use one more band of SH, up to the maximum."""
         self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)
 
     # Birth ----------------------------------------------------------------------------------
 
     def create_from_pcd(self, pcd, spatial_lr_scale: float):
-        """One round Gaussian a point, as wide as the way to its neighbours."""
+        """Make one round Gaussian for each point, as wide as the distance to its neighbours."""
         self.spatial_lr_scale = spatial_lr_scale
         points = torch.tensor(np.asarray(pcd.points)).float().cuda()
         colours = RGB2SH(torch.tensor(np.asarray(pcd.colors)).float().cuda())
@@ -129,7 +129,7 @@ class GaussianModel:
         self.max_radii2D = torch.zeros(n, device="cuda")
 
     def training_setup(self, training_args):
-        """A new optimizer: one group a tensor."""
+        """Make a new optimizer with one group for each tensor."""
         self.percent_dense = training_args.percent_dense
         self._reset_statistics()
         rates = {
@@ -149,7 +149,7 @@ class GaussianModel:
         )
 
     def update_learning_rate(self, iteration):
-        """Set the positions' learning rate; returns it."""
+        """Set and return the learning rate of the positions."""
         rate = self.xyz_scheduler_args(iteration)
         for group in self.optimizer.param_groups:
             if group["name"] == "xyz":
@@ -159,7 +159,7 @@ class GaussianModel:
     # Files ----------------------------------------------------------------------------------
 
     def construct_list_of_attributes(self):
-        """The PLY's columns, in order."""
+        """Names of the PLY's columns, in order."""
         counts = {
             "f_dc_": self._features_dc[0].numel(),
             "f_rest_": self._features_rest[0].numel(),
@@ -173,7 +173,7 @@ class GaussianModel:
         return names
 
     def save_ply(self, path):
-        """Write the raw tensors; colours channel by channel."""
+        """Write the raw tensors as PLY; SH go channel by channel."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         columns = [
             self._xyz,
@@ -191,7 +191,7 @@ class GaussianModel:
         PlyData([PlyElement.describe(rows, "vertex")]).write(path)
 
     def load_ply(self, path):
-        """Read what ``save_ply`` wrote."""
+        """Read a PLY that ``save_ply`` wrote."""
         vertex = PlyData.read(path)["vertex"]
         names = [p.name for p in vertex.properties]
 
@@ -246,7 +246,7 @@ class GaussianModel:
         return group["params"][0]
 
     def replace_tensor_to_optimizer(self, tensor, name):
-        """New values for one group, moments zeroed."""
+        """Replace the values of one group and zero its moments."""
         return {
             group["name"]: self._replace(group, tensor, torch.zeros_like)
             for group in self.optimizer.param_groups
@@ -277,7 +277,7 @@ class GaussianModel:
     # Density control ------------------------------------------------------------------------
 
     def reset_opacity(self):
-        """No Gaussian keeps more than 0.01."""
+        """Lower opacities to at most 0.01."""
         low = inverse_sigmoid(torch.clamp_max(self.get_opacity.detach(), 0.01))
         self._opacity = self.replace_tensor_to_optimizer(low, "opacity")["opacity"]
 
@@ -297,7 +297,7 @@ class GaussianModel:
         new_scaling,
         new_rotation,
     ):
-        """Append Gaussians and start the statistics again."""
+        """Append Gaussians and reset the statistics."""
         new = {
             "xyz": new_xyz,
             "f_dc": new_features_dc,
@@ -311,14 +311,14 @@ class GaussianModel:
         self.max_radii2D = torch.zeros(self.get_xyz.shape[0], device="cuda")
 
     def _needy(self, grads, grad_threshold, scene_extent, large):
-        """Rows that move on the screen and are large, or small; new rows have not moved yet."""
+        """Mask of large (or small) rows with a screen gradient; new rows have no gradient."""
         moved = torch.zeros(self.get_xyz.shape[0], device="cuda")
         moved[: grads.shape[0]] = torch.norm(grads, dim=-1)
         is_large = self.get_scaling.max(dim=1).values > self.percent_dense * scene_extent
         return (moved >= grad_threshold) & (is_large if large else ~is_large)
 
     def densify_and_clone(self, grads, grad_threshold, scene_extent):
-        """Double the small ones."""
+        """Clone the selected small Gaussians."""
         chosen = self._needy(grads, grad_threshold, scene_extent, large=False)
         self.densification_postfix(
             self._xyz[chosen],
@@ -330,7 +330,7 @@ class GaussianModel:
         )
 
     def densify_and_split(self, grads, grad_threshold, scene_extent, N=2):
-        """Replace each large one by N smaller ones, drawn from it."""
+        """Replace each selected large Gaussian by N smaller ones, sampled from it."""
         chosen = self._needy(grads, grad_threshold, scene_extent, large=True)
         spread = self.get_scaling[chosen].repeat(N, 1)
         turn = build_rotation(self._rotation[chosen]).repeat(N, 1, 1)
@@ -347,7 +347,7 @@ class GaussianModel:
         self.prune_points(torch.cat((chosen, children)))
 
     def densify_and_prune(self, max_grad, min_opacity, extent, max_screen_size):
-        """Clone, split, then remove the faint and the huge."""
+        """Clone, split, then remove faint and huge Gaussians."""
         grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
         self.densify_and_clone(grads, max_grad, extent)
         self.densify_and_split(grads, max_grad, extent)
@@ -359,7 +359,7 @@ class GaussianModel:
         torch.cuda.empty_cache()
 
     def add_densification_stats(self, viewspace_point_tensor, update_filter):
-        """Accumulate the screen gradients of what was seen."""
+        """Accumulate screen gradients of the visible Gaussians."""
         moved = torch.norm(viewspace_point_tensor.grad[update_filter, :2], dim=-1, keepdim=True)
         self.xyz_gradient_accum[update_filter] += moved
         self.denom[update_filter] += 1

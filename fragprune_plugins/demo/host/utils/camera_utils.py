@@ -1,11 +1,11 @@
-"""How large photographs are read."""
+"""Chooses the size at which photographs are read."""
 
 LARGEST = 1600
-"""Pixels: wider photographs are shrunk to this width unless a size is asked for."""
+"""Pixels. Wider photographs are reduced to this width unless an option gives the size."""
 
 
 def size_read(picture, args):
-    """Width and height: a small number divides both, -1 leaves the choice, others are a width."""
+    """(width, height) to read: 1, 2, 4 or 8 divide the size, -1 is automatic, others are widths."""
     width, height = picture.size
     if args.resolution in (1, 2, 4, 8):
         return round(width / args.resolution), round(height / args.resolution)

@@ -1,4 +1,4 @@
-"""Activations' inverses, schedules, rotations, seeds."""
+"""Inverse activations, schedules, rotations and seeds."""
 
 import math
 import random
@@ -8,7 +8,7 @@ import torch
 
 
 def inverse_sigmoid(x):
-    """Logit."""
+    """The logit of x, the inverse of the sigmoid."""
     return torch.log(x / (1 - x))
 
 
@@ -44,7 +44,7 @@ def build_covariance(scaling, modifier, quaternions):
 
 
 def safe_state(seed):
-    """Seed everything and choose the device."""
+    """Seed all random generators and choose the device."""
     random.seed(seed)
     np.random.seed(seed)
     torch.manual_seed(seed)

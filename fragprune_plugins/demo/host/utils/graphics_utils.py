@@ -16,7 +16,7 @@ class BasicPointCloud(NamedTuple):
 
 
 def world_to_view(rotation, translation):
-    """(4, 4), transposed, of a world-to-camera rotation (3, 3) and translation (3,)."""
+    """Transposed matrix (4, 4) of a world-to-camera rotation (3, 3) and translation (3,)."""
     matrix = torch.eye(4)
     matrix[:3, :3] = torch.as_tensor(rotation, dtype=torch.float32).T
     matrix[3, :3] = torch.as_tensor(translation, dtype=torch.float32)
@@ -24,7 +24,7 @@ def world_to_view(rotation, translation):
 
 
 def projection(fov_x, fov_y, near=0.01, far=100.0):
-    """(4, 4), transposed: a symmetric frustum, depth mapped to [0, 1]."""
+    """Transposed matrix (4, 4) of a symmetric frustum; it maps depth to [0, 1]."""
     matrix = torch.zeros(4, 4)
     matrix[0, 0] = 1 / math.tan(fov_x / 2)
     matrix[1, 1] = 1 / math.tan(fov_y / 2)

@@ -11,7 +11,7 @@ def l1_loss(image, truth):
 
 
 def psnr(image, truth):
-    """Decibels, of images in [0, 1]."""
+    """Peak signal-to-noise ratio in decibels, of images in [0, 1]."""
     return -10 * torch.log10(((image - truth) ** 2).mean())
 
 
