@@ -272,9 +272,7 @@ class World:
 
     def shadowed(self, point: Array) -> NDArray[np.bool_]:
         """(n,) bool: whether a shape is between the points (3, n) and the sun."""
-        across = np.linalg.svd(self.sun[None])[2][
-            1:
-        ]  # (2, 3): the plane across the sun's direction
+        across = np.linalg.svd(self.sun[None])[2][1:]  # (2, 3): the plane across the sun
         flat = times(across, point)
         dark = np.zeros(point.shape[1], dtype=bool)
         for shape in self.shapes:

@@ -83,7 +83,7 @@ class PatchLedger:
             module, seam, handle = self._wrapped.pop()
             try:
                 wrapt.unwrap_object(module, seam.attribute, handle)
-                if "." not in seam.attribute:  # a method is held by its class alone
+                if "." not in seam.attribute:  # only the class holds a method
                     _rebind(seam.attribute, handle, module)
             except (wrapt.WrapperNotOutermostError, wrapt.WrapperNotFoundError) as error:
                 findings.append(

@@ -58,7 +58,7 @@ def telling(script: Path, root: Path) -> Iterator[None]:
 def host_process(
     script: Path, arguments: list[str], device: str, folder: Path | None = None
 ) -> Iterator[None]:
-    """Inside, argv, the path and devices are those of a fresh interpreter with this command.
+    """Inside, ``sys.argv``, ``sys.path`` and devices are set for the script; then restored.
 
     Args:
         script: the script's file.

@@ -155,7 +155,7 @@ def after_step(session: SessionState, reference: Any, *_: Any) -> None:
 
 
 def on_step(session: SessionState, call: SeamCall) -> Any:
-    """Begin a step when the host sets its learning rate; in stage 2 the adapter may replace it."""
+    """Begin a step of the host; in stage 2 the adapter may choose the value that the host gets."""
     result = call.run()
     state = session.models.get(call.model)
     if state is None or not session.learn:
