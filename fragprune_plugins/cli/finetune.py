@@ -65,11 +65,11 @@ def command(
 ) -> Report:
     """Learn how far each Gaussian of MODEL must reach.
 
-    Thresholds and opacities adapt to each other on the photographs in --data. Positions, shapes
-    and colours stay bit for bit (but see --train). OUT has the columns of MODEL, and the thresholds
-    go beside it into OUT.fragprune.safetensors. The table compares both models on held-out views.
-    A line below it measures OUT without its thresholds, as other viewers draw it. Ctrl-C (exit code
-    130) and SIGTERM (143) save the thresholds learned so far.
+    Thresholds and all other parameters adapt to each other on the photographs in --data. With
+    --train opacity, positions, shapes and colours stay bit for bit. OUT has the columns of
+    MODEL, and the thresholds go beside it into OUT.fragprune.safetensors. The table compares both
+    models on held-out views. A line below it measures OUT without its thresholds, as other viewers
+    draw it. Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
 
     \b
     Examples:

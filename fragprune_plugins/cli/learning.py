@@ -22,16 +22,18 @@ _OPTIONS = (
     click.option(
         "--train",
         type=click.Choice(["opacity", "appearance", "all"]),
-        default="opacity",
+        default="all",
         show_default=True,
-        help="Parameters that learn with the thresholds; appearance adds SH, all adds shapes and "
-        "positions.",
+        help="Parameters that learn with the thresholds: opacities alone, as in the paper; "
+        "appearance adds SH; all adds shapes and positions, and truncates in the last 2,000 "
+        "iterations only.",
     ),
     click.option(
         "--pressure",
         type=float,
         help="Weight of drawn fragments per pixel in the loss; default: "
-        f"{ELASTICITY:g} of the loss per fragment, and at least {LEAST_PRESSURE:g}.",
+        f"{2 * ELASTICITY:g} of the loss per fragment ({ELASTICITY:g} unless all parameters "
+        f"learn), and at least {LEAST_PRESSURE:g}.",
     ),
     click.option(
         "--target-speedup",

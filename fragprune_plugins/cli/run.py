@@ -77,9 +77,10 @@ def command(
     """Train with a host's own command, then learn truncation thresholds.
 
     Put the unmodified command after --. Stage 1 is the host's own training. Stage 2 resumes it for
-    a few thousand iterations, in which only opacities and thresholds change (but see --train). The
-    host saves its model as usual, and the thresholds go beside it as a sidecar. In stage 2, Ctrl-C
-    (exit code 130) and SIGTERM (143) save the thresholds learned so far.
+    a few thousand iterations, in which no Gaussian is added or removed. All parameters learn with
+    the thresholds (but see --train). The host saves its model as usual, and the thresholds go
+    beside it as a sidecar. In stage 2, Ctrl-C (exit code 130) and SIGTERM (143) save the thresholds
+    learned so far.
 
     \b
     Examples:

@@ -119,12 +119,12 @@ def run_demo(
     ):
         command = host_command(scene.resolve(), model.resolve(), settings)
         say(
-            f"2/5  Training for {settings.iterations} iterations, then opacities and thresholds "
+            f"2/5  Training for {settings.iterations} iterations, then with thresholds "
             f"for {settings.finetune}"
         )
         summary = run(command, _run_options(settings))
     with clock.part("control"):
-        say(f"3/5  The control: the same {settings.finetune} iterations with opacities alone")
+        say(f"3/5  The control: the same {settings.finetune} iterations without truncation")
         control = _control(scene, summary, settings)
     with clock.part("measure"):
         say("4/5  Measuring on the held-out views")

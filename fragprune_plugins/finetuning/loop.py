@@ -1,4 +1,4 @@
-"""Stage 2 on its own: opacities and thresholds learn, everything else stays to the bit."""
+"""Stage 2 without a host: drives the learning over the photographs of a data set."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions
-# (times the scene's extent) take the hosts' last: more gained nothing held out, while a tenth of
-# these rates for shapes cut fewer fragments at no better PSNR.
+# (times the scene's extent) take a tenth of the hosts' first: a tenth of that held out less, and a
+# tenth of these rates for shapes cut fewer fragments at no better PSNR.
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
+_GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _POSTFIXES = 100  # times in a run that the bar says how it goes
-_GEOMETRY = {"xyz": 1.6e-6, "scaling": 0.005, "rotation": 0.001}
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ def activate(
     Args:
         adapter: the adapter's name; None detects it from the host's source.
         host: the checkout's folder; None for the folder of the running script.
-        stage: "finetune" trains only opacities and thresholds (and ``settings.train``), "joint"
+        stage: "finetune" trains thresholds and what ``settings.train`` names, "joint"
             trains everything, "off" only applies thresholds of sidecars.
         from_iter: number of iterations of this run before learning begins (0 if it is resumed).
         settings: settings of the fine-tuning; ``iterations`` is its length.

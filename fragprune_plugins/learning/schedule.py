@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import (
+    ELASTICITY,
     ElasticPressure,
     FixedPressure,
     Pressure,
@@ -21,12 +22,34 @@ _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
 
 
 @dataclass(frozen=True)
+class _Recipe:
+    """What suits one choice of what moves; docs/results.md has the runs that chose it.
+
+    Attributes:
+        steps: thresholds learn in the last so many; None for all. Where shapes follow, truncating
+            for longer still improves the training views and no longer the others.
+        elasticity: of the default pressure. Shapes that follow repair deeper cuts.
+    """
+
+    steps: int | None
+    elasticity: float
+
+
+_RECIPES: dict[Train, _Recipe] = {
+    "opacity": _Recipe(None, ELASTICITY),
+    "appearance": _Recipe(None, ELASTICITY),
+    "all": _Recipe(2000, 2 * ELASTICITY),
+}
+
+
+@dataclass(frozen=True)
 class Settings:
     """What a fine-tuning is asked to do; recorded in the sidecar.
 
     Attributes:
         iterations: optimizer steps of stage 2.
-        train: what moves beside the thresholds: "opacity", "appearance" (opacity and SH) or "all".
+        train: what moves beside the thresholds: "opacity" (the paper's), "appearance" (opacity and
+            SH) or "all", which truncates in the last 2,000 iterations only.
         pressure: lambda, weight of drawn fragments per pixel in the loss; None for one that
             follows the loss per fragment.
         target_speedup: fragments of the untruncated model as it came in over fragments drawn now,
@@ -38,7 +61,7 @@ class Settings:
     """
 
     iterations: int = FINETUNE_ITERATIONS
-    train: Train = "opacity"
+    train: Train = "all"
     pressure: float | None = None
     target_speedup: float | None = None
     threshold_lr: float = 0.05
@@ -71,7 +94,15 @@ class Settings:
             return FixedPressure(0.0)
         if self.target_speedup is not None:
             return PressureController(self.target_speedup)
-        return ElasticPressure() if self.pressure is None else FixedPressure(self.pressure)
+        if self.pressure is not None:
+            return FixedPressure(self.pressure)
+        return ElasticPressure(elasticity=_RECIPES[self.train].elasticity)
+
+    @property
+    def warmup(self) -> int:
+        """Steps that train without truncation before thresholds open."""
+        learning = _RECIPES[self.train].steps
+        return 0 if learning is None else max(0, self.iterations - learning)
 
 
 @dataclass(frozen=True)
@@ -87,6 +118,7 @@ class StepPlan:
         opacity_lr: learning rate the opacity group gets, None to leave the host's.
         progress: share of the learning that is over, 0 to 1.
         decay: share of its initial learning rate that every other group gets which trains.
+        counted: views drawn in this step count: a first visit gives their fragments "before".
     """
 
     learn: bool
@@ -94,10 +126,13 @@ class StepPlan:
     opacity_lr: float | None
     progress: float
     decay: float = 1.0
+    counted: bool = True
 
 
 class Schedule:
-    """Stage 2 after training: learn from the first step, learning rates decay tenfold.
+    """Stage 2 after training: thresholds learn after a warm-up, learning rates decay tenfold.
+
+    The warm-up is ``Settings.warmup``: none in a run of 2,000 steps or less.
 
     Subclass and return an instance from ``fragprune_create_schedule`` to change it.
     """
@@ -107,15 +142,21 @@ class Schedule:
 
     def at(self, step: int) -> StepPlan:
         """The plan of a step, counted from 1 by the session."""
-        progress = min(1.0, max(0.0, (step - 1) / max(1, self.settings.iterations - 1)))
-        decay = _DECAY**progress
+        settings = self.settings
+        decay = _DECAY ** _share(step - 1, settings.iterations - 1)
+        over = _share(step - 1 - settings.warmup, settings.iterations - 1 - settings.warmup)
         return StepPlan(
-            learn=True,
-            threshold_lr=self.settings.threshold_lr * decay,
-            opacity_lr=self.settings.opacity_lr * decay,
-            progress=progress,
+            learn=step > settings.warmup,
+            threshold_lr=settings.threshold_lr * _DECAY**over,
+            opacity_lr=settings.opacity_lr * decay,
+            progress=over,
             decay=decay,
         )
+
+
+def _share(steps: int, of: int) -> float:
+    """Steps over all steps, 0 to 1."""
+    return min(1.0, max(0.0, steps / max(1, of)))
 
 
 class JointSchedule(Schedule):
@@ -133,9 +174,9 @@ class JointSchedule(Schedule):
 
     def at(self, step: int) -> StepPlan:
         """Neutral before ``from_step``; the opacity rate stays the host's."""
-        span = max(1, self.settings.iterations - self.from_step)
-        progress = min(1.0, max(0.0, (step - self.from_step) / span))
+        progress = _share(step - self.from_step, self.settings.iterations - self.from_step)
         on = step >= self.from_step and (
             self.every is None or ((step - self.from_step) // self.every) % 2 == 0
         )
-        return StepPlan(on, self.settings.threshold_lr * _DECAY**progress, None, progress)
+        rate = self.settings.threshold_lr * _DECAY**progress
+        return StepPlan(on, rate, None, progress, counted=on)

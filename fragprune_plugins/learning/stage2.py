@@ -106,6 +106,7 @@ class Stage2:
         self.plan: StepPlan | None = None
         self._truncate, self._again, self._watch = truncate, views, watch
         self._parameters, self._suspect = parameters, False
+        self._open = False  # the warm-up is over
         self._held = False  # thresholds have met their target and stay
         self._met: float | None = None  # the speed-up they met it with
         self._before: dict[tuple[Hashable, int], Tensor] = {}
@@ -140,6 +141,7 @@ class Stage2:
         self.steps += 1
         self.plan = self.schedule.at(self.steps)
         self._views.begin()
+        self._open |= self.plan.learn
         if self.plan.learn and self.settings.truncate:
             if not self.store.opened:
                 self.store.open(opacities())
@@ -174,15 +176,16 @@ class Stage2:
             The fragment pressure, a scalar to add to the loss; None where nothing is to be added.
         """
         picture = view, part
-        learns = torch.is_grad_enabled() and self.plan is not None and self.plan.learn
-        if learns and picture not in self._before:
+        counted = torch.is_grad_enabled() and self.plan is not None and self.plan.counted
+        if counted and picture not in self._before:
             with torch.no_grad():
                 self._before[picture] = untruncated().fragments_per_pixel.detach()
-        if picture in self._before:
-            self._after[picture] = outputs.fragments_per_pixel.detach()
-        if not learns:
+        drawn = outputs.fragments_per_pixel.detach()
+        if picture in self._before and self._open:
+            self._after[picture] = drawn
+        if not counted:
             return None
-        self._views.draw(self._after[picture], self._before[picture])
+        self._views.draw(drawn, self._before[picture])
         if not self.learning or self.pressure.value == 0:
             return None
         return outputs.fragments_per_pixel * (self.pressure.value / self._views.expected)

@@ -34,7 +34,7 @@ def steps(host, model, camera, first, last):
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 @pytest.mark.parametrize("what", ["opacity", "scaling", "thresholds", "moments"])
 def test_a_host_is_not_let_save_what_is_not_finite(tmp_path, what, value):
-    with running(Settings(iterations=9)) as host:
+    with running(Settings(iterations=9, train="opacity")) as host:
         model, camera = host.model(20), host.camera()
         for iteration in (1, 2, 3):
             host.step(model, camera, iteration)
@@ -57,7 +57,7 @@ def test_a_host_is_not_let_save_what_is_not_finite(tmp_path, what, value):
 
 def test_before_stage_two_and_without_learning_the_host_saves_what_it_likes(tmp_path):
     for options in ({"from_step": 5}, {"learn": False}):
-        with running(Settings(iterations=9), **options) as host:
+        with running(Settings(iterations=9, train="opacity"), **options) as host:
             model = host.model(20)
             host.step(model, host.camera(), 1)
             spoil(model._scaling, 1, torch.nan)
@@ -67,7 +67,7 @@ def test_before_stage_two_and_without_learning_the_host_saves_what_it_likes(tmp_
 
 @pytest.mark.parametrize("begin", [running, joint])
 def test_what_spoils_the_loss_is_noticed_in_the_next_step(begin):
-    with begin(Settings(iterations=9)) as host:
+    with begin(Settings(iterations=9, train="opacity")) as host:
         model, camera = host.model(20), host.camera()
         host.step(model, camera, 1)
         model.update_learning_rate(2)
@@ -78,7 +78,7 @@ def test_what_spoils_the_loss_is_noticed_in_the_next_step(begin):
 
 
 def test_thresholds_that_are_not_finite_are_noticed_in_the_next_step():
-    with running(Settings(iterations=9)) as host:
+    with running(Settings(iterations=9, train="opacity")) as host:
         model, camera = host.model(20), host.camera()
         host.step(model, camera, 1)
         spoil(host.store(model).logits, 20, torch.nan)
@@ -88,7 +88,7 @@ def test_thresholds_that_are_not_finite_are_noticed_in_the_next_step():
 
 def test_what_shows_in_no_loss_is_noticed_within_a_hundred_steps():
     """A Gaussian that is not finite is simply not drawn."""
-    with running(Settings(iterations=300)) as host:
+    with running(Settings(iterations=300, train="opacity")) as host:
         model, camera = host.model(5), host.camera(8, 6)
         host.step(model, camera, 1)
         spoil(model._scaling, 1, torch.inf)

@@ -46,7 +46,7 @@ def test_only_what_is_named_moves(train):
 
 
 def test_before_stage_two_the_host_has_its_way():
-    with running(Settings(iterations=9), from_step=1) as host:
+    with running(Settings(iterations=9, train="opacity"), from_step=1) as host:
         model, camera = host.model(20), host.camera()
         host.step(model, camera, 1)
         model.xyz_gradient_accum += 1.0
@@ -79,7 +79,7 @@ def rates_of(model):
 
 def test_thresholds_step_once_a_counted_step_however_often_the_hosts_optimizer_does():
     """A subclass whose step() calls its parent's fires the hook twice."""
-    with running(Settings(iterations=9)) as host:
+    with running(Settings(iterations=9, train="opacity")) as host:
         model, camera = host.model(20), host.camera()
         for iteration in (1, 2, 3):
             model.update_learning_rate(iteration)
@@ -90,7 +90,7 @@ def test_thresholds_step_once_a_counted_step_however_often_the_hosts_optimizer_d
 
 
 def test_the_control_trains_the_same_without_thresholds():
-    with running(Settings(iterations=9, truncate=False)) as host:
+    with running(Settings(iterations=9, truncate=False, train="opacity")) as host:
         model, camera = host.model(20), host.camera()
         before = tensors(model)
         for iteration in (1, 2, 3):
@@ -119,7 +119,7 @@ def test_frozen_parameters_ask_the_engine_for_no_gradient_and_stay_as_the_host_m
 
 
 def test_a_host_that_fails_to_draw_keeps_its_parameters_as_they_were():
-    with running(Settings(iterations=9)) as host:
+    with running(Settings(iterations=9, train="opacity")) as host:
         model = host.model(20)
         host.step(model, host.camera(), 1)
         with pytest.raises(AttributeError):

@@ -30,7 +30,7 @@ class Costs(TorchDispatchMode):
 
 
 def test_drawing_a_view_that_is_known_reads_nothing_back():
-    with joint(Settings(iterations=30)) as host:
+    with joint(Settings(iterations=30, train="opacity")) as host:
         model, camera = host.model(ROWS), host.camera()
         for iteration in (1, 2, 3):
             host.step(model, camera, iteration)
@@ -50,7 +50,7 @@ def test_figures_of_a_step_are_worked_out_once_for_all_its_views():
         def fragprune_step(self, stats):
             seen.append(stats)
 
-    with joint(Settings(iterations=30), plugins=[Observer()]) as host:
+    with joint(Settings(iterations=30, train="opacity"), plugins=[Observer()]) as host:
         model, cameras = host.model(ROWS), [host.camera(side=s) for s in (-0.4, 0.0, 0.4)]
         with Costs() as costs:
             for iteration in (1, 2):

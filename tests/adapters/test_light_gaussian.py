@@ -181,7 +181,7 @@ def test_a_point_cloud_read_with_fewer_bands_has_its_thresholds(mini, tmp_path, 
 
 
 def test_the_rate_of_stage_two_is_not_the_hosts_schedulers(mini):
-    with running(Settings(iterations=9, opacity_lr=0.02), **of(mini)) as host:
+    with running(Settings(iterations=9, opacity_lr=0.02, train="opacity"), **of(mini)) as host:
         model, rates = host.model(COUNT), []
         model.scheduler = torch.optim.lr_scheduler.ExponentialLR(model.optimizer, gamma=0.5)
         model.optimizer.register_step_pre_hook(

@@ -104,7 +104,9 @@ FLAGS = {
     "ms": ["--densify_until_iter", 10, "--simp_iteration1", 10, *OWN, "--imp_metric", "indoor"],
     "ms_d": ["--densify_until_iter", 10, *OWN],
 }
-OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=6, threshold_lr=0.3))
+OPTIONS = RunOptions(
+    device="cpu", settings=Settings(iterations=6, threshold_lr=0.3, train="opacity")
+)
 
 
 def command(mini, variant, scene, out, iterations, *more):
@@ -140,7 +142,7 @@ def test_stage_two_stands_still_where_points_would_be_made_anew(
     """It passes depth's iteration and the simplifications; the host goes through the motions."""
     later = ["--densify_until_iter", 10, "--depth_interval", 9, "--simp_iteration2", 12]
     more = [*later, *(["--simp_iteration1", 10] if variant == "ms" else [])]
-    options = replace(OPTIONS, settings=Settings(iterations=8, threshold_lr=0.3))
+    options = replace(OPTIONS, settings=Settings(iterations=8, threshold_lr=0.3, train="opacity"))
     summary = run(command(mini, variant, photographs, tmp_path, 7, *more), options)
     before = read_ply(summary.model_before)
     assert frozen_differences(summary.model_before, summary.model_after) == []

@@ -26,7 +26,7 @@ class Notes:
 @pytest.mark.parametrize("pressure", [0.0, 1e-4, 0.02])
 def test_gradients_are_those_of_loss_plus_pressure_times_fragments(pressure):
     notes = Notes()
-    with joint(Settings(iterations=9, pressure=pressure), plugins=[notes]) as host:
+    with joint(Settings(iterations=9, pressure=pressure, train="opacity"), plugins=[notes]) as host:
         model, camera = host.model(40), host.camera()
         model.update_learning_rate(1)
         store = host.store(model)
@@ -50,7 +50,7 @@ def test_gradients_are_those_of_loss_plus_pressure_times_fragments(pressure):
 
 
 def test_evaluation_renders_feel_no_pressure_and_count_for_nothing():
-    with joint(Settings(iterations=9, pressure=0.1)) as host:
+    with joint(Settings(iterations=9, pressure=0.1, train="opacity")) as host:
         model, camera, other = host.model(), host.camera(), host.camera(side=0.4)
         host.step(model, camera, 1)
         before = host.finish()
@@ -62,7 +62,9 @@ def test_evaluation_renders_feel_no_pressure_and_count_for_nothing():
 def test_more_pressure_means_fewer_fragments():
     drawn = []
     for pressure in (0.0, 0.01):
-        with running(Settings(iterations=30, pressure=pressure, threshold_lr=0.3)) as host:
+        with running(
+            Settings(iterations=30, pressure=pressure, threshold_lr=0.3, train="opacity")
+        ) as host:
             model, camera = host.model(40), host.camera()
             for iteration in range(1, 31):
                 host.step(model, camera, iteration)
@@ -94,7 +96,9 @@ class EnlargingHost(Vanilla3DGS):
 
 @pytest.mark.parametrize("adapter", [Vanilla3DGS(), EnlargingHost()], ids=["one", "three"])
 def test_a_target_is_met_over_all_pictures_of_all_views(adapter):
-    settings = Settings(iterations=12, target_speedup=1.6, threshold_lr=0.3, opacity_lr=1e-6)
+    settings = Settings(
+        iterations=12, target_speedup=1.6, threshold_lr=0.3, opacity_lr=1e-6, train="opacity"
+    )
     with running(settings, adapter=adapter) as host:
         model, cameras = host.model(40), [host.camera(), host.camera(side=0.5)]
         for iteration in range(1, 13):
@@ -134,7 +138,7 @@ def gradients(host, model, cameras, iteration):
 
 
 def test_a_step_of_several_views_feels_the_mean_of_their_pressures():
-    with joint(Settings(iterations=9, pressure=0.02)) as host:
+    with joint(Settings(iterations=9, pressure=0.02, train="opacity")) as host:
         model = host.model(40)
         views = [host.camera(), host.camera(side=0.4), host.camera(side=-0.4)]
         alone = []
@@ -159,7 +163,7 @@ def test_a_step_of_several_views_feels_the_mean_of_their_pressures():
 
 
 def test_the_default_pressure_follows_the_hosts_loss_per_fragment():
-    with joint(Settings(iterations=9)) as host:
+    with joint(Settings(iterations=9, train="opacity")) as host:
         model, camera = host.model(40), host.camera()
         for iteration in range(1, 6):
             host.step(model, camera, iteration)

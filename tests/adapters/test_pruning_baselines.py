@@ -27,7 +27,9 @@ from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_speedy_splat import SpeedySplat
 
-OPTIONS = RunOptions(device="cpu", settings=Settings(iterations=6, threshold_lr=0.3))
+OPTIONS = RunOptions(
+    device="cpu", settings=Settings(iterations=6, threshold_lr=0.3, train="opacity")
+)
 
 
 @pytest.fixture(scope="module")

@@ -223,7 +223,7 @@ OptimizationParams:
 """
 OPTIONS = {
     "device": "cpu",
-    "settings": Settings(iterations=5, threshold_lr=0.3),
+    "settings": Settings(iterations=5, threshold_lr=0.3, train="opacity"),
 }
 
 

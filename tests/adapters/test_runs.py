@@ -48,7 +48,7 @@ class Never(Schedule):
 
 def host_run(scene, out, wrapped):
     """25 iterations with our drop-in; with the session around them or not."""
-    settings = Settings(iterations=25)
+    settings = Settings(iterations=25, train="opacity")
     session = Session(
         Vanilla3DGS(),
         HostRepo(HOST),
@@ -243,7 +243,7 @@ def test_a_host_that_learns_and_draws_nothing_is_an_error_however_it_ends(
 
 
 def test_joint_learning_through_densification_keeps_rows_together(photographs, tmp_path):
-    settings = Settings(iterations=8, threshold_lr=0.3)
+    settings = Settings(iterations=8, threshold_lr=0.3, train="opacity")
     options = RunOptions(stage="joint", from_iter=3, device="cpu", settings=settings)
     summary = run(command(photographs, tmp_path / "out", 20), options)
     store, _ = sidecar.load(summary.model_after)
@@ -254,7 +254,8 @@ def test_joint_learning_through_densification_keeps_rows_together(photographs, t
 
 def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path):
     """One run, its first ten iterations the host's own, densification included."""
-    options = RunOptions(stage="finetune", from_iter=12, device="cpu")
+    settings = Settings(train="opacity")
+    options = RunOptions(stage="finetune", from_iter=12, device="cpu", settings=settings)
     flags = ("--save_iterations", 14, "--checkpoint_iterations", 12)
     out = tmp_path / "out"
     summary = run(command(photographs, out, 20, *flags), options)

@@ -23,7 +23,7 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 NAMES = ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")
-SETTINGS = Settings(iterations=8, threshold_lr=0.3)
+SETTINGS = Settings(iterations=8, threshold_lr=0.3, train="opacity")
 OPTIONS = RunOptions(device="cpu", settings=SETTINGS)
 EVERYTHING = {"xyz", "f_dc", "scaling", "rotation", "opacity"}  # a second band comes much later
 

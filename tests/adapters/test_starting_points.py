@@ -17,7 +17,7 @@ from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import records, sidecar
 
-SETTINGS = Settings(iterations=6, threshold_lr=0.3)
+SETTINGS = Settings(iterations=6, threshold_lr=0.3, train="opacity")
 OPTIONS = RunOptions(device="cpu", settings=SETTINGS)
 FINETUNE = replace(OPTIONS, stage="finetune")
 CONTROL = replace(FINETUNE, settings=replace(SETTINGS, truncate=False))

@@ -32,7 +32,8 @@ def test_writes_a_pair_and_a_table(scene, tmp_path):
     data, path, model = scene
     before = path.read_bytes()
     out = tmp_path / "out.ply"
-    result = run("finetune", path, "--data", data, "--out", out, "--iters", 40, "--pressure", 1e-3)
+    words = ("--data", data, "--out", out, "--train", "opacity")
+    result = run("finetune", path, *words, "--iters", 40, "--pressure", 1e-3)
     assert result.exit_code == 0, result.stderr
     for words in ("PSNR, dB", "fragments/pixel", "before", "after", "x fewer fragments", str(out)):
         assert words in result.stdout
@@ -51,7 +52,7 @@ def test_json_is_one_object_with_the_house_names(scene, tmp_path):
     assert report["iterations"] == 5
     assert report["seed"] == 3
     assert report["adapter"] is None
-    assert report["settings"]["train"] == "opacity"
+    assert report["settings"]["train"] == "all"
     assert report["interrupted"] is False
     for part in ("before", "after"):
         assert report[part]["lpips"] is None
@@ -120,7 +121,7 @@ def test_target_control_and_curves(scene, tmp_path):
     assert report["target_reached"] == (abs(1.5 / report["speedup"] - 1) <= 0.05)
     assert curves.exists()
     report = run_json(*arguments, "--control")
-    assert report["speedup"] == pytest.approx(1, abs=0.02)  # opacities alone move
+    assert report["speedup"] == pytest.approx(1, abs=0.05)  # nothing is truncated
     assert sidecar.load(out)[0].neutral
 
 

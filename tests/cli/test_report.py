@@ -17,7 +17,7 @@ def finetuned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     data, model, _ = tiny.scene(folder)
     out = folder / "out"
-    words = ("--data", data, "--iters", 4)
+    words = ("--data", data, "--iters", 4, "--train", "opacity")
     figures = run_json("finetune", model, "--out", out / "pruned.ply", *words)
     return out, data, figures
 

@@ -16,18 +16,26 @@ from fragprune_plugins.learning.pressure import (
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings
 
 
-@given(st.integers(2, 10_000))
-def test_stage_two_learns_throughout_and_its_rates_fall_tenfold(iterations):
-    schedule = Schedule(Settings(iterations=iterations, threshold_lr=0.05, opacity_lr=0.01))
-    first, last = schedule.at(1), schedule.at(iterations)
-    assert first.learn
-    assert last.learn
-    assert (first.threshold_lr, first.opacity_lr, first.progress) == (0.05, 0.01, 0.0)
+@given(st.integers(2, 10_000), st.sampled_from(["opacity", "appearance", "all"]))
+def test_the_rates_of_stage_two_fall_tenfold(iterations, train):
+    settings = Settings(iterations=iterations, train=train, threshold_lr=0.05, opacity_lr=0.01)
+    schedule = Schedule(settings)
+    first, last = schedule.at(settings.warmup + 1), schedule.at(iterations)
+    assert (first.threshold_lr, first.progress) == (0.05, 0.0)
+    assert schedule.at(1).opacity_lr == 0.01
     assert last.threshold_lr == pytest.approx(0.005)
     assert last.opacity_lr == pytest.approx(0.001)
     assert last.progress == 1.0
-    middle = schedule.at(iterations // 2)
+    middle = schedule.at((settings.warmup + iterations) // 2)
     assert last.threshold_lr <= middle.threshold_lr <= first.threshold_lr
+
+
+@given(st.integers(1, 10_000), st.integers(1, 10_000))
+def test_where_everything_moves_thresholds_learn_in_the_last_2000_steps(iterations, step):
+    plan = Schedule(Settings(iterations=iterations, train="all")).at(step)
+    assert plan.learn == (step > iterations - 2000)
+    assert plan.counted  # so that fragments before are those of the model as it came in
+    assert Schedule(Settings(iterations=iterations, train="opacity")).at(step).learn
 
 
 def test_a_run_of_one_iteration_and_steps_past_the_end_have_a_plan():
@@ -67,7 +75,8 @@ def test_settings_out_of_range_are_usage_errors(wrong):
 
 
 def test_settings_choose_their_pressure():
-    assert Settings().make_pressure() == ElasticPressure()
+    assert Settings(train="opacity").make_pressure() == ElasticPressure()
+    assert Settings().make_pressure() == ElasticPressure(elasticity=2 * ELASTICITY)
     assert Settings(pressure=3e-4).make_pressure() == FixedPressure(3e-4)
     assert isinstance(Settings(target_speedup=1.8).make_pressure(), PressureController)
     assert Settings(truncate=False, target_speedup=1.8).make_pressure() == FixedPressure(0.0)

@@ -106,6 +106,22 @@ def test_a_step_that_does_not_learn_truncates_and_leaves_no_gradient_for_the_nex
     assert it.store.logits.grad is None
 
 
+def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
+    told = []
+    it = stage(settings=Settings(iterations=2001, train="all", pressure=1e-2), watch=told.append)
+    it.begin(lambda: OPACITIES)
+    assert it.thresholds(None) is None
+    assert it.drew("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None  # no pressure
+    it.end()
+    assert it.store.neutral
+    assert not it.viewed
+    step(it, "a")
+    it.close()
+    assert it.progress().fragments_before == 20.0
+    assert [stats.fragments_per_pixel for stats in told] == [20.0, it.progress().fragments_after]
+    assert told[1].fragments_per_pixel < 20.0
+
+
 def test_rates_follow_the_schedule():
     it = stage(schedule=Turns(Settings(iterations=10)))
     assert it.rate("f_dc", 0.4) == 0.4

@@ -57,13 +57,13 @@ class Halting(Schedule):
 
 
 CASES = {
-    "default": Settings(iterations=STEPS),
-    "pressure": Settings(iterations=STEPS, pressure=2e-3),
-    "target": Settings(iterations=STEPS, target_speedup=1.5),
+    "default": Settings(iterations=STEPS, train="opacity"),
+    "pressure": Settings(iterations=STEPS, pressure=2e-3, train="opacity"),
+    "target": Settings(iterations=STEPS, target_speedup=1.5, train="opacity"),
     "appearance": Settings(iterations=STEPS, train="appearance"),
-    "control": Settings(iterations=STEPS, truncate=False),
+    "control": Settings(iterations=STEPS, truncate=False, train="opacity"),
     "a schedule of one's own": Settings(iterations=STEPS, pressure=1e-3, train="appearance"),
-    "a plugin's thresholds": Settings(iterations=STEPS, pressure=1e-3),
+    "a plugin's thresholds": Settings(iterations=STEPS, pressure=1e-3, train="opacity"),
 }
 
 

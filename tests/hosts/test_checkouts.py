@@ -191,7 +191,7 @@ from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.injection.session import Session
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
-root, settings = Path(sys.argv[1]), Settings(iterations=9)
+root, settings = Path(sys.argv[1]), Settings(iterations=9, train="opacity")
 sys.path.insert(0, str(root))
 session = Session(
     Vanilla3DGS(), HostRepo(root), load_plugins(), settings,
@@ -257,7 +257,7 @@ from fragprune_plugins.injection.session import Session
 from fragprune_mcmc import MCMC
 from fragprune_mip_splatting import MipSplatting
 
-root, settings = Path(sys.argv[1]), Settings(iterations=9)
+root, settings = Path(sys.argv[1]), Settings(iterations=9, train="opacity")
 sys.path.insert(0, str(root))
 session = Session(
     MCMC(), HostRepo(root), load_plugins(), settings,

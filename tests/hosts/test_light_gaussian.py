@@ -71,9 +71,8 @@ def train(stage, *more):
     words = "--iterations 30 --densify_from_iter 5 --densification_interval 10".split()
     words += "--densify_until_iter 15 --densify_grad_threshold 0.002".split()
     words += "--prune_iterations 20 33 --prune_percent 0.3".split()
-    options = RunOptions(
-        device="cpu", stage=stage, settings=Settings(iterations=10, threshold_lr=0.3)
-    )
+    settings = Settings(iterations=10, threshold_lr=0.3, train="opacity")
+    options = RunOptions(device="cpu", stage=stage, settings=settings)
     return run(command("train_densify_prune.py", out / "a", *words, *more), options)
 
 def row_of(model):

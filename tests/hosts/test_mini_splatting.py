@@ -65,7 +65,7 @@ def train(folder, stage, iterations, *more):
     words = [str(host / variant / "train.py"), "-s", str(data), "-m", str(folder), "--eval"]
     words += "-r 1 --sh_degree 1 --test_iterations -1 --port 0 --densify_from_iter 5".split()
     words += ["--iterations", str(iterations), *sys.argv[5:], *map(str, more)]
-    settings = Settings(iterations=10, threshold_lr=0.3)
+    settings = Settings(iterations=10, threshold_lr=0.3, train="opacity")
     start = 5 if stage == "joint" else None
     return run(words, RunOptions(device="cpu", stage=stage, from_iter=start, settings=settings))
 

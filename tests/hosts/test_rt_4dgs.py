@@ -93,7 +93,8 @@ from fragprune_plugins.learning.schedule import Settings
 host, config = sys.argv[1:]
 names = ("degree", "xyz", "dc", "rest", "scaling", "rotation", "opacity")
 with contextlib.redirect_stdout(sys.stderr):
-    options = RunOptions(device="cpu", settings=Settings(iterations=10, threshold_lr=0.3))
+    settings = Settings(iterations=10, threshold_lr=0.3, train="opacity")
+    options = RunOptions(device="cpu", settings=settings)
     summary = run([f"{host}/train.py", "--config", config], options)
     before, after = (
         torch.load(path, weights_only=False)[0]

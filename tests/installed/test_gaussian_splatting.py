@@ -81,7 +81,7 @@ def test_its_own_command_trains_and_is_fine_tuned(mode, photographs, tmp_path):
     options = OPTIONS if mode == "densify" else {"camera_position_lr_init": 0.01}
     for name, value in options.items():
         words += ["-o", f"{name}={value}"]
-    settings = Settings(iterations=12, threshold_lr=0.3)
+    settings = Settings(iterations=12, threshold_lr=0.3, train="opacity")
     summary = run([str(word) for word in words], RunOptions(device="cpu", settings=settings))
     assert summary.adapter == "gaussian-splatting"
     assert summary.model_before == out / "point_cloud/iteration_12/point_cloud.ply"
@@ -104,7 +104,9 @@ def test_a_run_may_begin_from_a_ply(stage, photographs, tmp_path):
     command = [str(word) for word in words]
     run([*command, "-d", str(tmp_path / "first"), "-i", "3"], RunOptions(stage="off", device="cpu"))
     (model,) = tmp_path.glob("first/point_cloud/iteration_3/*.ply")
-    options = RunOptions(stage=stage, device="cpu", settings=Settings(iterations=6))
+    options = RunOptions(
+        stage=stage, device="cpu", settings=Settings(iterations=6, train="opacity")
+    )
     out = tmp_path / "second"
     summary = run([*command, "-d", str(out), "-l", str(model), "-i", "6"], options)
     assert summary.model_after.is_relative_to(out if stage == "joint" else out / "finetuned")
