@@ -38,18 +38,18 @@ _POSTFIXES = 100  # times in a run that the bar says how it goes
 
 @dataclass(frozen=True, eq=False)
 class FinetuneResult:
-    """What a fine-tuning gave.
+    """Result of a fine-tuning.
 
     Attributes:
         model: the Gaussians; what ``train`` did not name is the very tensor that came in.
         store: their thresholds, neutral when truncation was off.
-        settings: what was asked.
-        curves: one point a step.
+        settings: of the fine-tuning.
+        curves: one point per step.
         progress: steps done, fragments before and after on the training views, the target.
         train_seconds: wall-clock seconds of the loop.
         engine: the engine's name.
-        interrupted: Ctrl-C, or SIGTERM, ended it early; what was learned by then is here.
-        terminated: it was SIGTERM.
+        interrupted: Ctrl-C or SIGTERM ended it early; the result is what was learned until then.
+        terminated: SIGTERM ended it.
     """
 
     model: SplatFile
@@ -80,7 +80,7 @@ def finetune(
     engine: str | Engine = "auto",
     progress: bool = False,
 ) -> FinetuneResult:
-    """Learn thresholds and opacities of a trained splat on its photographs.
+    """Learn the thresholds of a trained splat on its photographs.
 
     Loss: 0.8 L1 + 0.2 (1 - SSIM) + pressure x drawn fragments per pixel. Views come in seeded
     random permutations; the global random streams are not touched.
@@ -90,8 +90,8 @@ def finetune(
         dataset: its photographs; only training views are learned from. Pixels stay in main memory
             and follow the model one view at a time.
         settings: iterations, what moves, pressure or target; defaults when None.
-        store: thresholds to go on from, changed in place; neutral ones when None.
-        schedule: when what learns how fast; when None a plugin's, or the default one.
+        store: thresholds to start from, changed in place; neutral ones when None.
+        schedule: gives the plan of each step; when None a plugin's, or the default one.
         engine: a name or an engine.
         progress: draw a bar on stderr.
 
@@ -251,7 +251,7 @@ class _Run:
         self.done += 1
 
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
-        """A view as stage 2 has it, and the pressure of its fragments."""
+        """Draw a view with its thresholds; also return the fragment pressure."""
         inputs = RasterInputs(shot.view, self.model.splats())
         thresholds = self.stage.thresholds(inputs)
         outputs = self.engine.rasterize(inputs, thresholds)

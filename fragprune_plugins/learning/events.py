@@ -1,4 +1,4 @@
-"""What learning tells those who watch it."""
+"""Records that learning gives to observers: population changes, steps, summaries."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from typing import Any
 
 @dataclass(frozen=True)
 class PopulationChange:
-    """Rows of a model changed; the store followed."""
+    """Rows of a model changed, and its threshold store changed with them.
+
+    Attributes:
+        operation: of the store or of the host, such as "keep" or "training_setup".
+        before: rows before the change.
+        after: rows after it.
+    """
 
     operation: str
     before: int
@@ -21,11 +27,11 @@ class StepStats:
     """One training step that learned.
 
     Attributes:
-        step: of the learning, from 1.
+        step: number of the step, from 1.
         fragments_per_pixel: drawn, mean over this step's views.
-        pressure: lambda used.
+        pressure: lambda in this step.
         threshold_median: over all Gaussians, in falloff.
-        loss: the host's own, without the pressure, summed over this step's views.
+        loss: photometric loss without the pressure, summed over this step's views.
     """
 
     step: int
@@ -37,12 +43,12 @@ class StepStats:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a session gained, over the training views it drew.
+    """Result of a session on the training views that it drew.
 
     Attributes:
-        adapter: its name.
-        engine: that drew.
-        steps: learned.
+        adapter: name of the adapter.
+        engine: name of the engine.
+        steps: number of steps that learned.
         gaussians: in the trained model.
         fragments_before: per pixel, untruncated with the opacities at each view's first visit.
         fragments_after: per pixel, as drawn at each view's last visit.

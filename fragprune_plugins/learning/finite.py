@@ -1,4 +1,4 @@
-"""Whether what was learned is numbers at all."""
+"""Detect NaN and infinity in what was learned."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 CHECK_EVERY = 100
-"""Steps between two looks at every trained number: each look waits for the device."""
+"""Number of steps between two checks of all trained numbers. A check waits for the device."""
 
 
 def expect_finite(tensors: Mapping[str, Tensor], where: str) -> None:
     """Raise DivergedError unless every number of every tensor is finite; rows are counted.
 
     Args:
-        tensors: (N, ...), by what to call them.
-        where: which training, and which step of it.
+        tensors: (N, ...) each, by the name that a message gives them.
+        where: the training and its step, for the message.
     """
     found = []
     for name, tensor in tensors.items():
@@ -32,6 +32,6 @@ def expect_finite(tensors: Mapping[str, Tensor], where: str) -> None:
             where,
             f"NaN or infinity in {', '.join(found)}",
             "finite numbers",
-            "Nothing of it was saved. Begin again from the model before; if that is not finite "
-            "either, from an earlier one.",
+            "Nothing of it was saved. Begin again from the model before; if that one is not "
+            "finite either, begin from an earlier one.",
         )

@@ -1,4 +1,4 @@
-"""SIGTERM while something learns: clusters send it, and what was learned is to be saved first."""
+"""Save what was learned when SIGTERM arrives: clusters send it before they end a job."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from collections.abc import Iterator
 from types import FrameType
 
 EXIT_CODE = 128 + signal.SIGTERM
-"""What a shell reports of a process that SIGTERM ended: 143."""
+"""Exit code that a shell reports for a process which SIGTERM ended: 143."""
 
 
 class Terminate(KeyboardInterrupt):
-    """SIGTERM, where it found the main thread; what catches Ctrl-C catches it."""
+    """SIGTERM as an exception in the main thread. Handlers of Ctrl-C catch it too."""
 
 
 @contextlib.contextmanager
 def sigterm_interrupts() -> Iterator[None]:
-    """Inside, the first SIGTERM raises ``Terminate`` and later ones wait for the end.
+    """Raise ``Terminate`` on the first SIGTERM inside the block, and ignore later ones.
 
-    Does nothing in a thread that gets no signals, or where somebody has SIGTERM ignored.
+    Outside the main thread, or if SIGTERM is already ignored, the block changes nothing.
     """
     before = signal.getsignal(signal.SIGTERM)
     main = threading.current_thread() is threading.main_thread()

@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     Figure = float | Tensor
 
 LEAST_PRESSURE = 1e-4
-"""What a loss per fragment too small to matter (an overfitted model's) gets by default."""
+"""Least lambda by default, for models whose loss per fragment is very small (overfitted ones)."""
 
 ELASTICITY = 0.1
-"""By default a per cent of the fragments is worth this many per cent of the loss."""
+"""Per cent of the loss that one per cent of the fragments is worth by default."""
 
 TARGET_TOLERANCE = 0.05
-"""Relative distance from the target, in fragments per pixel, that counts as reached."""
+"""A target counts as reached within this relative distance, in fragments per pixel."""
 
 CALIBRATE_AT = 0.85
-"""Share of the run after which a target is met by a uniform shift; then opacities alone adapt."""
+"""Share of the learning after which one shift of all thresholds meets the target, and they stay."""
 
 CALIBRATION_VIEWS = 24
-"""Most training views that a calibration measures."""
+"""Number of training views that a calibration measures at most."""
 
 _CURVE_SPEEDUP = 1.62  # fragments before / after that LEAST_PRESSURE gives
 _CURVE_SLOPE = 0.22  # d ln(speedup) / d ln(lambda), measured between 1.45x and 2.6x
@@ -42,10 +42,10 @@ _CURVE_SLOPE = 0.22  # d ln(speedup) / d ln(lambda), measured between 1.45x and 
 
 @dataclass(frozen=True)
 class Observation:
-    """A step that learned.
+    """Figures of one step that learned, for the pressure.
 
     Attributes:
-        progress: share of the run that was over, 0 to 1.
+        progress: share of the learning that was over, 0 to 1.
         fragments: drawn per pixel, mean over the step's views.
         untruncated: the same views' before learning began.
         loss: the photometric loss, without the pressure; NaN when not known.
@@ -58,22 +58,26 @@ class Observation:
 
 
 class Pressure(Protocol):
-    """Gives lambda for a step, told the fragments of each."""
+    """Gives lambda for the next step, and is told the figures of each step."""
 
     value: float
 
     def observe(self, step: Observation) -> None:
-        """Learn of a step that is over."""
+        """Take the figures of a step that is over."""
 
 
 @dataclass
 class FixedPressure:
-    """The same lambda throughout."""
+    """Keeps lambda the same in all steps.
+
+    Attributes:
+        value: lambda.
+    """
 
     value: float
 
     def observe(self, step: Observation) -> None:
-        """A fixed pressure learns nothing."""
+        """Do nothing: the value is fixed."""
 
 
 @dataclass
@@ -99,7 +103,7 @@ class ElasticPressure:
     _fragments: float = 0.0
 
     def observe(self, step: Observation) -> None:
-        """Average, over all steps at first; a loss that is not known, or not positive, is none."""
+        """Average the step in. A loss that is unknown or not positive is left out."""
         if not 0 < step.loss < math.inf:
             return
         self._steps += 1
@@ -111,11 +115,11 @@ class ElasticPressure:
 
 @dataclass
 class StepViews:
-    """The views that one training step draws: a host that trains in batches draws several.
+    """The views that one training step draws; a host that trains in batches draws several.
 
-    It divides each view's loss by their number, so the pressure must be their mean as well. How
-    many there will be shows only in the end: the step before tells, and the first step takes one.
-    Figures may be scalars on a device: they are waited for when they are read, not before.
+    Such a host divides each view's loss by their number, so the pressure must be their mean as
+    well. Their number is known only at the end of a step, so the number of the step before is used,
+    and one in the first step. Figures may be scalars on a device; reading them waits for it.
 
     Attributes:
         expected: views a step.
@@ -127,45 +131,45 @@ class StepViews:
     _losses: list[Figure | None] = field(default_factory=list)
 
     def begin(self) -> None:
-        """A new step."""
+        """Forget the views of the last step; their number is what the next step expects."""
         self.expected = self.drawn or self.expected
         self._fragments, self._untruncated, self._losses = [], [], []
 
     def draw(self, fragments: Figure, untruncated: Figure) -> None:
-        """A view was drawn with gradients: fragments per pixel, and those before learning."""
+        """Note a view drawn with gradients: its fragments per pixel now and before learning."""
         self._fragments.append(fragments)
         self._untruncated.append(untruncated)
         self._losses.append(None)
 
     def lose(self, loss: Figure) -> None:
-        """The loss of the view drawn last went backward."""
+        """Note the loss of the view drawn last."""
         if self._losses:
             self._losses[-1] = loss
 
     @property
     def drawn(self) -> int:
-        """Views so far."""
+        """Number of views so far."""
         return len(self._fragments)
 
     @property
     def fragments(self) -> float:
-        """Per pixel, the mean over the views so far."""
+        """Fragments per pixel, mean over the views so far."""
         return _mean(self._fragments)
 
     @property
     def untruncated(self) -> float:
-        """Per pixel before learning, likewise."""
+        """Fragments per pixel before learning, mean over the views so far."""
         return _mean(self._untruncated)
 
     @property
     def loss(self) -> float:
-        """The sum over the views so far, of those whose loss is known."""
+        """Sum of the known losses of the views so far; NaN if none is known."""
         known = [float(loss) for loss in self._losses if loss is not None]
         return sum(known) if known else math.nan
 
     @property
     def finite(self) -> bool:
-        """Whether the losses that are known are."""
+        """Whether all known losses are finite."""
         return all(math.isfinite(loss) for loss in self._losses if loss is not None)
 
 
@@ -203,7 +207,7 @@ class PressureController:
         self._count = 0
 
     def observe(self, step: Observation) -> None:
-        """Average log ratios over one period, then correct lambda once."""
+        """Average the logarithms of the ratios over a period, then correct lambda once."""
         self._sum += math.log(max(step.fragments / max(step.untruncated, 1e-9), 1e-6))
         self._count += 1
         if step.progress < self._next:

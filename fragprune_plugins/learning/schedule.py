@@ -44,7 +44,7 @@ _RECIPES: dict[Train, _Recipe] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """What a fine-tuning is asked to do; recorded in the sidecar.
+    """Settings of a fine-tuning; recorded in the sidecar.
 
     Attributes:
         iterations: optimizer steps of stage 2.
@@ -56,8 +56,8 @@ class Settings:
             on the training views that calibration measures, to steer for; overrides pressure.
         threshold_lr: initial learning rate of threshold logits.
         opacity_lr: initial learning rate of opacity logits in stage 2.
-        truncate: False trains without thresholds, the honest control for a comparison.
-        seed: of the view order where ours is used.
+        truncate: False trains without thresholds: the control to compare with.
+        seed: of the order of views in ``finetune``; hosts have their own.
     """
 
     iterations: int = FINETUNE_ITERATIONS
@@ -107,13 +107,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class StepPlan:
-    """What one step does.
+    """Plan of one step.
 
     Attributes:
         learn: thresholds move, and drawn fragments press on the loss. When False they stay as they
             are and truncate as they are; before the first step that learns they are neutral, and
-            nothing is truncated. What else trains goes on, at the rates below. Without truncation
-            at all, ``Settings.truncate``, it makes no difference.
+            nothing is truncated. Other parameters train on at the rates below. If
+            ``Settings.truncate`` is False this has no effect.
         threshold_lr: learning rate of their logits.
         opacity_lr: learning rate the opacity group gets, None to leave the host's.
         progress: share of the learning that is over, 0 to 1.

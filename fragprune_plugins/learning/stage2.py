@@ -53,7 +53,7 @@ def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | 
 
 @dataclass(frozen=True)
 class Progress:
-    """What a stage 2 has done so far.
+    """State of a stage 2.
 
     Attributes:
         steps: that the driver's optimizer took.
@@ -75,16 +75,16 @@ class Progress:
 
 
 class Stage2:
-    """One population of Gaussians learning its thresholds.
+    """Learning of the thresholds of one population of Gaussians.
 
     Args:
         store: the thresholds; changed in place.
-        settings: what was asked for.
-        schedule: when what learns how fast; stage 2 as the paper has it when None.
+        settings: of the fine-tuning.
+        schedule: gives the plan of each step; ``Schedule(settings)`` when None.
         truncate: gives the thresholds to draw with; the hook ``fragprune_truncate``.
-        views: by view, what draws it again, ending in ``drew``; those that a target is met on.
-        watch: told of every step that is over.
-        parameters: gives by name what the driver trains; it is looked at that it stays finite.
+        views: by view, a call that draws it again and ends in ``drew``; a target is met on these.
+        watch: called after every step.
+        parameters: gives by name the tensors that the driver trains; they are checked to be finite.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Stage2:
 
     @property
     def viewed(self) -> bool:
-        """Whether any view was drawn with thresholds while they learned."""
+        """Whether any view was drawn after thresholds opened."""
         return bool(self._after)
 
     def begin(self, opacities: Callable[[], Tensor]) -> StepPlan:
@@ -245,7 +245,7 @@ class Stage2:
         self._suspect = False
 
     def progress(self) -> Progress:
-        """What was done so far."""
+        """The state so far."""
         before, after = _mean(self._before), _mean(self._after)
         speedup, target = self._met, self.settings.target_speedup
         if speedup is None and before is not None and after:

@@ -28,7 +28,8 @@ class ThresholdStore:
     Args:
         count: N, number of Gaussians.
         device: where the model lives.
-        lr: initial learning rate on the logits (science: 0.05 to 0.1; too small shows no effect).
+        lr: initial learning rate on the logits (0.05 to 0.1 works; a much smaller one
+            has no visible effect).
     """
 
     def __init__(self, count: int, device: torch.device | str = "cpu", lr: float = 0.05) -> None:
@@ -100,18 +101,18 @@ class ThresholdStore:
 
     @property
     def neutral(self) -> bool:
-        """True while no threshold decides anything; rows are looked at once for each change."""
+        """True while no threshold decides anything. Rows are read once after each change."""
         if not self._is_known():
             self._look()
         return self._neutral
 
     @property
     def opened(self) -> bool:
-        """True when ``open`` would change nothing: no row has been neutral since it was called."""
+        """True if ``open`` would change nothing, because it was called and no row is neutral."""
         return self._is_known() and self._opened
 
     def _is_known(self) -> bool:
-        """Whether nobody has written to the logits, or replaced them, since the last look."""
+        """Whether the logits are unchanged since they were last read."""
         return self._seen is not None and (
             self._seen[0] is self.logits and self._seen[1] == self.logits._version
         )
@@ -120,7 +121,7 @@ class ThresholdStore:
         self._know(bool((self.logits <= NEUTRAL_LOGIT).all()), opened)
 
     def _know(self, neutral: bool, opened: bool) -> None:
-        """Remember whether all rows are neutral, and whether none is, of the logits as they are."""
+        """Remember for the present logits whether all rows are neutral, and whether none is."""
         self._neutral, self._opened = neutral, opened
         counted = not self.logits.is_inference()  # made in inference mode, they have no version
         self._seen = (self.logits, self.logits._version) if counted else None
@@ -145,7 +146,7 @@ class ThresholdStore:
         self._look(opened=True)
 
     def step(self, lr: float | None = None) -> None:
-        """One optimizer step on the gradient gathered since the last; clears it."""
+        """Make one optimizer step with the gradient gathered since the last one, and clear it."""
         if lr is not None:
             self.optimizer.param_groups[0]["lr"] = lr
         learning = not self.neutral
@@ -158,7 +159,7 @@ class ThresholdStore:
 
     @torch.no_grad()
     def place(self, logits: Tensor) -> None:
-        """Take these logits (N,), kept where float32 tells their thresholds from 0 and from 1."""
+        """Set the logits (N,), clamped to where float32 thresholds differ from 0 and from 1."""
         self.logits.copy_(logits.clamp(LOGIT_MIN, LOGIT_MAX))
 
     def keep(self, mask: Tensor) -> None:
@@ -190,7 +191,7 @@ class ThresholdStore:
         self._resize(lambda rows: torch.cat([rows, rows.new_zeros(count)]), tail=new)
 
     def copy(self, source: Tensor, target: Tensor) -> None:
-        """Relocation: rows ``target`` take threshold and moments of rows ``source``, both (M,)."""
+        """Copy thresholds and moments of rows ``source`` to rows ``target``, both (M,) int64."""
         target = self._rows(target, len(target), "copy")
         source = self._rows(source, len(target), "copy")
 
@@ -202,7 +203,7 @@ class ThresholdStore:
         self._resize(moved)
 
     def rearrange(self, origins: Tensor, fresh: Tensor) -> None:
-        """Keep, copy and append at once: row i becomes what row ``origins[i]`` was.
+        """Keep, copy and append rows at once: row i takes the values of row ``origins[i]``.
 
         Args:
             origins: (M,) int64, for each of the M new rows the old row it descends from.
@@ -217,7 +218,7 @@ class ThresholdStore:
         self.forget(fresh.nonzero()[:, 0])
 
     def forget(self, rows: Tensor | None = None) -> None:
-        """Zero the moments of rows (M,) int64, repeats allowed; of all when None."""
+        """Zero the moments of rows (M,) int64, repeats allowed, or of all rows if None."""
         chosen = slice(None) if rows is None else self._rows(rows, len(rows), "forget")
         state = self.optimizer.state.get(self.logits)
         if state:
@@ -225,20 +226,20 @@ class ThresholdStore:
             state["exp_avg_sq"][chosen] = 0
 
     def replace(self, count: int) -> None:
-        """Another population altogether: count neutral rows, fresh moments."""
+        """Start over for another population: ``count`` neutral rows with zero moments."""
         lr = self.optimizer.param_groups[0]["lr"]
         self._bind(torch.full((count,), NEUTRAL_LOGIT, device=self.logits.device), lr)
 
     @property
     def numbers(self) -> dict[str, Tensor]:
-        """Everything learned, each (N,), by what a person calls it."""
+        """All learned tensors, each (N,), by a name for messages."""
         state = self.optimizer.state.get(self.logits, {})
         moments = {"exp_avg": "their moments", "exp_avg_sq": "their second moments"}
         named = {name: state[key] for key, name in moments.items() if key in state}
         return {"thresholds": self.logits.detach(), **named}
 
     def state_dict(self) -> dict[str, Any]:
-        """Logits, moments and counters; tensors are copies."""
+        """Copies of logits, moments and counters, for ``load_state_dict``."""
         state = self.optimizer.state.get(self.logits, {})
         zeros = torch.zeros_like(self.logits)
         return {
@@ -318,5 +319,5 @@ class ThresholdStore:
                 f"ThresholdStore.{operation}",
                 f"{count} Gaussians",
                 f"{len(self)}, one per threshold",
-                "Report this with the host's name: its rows changed without the store seeing it.",
+                "Report this with the host's name: its rows changed, and the store was not told.",
             )
