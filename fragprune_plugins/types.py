@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 Compensation = Literal["none", "antialiasing", "mip"]
 """What keeps a dilated Gaussian's weight, by name; ``RasterInputs`` has the formulas."""
 
+Plane = Literal["invdepth", "alpha"]
+"""What is drawn beside the image, by its name in ``RasterOutputs``."""
+
 
 def _check(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = False) -> None:
     """Raise InputError unless tensor is None or holds real numbers in the shape.
@@ -532,6 +535,8 @@ class RasterInputs:
         scores: also give each Gaussian's weights and wins, and the pixels' winners.
         alpha_max: alpha is capped here; 1/255 to 1.
         cap_gradient: the gradient passes through the cap; else it is 0 where alpha was capped.
+        planes: those of inverse depth and alpha that somebody will look at; () for the image alone.
+            An engine may spare itself the others, or draw them all the same.
     """
 
     view: View
@@ -547,6 +552,7 @@ class RasterInputs:
     scores: bool = False
     alpha_max: float = ALPHA_MAX
     cap_gradient: bool = True
+    planes: tuple[Plane, ...] = get_args(Plane)
 
     __repr__ = one_line
 
@@ -558,6 +564,7 @@ class RasterInputs:
             ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),
             ("near", self.near >= 0, "0 or more"),
             ("alpha_max", ALPHA_MIN <= self.alpha_max <= 1, "1/255 to 1"),
+            ("planes", set(self.planes) <= set(get_args(Plane)), f"of {get_args(Plane)}"),
         )
         for name, holds, expected in checks:
             if not holds:
@@ -597,8 +604,9 @@ class RasterOutputs:
         image: (3, H, W) RGB with background, not clamped.
         radii: (N,) int32, the HOST's rule: ceil(3 sigma), 0 when culled by the host, thresholds
             never change it; 0 for ``Footprints``.
-        invdepth: (1, H, W) sum of alpha T / z, no background term.
-        alpha: (1, H, W) 1 - final transmittance.
+        invdepth: (1, H, W) sum of alpha T / z, no background term; or (0, H, W) where ``planes``
+            did not ask for it.
+        alpha: (1, H, W) 1 - final transmittance; likewise.
         fragments_per_pixel: scalar, drawn fragments over pixels; differentiable in the thresholds
             through the rim surrogate, so ``loss + pressure * fragments_per_pixel`` is the fragment
             pressure.

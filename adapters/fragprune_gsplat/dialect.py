@@ -135,6 +135,7 @@ class GsplatDialect(Dialect):
             ),
             alpha_max=self.alpha_max,
             cap_gradient=False,
+            planes=("alpha",),
         )
 
     @staticmethod

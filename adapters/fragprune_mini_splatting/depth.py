@@ -61,6 +61,7 @@ def render_depth(
             "scales and rotations, which the host's own rasterizer reads here",
             "Leave out --compute_cov3D_python.",
         )
+    inputs = replace(inputs, planes=("alpha",))
     drawn = draw(inputs)
     winners, left, image = drawn.winners, 1 - drawn.alpha[0], drawn.image
     assert winners is not None  # scores were asked for

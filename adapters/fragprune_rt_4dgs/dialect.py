@@ -64,7 +64,8 @@ class RT4DGSDialect(GraphdecoDialect):
         flow = call.get("flow_2d")
         flow = means.new_zeros(len(means), 2) if flow is None else flow
         features = torch.cat([depths, flow], dim=1)
-        return replace(inputs, splats=replace(inputs.splats, features=features))
+        splats = replace(inputs.splats, features=features)
+        return replace(inputs, splats=splats, planes=("alpha",))
 
     def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
         """Rows of a call: with ``compute_cov3D_python`` only those present at the moment.

@@ -168,7 +168,7 @@ def scaling(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float] 
 
 def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     """Make a function that draws once, optionally with gradients of a fixed random loss."""
-    inputs = RasterInputs(case.view, case.splats)
+    inputs = RasterInputs(case.view, case.splats, planes=())
     if case.kind == "forward":
 
         @torch.no_grad()
@@ -183,7 +183,7 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     thresholds = None
     if case.thresholds is not None:
         thresholds = case.thresholds.clone().requires_grad_(True)
-    inputs = RasterInputs(case.view, replace(case.splats, **leaves), hook)
+    inputs = RasterInputs(case.view, replace(case.splats, **leaves), hook, planes=())
     stream = torch.Generator().manual_seed(0)
     weight = torch.randn(3, case.view.height, case.view.width, generator=stream).to(case.device)
 

@@ -180,7 +180,7 @@ def _peers(
         keys = ("width", "height", "gaussians", "ms_median", "ms_min", "ms_se")
         row = {"name": "fragprune", "device": ours["device"], "psnr": None, "failed": None}
         rows.append({"scene": name, **row, **{key: ours[key] for key in keys}})
-        truth = rasterizer.rasterize(RasterInputs(view, flat), None).image
+        truth = rasterizer.rasterize(RasterInputs(view, flat, planes=()), None).image
         for peer in installed():
             say(f"{peer}, {name}, {view.width}x{view.height}")
             rows.append({"scene": name, **time_peer(peer, flat, view, truth, repeats=repeats)})

@@ -79,7 +79,7 @@ def command(
     files, fragments, maps = [], [], []
     with torch.no_grad():
         for name, view in named:
-            inputs = RasterInputs(view.to(where), splats, counts=heatmap)
+            inputs = RasterInputs(view.to(where), splats, counts=heatmap, planes=())
             outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, store))
             file = out / f"{Path(name.replace('/', '_')).stem}.png"
             save_image(file, outputs.image)

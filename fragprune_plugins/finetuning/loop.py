@@ -147,7 +147,7 @@ def mean_fragments(
     splats = model.splats()
     total = 0.0
     for shot in shots:
-        outputs = engine.rasterize(RasterInputs(shot.view, splats), thresholds)
+        outputs = engine.rasterize(RasterInputs(shot.view, splats, planes=()), thresholds)
         total += float(outputs.fragments_per_pixel)
     return total / len(shots)
 
@@ -252,7 +252,7 @@ class _Run:
 
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
         """Draw a view with its thresholds; also return the fragment pressure."""
-        inputs = RasterInputs(shot.view, self.model.splats())
+        inputs = RasterInputs(shot.view, self.model.splats(), planes=())
         thresholds = self.stage.thresholds(inputs)
         outputs = self.engine.rasterize(inputs, thresholds)
 

@@ -42,8 +42,8 @@ class Candidate:
     __repr__ = one_line
 
     def inputs(self, view: View, splats: Splats) -> RasterInputs:
-        """The inputs of one view with the activated model."""
-        return RasterInputs(view, splats, **self.drawing)
+        """The inputs of one view with the activated model; only the image is asked for."""
+        return RasterInputs(view, splats, planes=(), **self.drawing)
 
     def draw(
         self, engine: Engine, view: View, splats: Splats, *, counts: bool = False

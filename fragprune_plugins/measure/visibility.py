@@ -70,7 +70,7 @@ def visible(
         for view in views:
             # Alpha capped at its least cuts and hides no Gaussian: light is left behind two
             # thousand Gaussians. So those count too that end a pixel without being drawn in it.
-            inputs = RasterInputs(view, splats, counts=True, alpha_max=ALPHA_MIN)
+            inputs = RasterInputs(view, splats, counts=True, alpha_max=ALPHA_MIN, planes=())
             counts = drawer.rasterize(inputs, thresholds).fragments_per_gaussian
             assert counts is not None
             seen |= counts > 0

@@ -111,7 +111,8 @@ def test_depth_is_the_blended_distance_of_what_is_drawn(mini):
         model, camera = host.model(1), host.camera(20, 14)
         host.step(model, camera, 1)
         package = host.render(camera, model, torch.ones(3))
-        alpha = rasterize(notes.inputs, host.store(model).values).alpha.detach()
+        inputs = replace(notes.inputs, planes=("alpha",))
+        alpha = rasterize(inputs, host.store(model).values).alpha.detach()
         point = torch.cat([model.get_xyz.detach()[0], torch.ones(1)])
         z = float((point @ camera.world_view_transform)[2])
     drawn = alpha > 0.01

@@ -96,7 +96,8 @@ class _Drawing:
         view, n = self.inputs.view, len(self.inputs.splats)
         size = (view.height, view.width)
         empty = partial(_empty, self.workspace)
-        image, invdepth, alpha = empty(3, *size), empty(1, *size), empty(1, *size)
+        image, planes = empty(3, *size), self.inputs.planes
+        invdepth, alpha = (empty(int(name in planes), *size) for name in ("invdepth", "alpha"))
         features = empty(_channels(self.inputs.splats.features), *size)
         radii, whole = empty(n, dtype=torch.int32), torch.int32
         if self.inputs.counts:

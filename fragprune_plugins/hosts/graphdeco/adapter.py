@@ -131,6 +131,7 @@ class GraphdecoDialect(Dialect):
             means2d_hook=call.get("means2D"),
             scale_modifier=float(s.scale_modifier),
             compensation="antialiasing" if getattr(s, "antialiasing", False) else "none",
+            planes=("invdepth",) if self.outputs > 2 else (),
         )
 
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:

@@ -23,7 +23,7 @@ struct CellLists {
 
 // Each thread walks all splats for a band of rows of its own: cheaper than counting beforehand what
 // each part of the splats puts into each row, up to some number of threads.
-inline CellLists list_cells(Team& team, const Memory& memory, const Scene& scene) {
+FP_STAGE inline CellLists list_cells(Team& team, const Memory& memory, const Scene& scene) {
   const size_t across = scene.across, rows = scene.cells.size() / across;
   CellLists lists;
   lists.first.reserve(scene.cells.size() + 1);
@@ -144,7 +144,7 @@ class FrontToBack {
 // A tile is cut into blocks of 4 columns by kLanes / 4 rows, one pixel per lane.
 constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlockRows = kTile / kBlockHeight, kBlocks = kBlockRows * 4;
-static_assert(kCell * 4 == 64, "a cell's row of blocks fits a word");
+static_assert(kCell < 32, "a cell's tiles fit a word");
 
 // One bit for each block of a tile.
 #if FP_LANES == 4
@@ -152,33 +152,64 @@ typedef uint64_t Blocks;
 #else
 typedef uint32_t Blocks;
 #endif
+constexpr Blocks kAllBlocks = ~Blocks{0} >> (8 * sizeof(Blocks) - kBlocks);
 
-// The bits of a cell's tiles x0..x1, four for each.
-inline uint64_t tile_bits(int x0, int x1) {
-  return (uint64_t{2} << (4 * x1 + 3)) - (uint64_t{1} << 4 * x0);
+// One bit for each of a cell's tiles x0..x1.
+inline uint32_t tile_bits(int x0, int x1) { return (2u << x1) - (1u << x0); }
+
+#if FP_LANES > 4
+// One number for each row of blocks.
+typedef float Columns __attribute__((vector_size(4 * kBlockRows)));
+typedef int32_t WholeColumns __attribute__((vector_size(4 * kBlockRows)));
+#if FP_LANES == 8
+inline WholeColumns shifted_left(WholeColumns a, WholeColumns by) {
+  return (WholeColumns)_mm256_sllv_epi32((__m256i)a, (__m256i)by);
 }
+inline WholeColumns shifted_right(WholeColumns a, WholeColumns by) {
+  return (WholeColumns)_mm256_srlv_epi32((__m256i)a, (__m256i)by);
+}
+#else
+inline WholeColumns shifted_left(WholeColumns a, WholeColumns by) {
+  return (WholeColumns)_mm_sllv_epi32((__m128i)a, (__m128i)by);
+}
+inline WholeColumns shifted_right(WholeColumns a, WholeColumns by) {
+  return (WholeColumns)_mm_srlv_epi32((__m128i)a, (__m128i)by);
+}
+#endif
+#endif
 
 // Columns of blocks of a cell that kLanes splats reach, by row of blocks: begin..end, both included;
-// from 1 to 0 where there are none.
+// from 1 to 0 where there are none. To be rounded towards 0.
 struct BlockSpans {
-  alignas(64) int32_t begin[kBlockRows][kLanes], end[kBlockRows][kLanes];
-};
+  alignas(64) float begin[kLanes][kBlockRows], end[kLanes][kBlockRows];
 
-// One splat's, as bits.
-struct CellBlocks {
-  uint64_t row[kBlockRows], any;
-
-  CellBlocks(const BlockSpans& spans, int lane, uint64_t inside) : any(0) {
-    for (int r = 0; r < kBlockRows; r++) {
-      const uint64_t begin = uint64_t{1} << spans.begin[r][lane];
-      row[r] = ((uint64_t{2} << spans.end[r][lane]) - begin) & inside;
-      any |= row[r];
-    }
-  }
-  Blocks of_tile(int x) const {
+  // The blocks of the cell's tile x that one splat reaches.
+  Blocks of_tile(int lane, int x) const {
     Blocks blocks = 0;
-    for (int r = 0; r < kBlockRows; r++)
-      blocks |= static_cast<Blocks>(row[r] >> 4 * x & 15) << 4 * r;
+#if FP_LANES == 4
+    for (int r = 0; r < kBlockRows; r++) {
+      const int from = std::max(static_cast<int>(begin[lane][r]) - 4 * x, 0);
+      const int to = std::min(static_cast<int>(end[lane][r]) - 4 * x, 3);
+      if (from <= to) blocks |= static_cast<Blocks>((2u << to) - (1u << from)) << 4 * r;
+    }
+#else
+    Columns first, last;
+    std::memcpy(&first, begin[lane], sizeof first);
+    std::memcpy(&last, end[lane], sizeof last);
+    // columns to leave out, on the left and on the right; 4 or more: all
+    WholeColumns left = __builtin_convertvector(first, WholeColumns) - 4 * x, none = {}, place;
+    WholeColumns right = 4 * x + 3 - __builtin_convertvector(last, WholeColumns);
+    left = left > none ? left : none, right = right > none ? right : none;
+    for (int r = 0; r < kBlockRows; r++) place[r] = 4 * r;
+    const auto fifteen = none + 15;
+    const auto bits =
+        shifted_left(shifted_left(fifteen, left) & shifted_right(fifteen, right), place);
+    typedef uint64_t Pairs __attribute__((vector_size(sizeof bits)));
+    const auto pairs = bits_as<Pairs>(bits);
+    uint64_t all = 0;
+    for (int k = 0; k < kBlockRows / 2; k++) all |= pairs[k];
+    blocks = static_cast<Blocks>(all | all >> 32);
+#endif
     return blocks;
   }
 };
@@ -196,6 +227,7 @@ inline void find_blocks(const Splat* splats, const uint32_t* which, float spread
   const Ellipse<Lanes> e = ellipse_of(v[2], v[3], v[4], v[5] - v[7], away);
   const Lanes top = ceil(mean_y - e.half_height), bottom = floor(mean_y + e.half_height);
   const Lanes above = mean_y - away, below = mean_y + away;
+  Lanes begin[4], end[4];
   for (int row = 0; row < kBlockRows; row++) {
     const float first = static_cast<float>(row * kBlockHeight);
     const Lanes low = max(broadcast<Lanes>(first), top);
@@ -205,8 +237,11 @@ inline void find_blocks(const Splat* splats, const uint32_t* which, float spread
     const Lanes from = max(none, left), last = min(broadcast<Lanes>(kCell * kTile - 1), right);
     const Mask some = both(ge(high, low), ge(last, from));
     constexpr float block = 1.f / kBlockWidth;
-    store(to.begin[row], to_int(select(some, from * block, one)));
-    store(to.end[row], to_int(select(some, last * block, none)));
+    begin[row % 4] = select(some, from * block, one);
+    end[row % 4] = select(some, last * block, none);
+    if (row % 4 != 3) continue;
+    store_rows(begin, [&](int lane) { return to.begin[lane] + row - 3; });
+    store_rows(end, [&](int lane) { return to.end[lane] + row - 3; });
   }
 }
 

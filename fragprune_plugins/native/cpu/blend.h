@@ -6,6 +6,7 @@
 
 #include <cstring>
 #include <optional>
+#include <type_traits>
 #include <vector>
 
 #include "binning.h"
@@ -86,10 +87,38 @@ struct Batch {
   }
 };
 
+constexpr int words_of(int count) { return (count + kWord - 1) / kWord; }
+
 // For each block one bit per Gaussian, from one bit per block for each Gaussian.
 inline void transpose_bits(const Blocks* reached, int count, uint64_t (*words)[kBlocks]) {
-  std::memset(words, 0, kBatch / kWord * sizeof *words);
-#if FP_LANES == 16
+  std::memset(words, 0, static_cast<size_t>(words_of(count)) * sizeof *words);
+#if FP_LANES == 8
+  for (int j = 0; j < count; j += 32) {
+    alignas(32) Blocks mine[32] = {};
+    std::copy_n(reached + j, std::min(count - j, 32), mine);
+    // byte k of each to plane k: four from each register's halves, then these in order
+    const __m256i bytes = _mm256_setr_epi8(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15,
+                                           0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+    const auto four = [&](int i) {
+      const __m256i all = _mm256_load_si256(reinterpret_cast<const __m256i*>(mine + 8 * i));
+      return _mm256_shuffle_epi8(all, bytes);
+    };
+    const __m256i a = four(0), b = four(1), c = four(2), d = four(3);
+    const __m256i ab = _mm256_unpacklo_epi32(a, b), cd = _mm256_unpacklo_epi32(c, d);
+    const __m256i ab2 = _mm256_unpackhi_epi32(a, b), cd2 = _mm256_unpackhi_epi32(c, d);
+    const __m256i planes[4] = {_mm256_unpacklo_epi64(ab, cd), _mm256_unpackhi_epi64(ab, cd),
+                               _mm256_unpacklo_epi64(ab2, cd2), _mm256_unpackhi_epi64(ab2, cd2)};
+    const __m256i halves = _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7);
+    for (int k = 0; k < 4; k++) {
+      __m256i plane = _mm256_permutevar8x32_epi32(planes[k], halves);
+      for (int b = 8 * k + 7; b >= 8 * k; b--) {
+        const auto found = static_cast<uint32_t>(_mm256_movemask_epi8(plane));
+        words[j / kWord][b] |= uint64_t{found} << j % kWord;
+        plane = _mm256_add_epi8(plane, plane);
+      }
+    }
+  }
+#elif FP_LANES == 16
   for (int j = 0; j < count; j += kLanes) {
     const auto some = static_cast<__mmask16>((1u << std::min(count - j, kLanes)) - 1);
     const __m512i all = _mm512_loadu_si512(reached + j);
@@ -201,11 +230,11 @@ struct ExtraTile {
 };
 
 // Blends the Gaussians `which` of a batch, front to back, into one block, kInFlight at a time: their
-// exponentials do not wait for each other. `which` ends in kInFlight - 1 times kNobody. The batch is
-// what the list holds from `first` to `end`. Each is handed to `also(j, weight, drawn)`, too. Returns
-// how many it met. (Local copies of the pixels, one by one: a struct would be copied in small
-// pieces, which stalls the loads that follow.)
-template <bool kKeep, class Also>
+// exponentials do not wait for each other. `which` ends in kNobody. The batch is what the list holds
+// from `first` to `end`. Each is handed to `also(j, weight, drawn)`, too. Returns how many it met.
+// (Local copies of the pixels, one by one: a struct would be copied in small pieces, which stalls
+// the loads that follow.)
+template <bool kKeep, bool kDepth, class Also>
 inline int blend_block(const Batch& batch, const int32_t* which, int count, int first, int end,
                        Lanes px, Lanes py, float alpha_max, BlockPixels& pixels, Also also) {
   const Lanes floor = broadcast<Lanes>(kTransmittanceMin);
@@ -213,19 +242,19 @@ inline int blend_block(const Batch& batch, const int32_t* which, int count, int 
   Lanes r = pixels.r, g = pixels.g, blue = pixels.b, inv_z = pixels.inv_z;
   IntLanes drawn_count = pixels.drawn, stop = pixels.stop;
   Mask alive = pixels.alive;
-  int i = 0;
-  for (; i < count && bits(alive); i += kInFlight) {
-    Lanes alpha[kInFlight];
-    Mask inside[kInFlight];
-    for (int k = 0; k < kInFlight; k++) {
-      const int j = which[i + k];
+  const auto blend = [&](const int32_t* who, auto some) {
+    constexpr int kSome = decltype(some)::value;
+    Lanes alpha[kSome];
+    Mask inside[kSome];
+    for (int k = 0; k < kSome; k++) {
+      const int j = who[k];
       alpha[k] = meet(batch[j], px, py).exponent;
       inside[k] = ge(alpha[k], broadcast<Lanes>(batch.cut[j]));
     }
-    for (int k = 0; k < kInFlight; k++)
+    for (int k = 0; k < kSome; k++)
       alpha[k] = where(inside[k], capped(exp2(alpha[k]), alpha_max));
-    for (int k = 0; k < kInFlight; k++) {
-      const int j = which[i + k];
+    for (int k = 0; k < kSome; k++) {
+      const int j = who[k];
       const Lanes after = fnma(light, alpha[k], light);
       alive = both(alive, ge(after, floor));
       const Lanes weight = where(alive, alpha[k] * light);
@@ -236,12 +265,20 @@ inline int blend_block(const Batch& batch, const int32_t* which, int count, int 
       r = fma(weight, broadcast<Lanes>(batch.r[j]), r);
       g = fma(weight, broadcast<Lanes>(batch.g[j]), g);
       blue = fma(weight, broadcast<Lanes>(batch.b[j]), blue);
-      inv_z = fma(weight, broadcast<Lanes>(batch.inv_z[j]), inv_z);
+      if (kDepth) inv_z = fma(weight, broadcast<Lanes>(batch.inv_z[j]), inv_z);
       if (j != kNobody) also(j, weight, drawn);
     }
+  };
+  int i = 0;
+  for (; i + 2 < count && bits(alive); i += kInFlight)
+    blend(which + i, std::integral_constant<int, kInFlight>());
+  if (i < count && bits(alive)) {
+    blend(which + i, std::integral_constant<int, 2>());
+    i += 2;
   }
   pixels.light = light, pixels.alive = alive;
-  pixels.r = r, pixels.g = g, pixels.b = blue, pixels.inv_z = inv_z;
+  pixels.r = r, pixels.g = g, pixels.b = blue;
+  if (kDepth) pixels.inv_z = inv_z;
   pixels.drawn = drawn_count, pixels.stop = stop;
   return std::min(i, count);
 }
@@ -262,23 +299,45 @@ inline bool streams(const Canvas& c, const void* plane) {
          reinterpret_cast<uintptr_t>(plane) % kLine == 0;
 }
 
-// One number per pixel of a tile, from block order to rows of a plane of the image.
-template <class T>
-inline void paint_tile(const Canvas& c, T* plane, int x0, int y0, const T (*values)[kLanes]) {
+// One number per pixel of a tile, value_of(block) those of a block, to rows of a plane of the image.
+template <class T, class ValueOf>
+inline void paint_tile(const Canvas& c, T* plane, int x0, int y0, ValueOf value_of) {
   static_assert(kTile * sizeof(T) == kLine, "a tile's row is a line");
-  const int wide = std::min(kTile, c.width - x0), high = std::min(kTile, c.height - y0);
+  const size_t width = static_cast<size_t>(c.width);
+  plane += static_cast<size_t>(y0) * width + x0;
+  const auto each = [&](auto write) {  // write(to, from, x, y): 4 numbers to (x, y) of the tile
+    for (int b = 0; b < kBlocks; b++) {
+      T values[kLanes];
+      store(values, value_of(b));
+      for (int k = 0; k < kBlockHeight; k++) {
+        const int x = block_x(b), y = block_y(b) + k;
+        write(plane + static_cast<size_t>(y) * width + x, values + k * kBlockWidth, x, y);
+      }
+    }
+  };
+  if (x0 + kTile > c.width || y0 + kTile > c.height)
+    each([&](T* to, const T* from, int x, int y) {
+      for (int i = 0; i < kBlockWidth && x0 + x + i < c.width && y0 + y < c.height; i++)
+        to[i] = from[i];
+    });
+  else if (streams(c, plane))
+    each([](T* to, const T* from, int, int) { stream4(to, from); });
+  else
+    each([](T* to, const T* from, int, int) { std::memcpy(to, from, 4 * sizeof(T)); });
+}
+
+// One number everywhere in tiles side by side, from the tile at (x0, y0) on.
+template <class T>
+inline void fill_tiles(const Canvas& c, T* plane, int x0, int y0, int wide, T value) {
+  if (!plane) return;
   const bool past = streams(c, plane);
+  const T four[4] = {value, value, value, value};
+  const int end = std::min(wide, c.width - x0), high = std::min(kTile, c.height - y0);
   for (int y = 0; y < high; y++) {
-    T* to = plane + static_cast<size_t>(y0 + y) * c.width + x0;
-    const T(*from)[kLanes] = values + y / kBlockHeight * 4;
-    const int row = y % kBlockHeight * kBlockWidth;
-    if (past)
-      for (int b = 0; b < 4; b++) stream4(to + b * kBlockWidth, from[b] + row);
-    else if (wide == kTile)
-      for (int b = 0; b < 4; b++)
-        std::memcpy(to + b * kBlockWidth, from[b] + row, kBlockWidth * sizeof(T));
-    else
-      for (int x = 0; x < wide; x++) to[x] = from[x / kBlockWidth][row + x % kBlockWidth];
+    T* const to = plane + static_cast<size_t>(y0 + y) * c.width + x0;
+    for (int x = 0; past && x < end; x += kTile)
+      for (int i = 0; i < kTile; i += 4) stream4(to + x + i, four);
+    if (!past) std::fill_n(to, end, value);
   }
 }
 
@@ -314,15 +373,20 @@ struct OpenTile {
   int x, y;     // of the first pixel
   int blended;  // length of the list so far
   int waiting;  // what goes next
-  int alive;    // blocks
+  Blocks alive;  // blocks where something shows through
+  Blocks begun;  // blocks into which anything was blended; the others' pixels are unknown
   uint32_t splat[kBatch];
   Blocks reached[kBatch];
   BlockPixels blocks[kBlocks];
 
-  void open(int tile_x, int tile_y) {
+  void open(const Canvas& canvas, int tile_x, int tile_y) {
     x = tile_x, y = tile_y;
     blended = waiting = 0;
-    alive = kBlocks;
+    begun = 0, alive = kAllBlocks;
+    if (x + kTile <= canvas.width && y + kTile <= canvas.height) return;
+    for (int b = 0; b < kBlocks; b++)
+      if (x + block_x(b) >= canvas.width || y + block_y(b) >= canvas.height)
+        alive &= ~(Blocks{1} << b);
   }
   // A block before anything is blended into it.
   BlockPixels untouched(const Canvas& canvas, int b) const {
@@ -330,11 +394,10 @@ struct OpenTile {
     return {inside, none, none, none, none, broadcast_int(0), broadcast_int(0),
             ge(inside, broadcast<Lanes>(1.f))};
   }
-
 };
 
 // Blends what waits; returns lanes spent. A `list` grows by it; `extra` is NULL, unless kExtra.
-template <bool kKeep, bool kExtra>
+template <bool kKeep, bool kExtra, bool kDepth>
 inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const Canvas& canvas,
                              OpenTile& tile, TileList* list, ExtraTile* extra) {
   const int count = tile.waiting, first = tile.blended, end = first + count;
@@ -352,16 +415,17 @@ inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const 
   if (kExtra) extra->grow(end);
   uint64_t words[kBatch / kWord][kBlocks];
   transpose_bits(tile.reached, count, words);
+  Blocks todo = 0;
+  for (int j = 0; j < count; j++) todo |= tile.reached[j];
+  todo &= tile.alive;
   int64_t met = 0;
-  for (int b = 0; b < kBlocks; b++) {
+  for (; todo; todo &= todo - 1) {
+    const int b = __builtin_ctzll(todo);
     BlockPixels& pixels = tile.blocks[b];
-    if (first == 0) {
-      pixels = tile.untouched(canvas, b);
-      tile.alive -= !bits(pixels.alive);
-    }
-    if (!bits(pixels.alive)) continue;
+    if (!(tile.begun >> b & 1)) pixels = tile.untouched(canvas, b);
+    tile.begun |= Blocks{1} << b;
     int32_t which[kBatch + kLanes + kInFlight], *last = which;
-    for (int w = 0; w < kBatch / kWord; w++) last = expand(words[w][b], w * kWord, last);
+    for (int w = 0; w < words_of(count); w++) last = expand(words[w][b], w * kWord, last);
     std::fill_n(last, kInFlight - 1, kNobody);
     const int reached = static_cast<int>(last - which);
     if constexpr (kExtra) {
@@ -369,28 +433,39 @@ inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const 
         const float* row = extra->row(splats[tile.splat[j]]);
         extra->blocks[b].blend(extra->extras, row, first + j, weight, drawn, extra->each);
       };
-      met += blend_block<kKeep>(batch, which, reached, first, end, extra->samples.x[b],
-                                extra->samples.y[b], canvas.alpha_max, pixels, also);
+      met += blend_block<kKeep, true>(batch, which, reached, first, end, extra->samples.x[b],
+                                      extra->samples.y[b], canvas.alpha_max, pixels, also);
     } else {
       const Lanes px = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
       const Lanes py = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(b)));
-      met += blend_block<kKeep>(batch, which, reached, first, end, px, py, canvas.alpha_max, pixels,
-                                [](int, Lanes, Mask) {});
+      met += blend_block<kKeep, kDepth>(batch, which, reached, first, end, px, py,
+                                        canvas.alpha_max, pixels, [](int, Lanes, Mask) {});
     }
-    tile.alive -= !bits(pixels.alive);
+    if (!bits(pixels.alive)) tile.alive &= ~(Blocks{1} << b);
   }
   return kLanes * met;
 }
 
+// Paints tiles side by side, from the one at (x0, y0) on, into which nothing was blended.
+inline void paint_empty(const Canvas& c, int x0, int y0, int wide) {
+  const size_t size = static_cast<size_t>(c.width) * c.height;
+  for (int k = 0; k < 3; k++)
+    fill_tiles(c, c.image + size * k, x0, y0, wide, fma(1.f, c.background[k], 0.f));
+  fill_tiles(c, c.invdepth, x0, y0, wide, 0.f);
+  fill_tiles(c, c.alpha, x0, y0, wide, 0.f);
+  fill_tiles(c, c.fragments, x0, y0, wide, 0);
+}
+
 // Paints a tile; returns how many fragments it drew. `list` is read with `extra` only.
-inline int64_t close_tile(const Splat* splats, const Canvas& c, const OpenTile& tile,
+inline int64_t close_tile(const Splat* splats, const Canvas& c, OpenTile& tile,
                           const TileList* list, const ExtraTile* extra, TilePixels* keep) {
   const size_t size = static_cast<size_t>(c.width) * c.height;
+  for (Blocks rest = kAllBlocks & ~tile.begun; rest; rest &= rest - 1) {
+    const int b = __builtin_ctzll(rest);
+    tile.blocks[b] = tile.untouched(c, b);
+  }
   const auto paint = [&](auto* plane, auto value_of) {
-    if (!plane) return;
-    alignas(kLine) std::remove_reference_t<decltype(*plane)> values[kBlocks][kLanes];
-    for (int b = 0; b < kBlocks; b++) store(values[b], value_of(b));
-    paint_tile(c, plane, tile.x, tile.y, values);
+    if (plane) paint_tile(c, plane, tile.x, tile.y, value_of);
   };
   const auto over = [&](int b, Lanes v, float back) {
     return fma(tile.blocks[b].light, broadcast<Lanes>(back), v);

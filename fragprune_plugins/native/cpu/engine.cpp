@@ -116,8 +116,8 @@ class Cell {
         tiles_(picture.memory, static_cast<size_t>(wide_)) {
     const bool listed = p_.keep || p_.extras.any();
     for (int x = 0; x < wide_; x++) {
-      tiles_[x].open((left_ + x) * kTile, row_ * kTile);
-      open_ |= uint64_t{15} << 4 * x;
+      tiles_[x].open(p_.canvas, (left_ + x) * kTile, row_ * kTile);
+      open_ |= 1u << x;
       if (listed) lists_.emplace_back(p_.memory);
       if (p_.extras.any()) {
         const Tile tile{tiles_[x].x, tiles_[x].y, nullptr, nullptr, 0};
@@ -135,14 +135,19 @@ class Cell {
     const CellEntry *begin, *end;
     while (open_ && order.next(begin, end)) hand_out(begin, end);
     for (int x = 0; x < wide_; x++)
-      if (tiles_[x].waiting || tiles_[x].blended == 0) blend_waiting(x);
+      if (tiles_[x].waiting) blend_waiting(x);
     return evaluated_;
   }
 
   // Paints all of them and keeps what is to be kept; returns how many fragments were drawn.
   int64_t close() {
     int64_t drawn = 0;
+    const bool watched = p_.keep || p_.extras.any();
     for (int x = 0; x < wide_; x++) {
+      const int first = x;
+      while (!watched && x < wide_ && !tiles_[x].begun) x++;
+      if (x > first) paint_empty(p_.canvas, tiles_[first].x, tiles_[first].y, (x - first) * kTile);
+      if (x == wide_) break;
       const size_t t = static_cast<size_t>(row_) * static_cast<size_t>(p_.camera.tiles_x) +
                        static_cast<size_t>(left_ + x);
       const ExtraTile* extra = extra_.empty() ? nullptr : extra_[x].get();
@@ -162,7 +167,7 @@ class Cell {
     const float x = static_cast<float>(left_ * kTile), y = static_cast<float>(row_ * kTile);
     while (entry < end && open_) {
       uint32_t some[kSome + kLanes];  // of those that reach an open tile
-      uint64_t inside[kSome + kLanes];
+      uint32_t inside[kSome + kLanes];
       int n = 0;
       for (; entry < end && n < kSome; entry++) {
         some[n] = entry->splat;
@@ -175,33 +180,35 @@ class Cell {
         BlockSpans spans;
         find_blocks(splats_, some + i, p_.canvas.spread, x, y, spans);
         for (int lane = 0; lane < std::min(kLanes, n - i); lane++)
-          hand_out(some[i + lane], CellBlocks(spans, lane, inside[i + lane] & open_));
+          hand_out(some[i + lane], spans, lane, inside[i + lane] & open_);
       }
     }
   }
 
-  // Puts a splat on the lists of the open tiles that it reaches.
-  void hand_out(uint32_t splat, const CellBlocks& found) {
-    if (found.any) p_.colours.prefetch(splats_[splat]);
-    for (uint64_t any = found.any; any;) {
-      const int x = __builtin_ctzll(any) / 4;
-      any &= ~(uint64_t{15} << 4 * x);
+  // Puts a splat on the lists of those of the open tiles `inside` that it reaches.
+  void hand_out(uint32_t splat, const BlockSpans& spans, int lane, uint32_t inside) {
+    if (inside) p_.colours.prefetch(splats_[splat]);
+    for (; inside; inside &= inside - 1) {
+      const int x = __builtin_ctz(inside);
       OpenTile& tile = tiles_[x];
       tile.splat[tile.waiting] = splat;
-      tile.reached[tile.waiting] = found.of_tile(x);
-      if (++tile.waiting == kBatch) blend_waiting(x);
+      tile.reached[tile.waiting] = spans.of_tile(lane, x);
+      tile.waiting += tile.reached[tile.waiting] != 0;
+      if (tile.waiting == kBatch) blend_waiting(x);
     }
   }
 
   void blend_waiting(int x) {
-    const auto blend = p_.extras.any()
-                           ? p_.keep ? fp::blend_waiting<true, true> : fp::blend_waiting<false, true>
-                       : p_.keep ? fp::blend_waiting<true, false>
-                                 : fp::blend_waiting<false, false>;
+    static constexpr decltype(&fp::blend_waiting<false, false, false>) kinds[] = {
+        fp::blend_waiting<false, false, false>, fp::blend_waiting<false, false, true>,
+        fp::blend_waiting<true, false, false>,  fp::blend_waiting<true, false, true>,
+        fp::blend_waiting<false, true, true>,   fp::blend_waiting<true, true, true>};
+    const bool keep = p_.keep != nullptr, depth = p_.canvas.invdepth != nullptr;
+    const auto blend = kinds[p_.extras.any() ? 4 + keep : 2 * keep + depth];
     evaluated_ += blend(splats_, p_.colours, p_.canvas, tiles_[x],
                         lists_.empty() ? nullptr : &lists_[x],
                         extra_.empty() ? nullptr : extra_[x].get());
-    if (!tiles_[x].alive) open_ &= ~(uint64_t{15} << 4 * x);
+    if (!tiles_[x].alive) open_ &= ~(1u << x);
   }
 
   void keep_lists(KeptCell& to) const {
@@ -223,14 +230,14 @@ class Cell {
   const Splat* splats_;
   const size_t cell_;
   const int row_, left_, wide_;  // tiles
-  uint64_t open_ = 0;            // four bits for each tile where something shows through
+  uint32_t open_ = 0;            // one bit for each tile where something shows through
   int64_t evaluated_ = 0;
   Buffer<OpenTile> tiles_;
   std::vector<TileList> lists_;
   std::vector<std::unique_ptr<ExtraTile>> extra_;
 };
 
-void draw(Team& team, const Memory& memory, const Camera<float>& c, const fragprune_inputs& in,
+FP_STAGE void draw(Team& team, const Memory& memory, const Camera<float>& c, const fragprune_inputs& in,
           const Extras& extras, Scene& scene, const CellLists& lists, fragprune_outputs& out,
           fragprune_state* keep) {
   const float* back = in.background;
@@ -271,7 +278,7 @@ class Clock {
   std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
 };
 
-void forward(const fragprune_inputs& in, float spread, fragprune_outputs& out,
+FP_STAGE void forward(const fragprune_inputs& in, float spread, fragprune_outputs& out,
              const Memory& memory, fragprune_state* keep) {
   Clock clock;
   Team team(in.threads);
@@ -515,7 +522,7 @@ struct GradientRows {
   size_t width;
 };
 
-void backward(const fragprune_state& state, const fragprune_output_grads& grads,
+FP_STAGE void backward(const fragprune_state& state, const fragprune_output_grads& grads,
               const fragprune_input_grads& to, int threads) {
   const fragprune_inputs& in = state.in;
   const Scene& scene = state.scene;

@@ -133,6 +133,16 @@ class Colours {
     }
   }
 
+  // Colours `count` splats from the place `begin` on, none of which has one.
+  void fill_all(size_t begin, uint32_t count) const {
+    for (uint32_t i = 0; i < count; i += kLanes) {
+      uint32_t which[kLanes];
+      const uint32_t n = std::min<uint32_t>(kLanes, count - i);
+      for (uint32_t k = 0; k < n; k++) which[k] = static_cast<uint32_t>(begin) + i + k;
+      colour(which, static_cast<int>(n));
+    }
+  }
+
   // Asks for what fill() will read of a splat that has no colour yet.
   void prefetch(const Splat& s) const {
     if (!(read(s.brush.inv_z) < 0)) return;
@@ -222,7 +232,8 @@ class Projector {
     scene.count[k] = to.count;
     // Where few lie behind others they are coloured at once, in the order of the inputs: reading
     // them in the order of depth takes twice as long. The piece stands for all.
-    if (count_cells(to, scene) * scene.pieces() < many_) colour(begin, to.count);
+    if (count_cells(to, scene) * scene.pieces() < many_)
+      colours_.fill_all(begin, to.count);
   }
 
  private:
@@ -232,15 +243,6 @@ class Projector {
     Reach* reach;
     uint32_t count;
   };
-
-  void colour(size_t begin, uint32_t count) const {
-    uint32_t which[kBatch];
-    for (uint32_t j = 0; j < count; j += kBatch) {
-      const uint32_t n = std::min<uint32_t>(kBatch, count - j);
-      for (uint32_t i = 0; i < n; i++) which[i] = static_cast<uint32_t>(begin) + j + i;
-      colours_.fill(which, static_cast<int>(n));
-    }
-  }
 
   // Adds a piece's splats to the cells' counts, which all pieces share; returns how many tiles are
   // in their reach, added up.
@@ -385,7 +387,7 @@ class Projector {
 };
 
 // What only binning reads lies in `scratch`.
-inline Scene project_all(Team& team, const Memory& memory, const Memory& scratch,
+FP_STAGE inline Scene project_all(Team& team, const Memory& memory, const Memory& scratch,
                          const Camera<float>& c, const fragprune_inputs& in, int32_t* radii) {
   const size_t n = static_cast<size_t>(in.count), pieces = (n + kPiece - 1) / kPiece;
   Scene scene;

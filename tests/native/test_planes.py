@@ -1,0 +1,57 @@
+"""Planes that nobody asked for are not drawn, and the others are the same without them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.errors import InputError
+from fragprune_plugins.testing import scenes
+from fragprune_plugins.types import Plane
+
+SIZE = (70, 50)
+
+
+def lengths(*planes: Plane) -> dict[str, int]:
+    """Channels of each."""
+    return {name: int(name in planes) for name in ("invdepth", "alpha")}
+
+
+@pytest.mark.parametrize("planes", [(), ("alpha",), ("invdepth",), ("invdepth", "alpha")])
+@pytest.mark.parametrize("kind", [{}, {"features": 2}], ids=["plain", "features"])
+def test_a_plane_that_is_not_asked_for_changes_nothing_else(
+    engine: CpuEngine, planes: tuple[Plane, ...], kind: dict
+) -> None:
+    inputs = scenes.random_scene(3, 60, *SIZE, **kind)
+    thresholds = scenes.random_thresholds(3, 60)
+    whole = engine.rasterize(inputs, thresholds)
+    some = engine.rasterize(replace(inputs, planes=planes), thresholds)
+    assert torch.equal(some.image, whole.image)
+    assert torch.equal(some.radii, whole.radii)
+    for name, length in lengths(*planes).items():
+        assert torch.equal(getattr(some, name), getattr(whole, name)[:length])
+
+
+def test_gradients_of_the_image_alone_are_the_same(engine: CpuEngine) -> None:
+    grads = []
+    for planes in ((), ("invdepth", "alpha")):
+        made, leaves = scenes.leaves(scenes.random_scene(4, 60, *SIZE))
+        image = engine.rasterize(replace(made, planes=planes), None).image
+        image.square().sum().backward()
+        grads.append({name: leaf.grad for name, leaf in leaves.items()})
+    for name, grad in grads[0].items():
+        assert torch.equal(grad, grads[1][name]), name
+
+
+def test_an_engine_may_draw_more_than_was_asked_for() -> None:
+    inputs = replace(scenes.random_scene(3, 12, 20, 10), planes=())
+    assert ReferenceEngine().rasterize(inputs, None).alpha.shape == (1, 10, 20)
+
+
+def test_a_plane_of_another_name_is_refused() -> None:
+    with pytest.raises(InputError, match="planes"):
+        replace(scenes.random_scene(3, 12, 20, 10), planes=("depth",))
