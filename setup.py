@@ -15,8 +15,8 @@ FLAGS += ["-fvisibility=hidden", "-pthread"]
 AVX512 = [*(f"-mavx512{part}" for part in ("f", "dq", "vl", "bw")), "-mprefer-vector-width=512"]
 BUILDS = {  # name: floats in a vector, compiler flags
     "baseline": (4, FLAGS),
-    "avx2": (8, [*FLAGS, "-mavx2", "-mfma", "-mbmi2"]),
-    "avx512": (16, [*FLAGS, *AVX512, "-mfma", "-mbmi2"]),
+    "avx2": (8, [*FLAGS, "-mavx2", "-mfma", "-mbmi", "-mbmi2"]),
+    "avx512": (16, [*FLAGS, *AVX512, "-mfma", "-mbmi", "-mbmi2"]),
 }
 
 if __name__ == "__main__":

@@ -117,14 +117,19 @@ class FrontToBack {
   void sort(size_t n) {
     const Range all(sorted_.data(), sorted_.data() + n);
     Buffer<CellEntry> other(memory_, n);
-    for (int shift = 0; shift < all.width(); shift += kDigitBits) {
-      uint32_t place[1 << kDigitBits] = {};
+    // Digits as wide as the count's: counting them then costs about what moving the entries does.
+    const int widest = std::clamp(31 - __builtin_clz(static_cast<uint32_t>(n) | 1), 5, kDigitBits);
+    const int digits = (all.width() + widest - 1) / widest;
+    const int width = digits ? (all.width() + digits - 1) / digits : 0;  // bits
+    for (int shift = 0; shift < all.width(); shift += width) {
+      uint32_t place[1 << kDigitBits];
+      std::fill_n(place, 1u << width, 0);
       const auto digit = [&](const CellEntry& e) {
-        return (e.depth - all.least) >> shift & ((1 << kDigitBits) - 1);
+        return (e.depth - all.least) >> shift & ((1u << width) - 1);
       };
       for (size_t i = 0; i < n; i++) place[digit(sorted_[i])]++;
       uint32_t total = 0;
-      for (uint32_t& p : place) total += std::exchange(p, total);
+      for (uint32_t i = 0; i < 1u << width; i++) total += std::exchange(place[i], total);
       for (size_t i = 0; i < n; i++) other[place[digit(sorted_[i])]++] = sorted_[i];
       sorted_.swap(other);
     }

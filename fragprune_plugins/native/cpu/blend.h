@@ -45,6 +45,22 @@ inline Lanes lane_y() {
 inline int block_x(int block) { return block % 4 * kBlockWidth; }
 inline int block_y(int block) { return block / 4 * kBlockHeight; }
 
+// Where the pixels of each block lie in their tile.
+class BlockCentres {
+ public:
+  BlockCentres() {
+    for (int b = 0; b < 4; b++)
+      xs_[b] = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
+    for (int b = 0; b < kBlockRows; b++)
+      ys_[b] = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(4 * b)));
+  }
+  Lanes x(int block) const { return xs_[block % 4]; }
+  Lanes y(int block) const { return ys_[block / 4]; }
+
+ private:
+  Lanes xs_[4], ys_[kBlockRows];  // of each column and row of blocks
+};
+
 // Up to kBatch Gaussians in coordinates of a tile, one array per number.
 struct Batch {
   typedef float Numbers[kBatch + 1];
@@ -143,10 +159,6 @@ struct BlockPixels {
   Mask alive;  // has not stopped, and lies in the image
 };
 
-struct TileCounts {
-  int64_t drawn = 0, evaluated = 0;
-};
-
 // What some dialects want beyond the picture: more channels, samples beside the centres, scores.
 struct Extras {
   const float* offsets;   // (H, W, 2); or NULL
@@ -162,9 +174,9 @@ struct Samples {
   Lanes x[kBlocks], y[kBlocks];
 
   Samples(const Tile& tile, int width, int height, const float* offsets) {
+    const BlockCentres centres;
     for (int b = 0; b < kBlocks; b++) {
-      x[b] = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
-      y[b] = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(b)));
+      x[b] = centres.x(b), y[b] = centres.y(b);
       for (int i = 0; offsets && i < kLanes; i++) {
         const int column = tile.x + block_x(b) + i % kBlockWidth;
         const int row = tile.y + block_y(b) + i / kBlockWidth;
@@ -236,12 +248,13 @@ struct ExtraTile {
 // the loads that follow.)
 template <bool kKeep, bool kDepth, class Also>
 inline int blend_block(const Batch& batch, const int32_t* which, int count, int first, int end,
-                       Lanes px, Lanes py, float alpha_max, BlockPixels& pixels, Also also) {
+                       Lanes px, Lanes py, float alpha_max, const BlockPixels& before,
+                       BlockPixels& pixels, Also also) {
   const Lanes floor = broadcast<Lanes>(kTransmittanceMin);
-  Lanes light = pixels.light;
-  Lanes r = pixels.r, g = pixels.g, blue = pixels.b, inv_z = pixels.inv_z;
-  IntLanes drawn_count = pixels.drawn, stop = pixels.stop;
-  Mask alive = pixels.alive;
+  Lanes light = before.light;
+  Lanes r = before.r, g = before.g, blue = before.b, inv_z = before.inv_z;
+  IntLanes drawn_count = before.drawn, stop = before.stop;
+  Mask alive = before.alive;
   const auto blend = [&](const int32_t* who, auto some) {
     constexpr int kSome = decltype(some)::value;
     Lanes alpha[kSome];
@@ -278,7 +291,7 @@ inline int blend_block(const Batch& batch, const int32_t* which, int count, int 
   }
   pixels.light = light, pixels.alive = alive;
   pixels.r = r, pixels.g = g, pixels.b = blue;
-  if (kDepth) pixels.inv_z = inv_z;
+  pixels.inv_z = inv_z;
   pixels.drawn = drawn_count, pixels.stop = stop;
   return std::min(i, count);
 }
@@ -306,14 +319,14 @@ inline void paint_tile(const Canvas& c, T* plane, int x0, int y0, ValueOf value_
   const size_t width = static_cast<size_t>(c.width);
   plane += static_cast<size_t>(y0) * width + x0;
   const auto each = [&](auto write) {  // write(to, from, x, y): 4 numbers to (x, y) of the tile
-    for (int b = 0; b < kBlocks; b++) {
-      T values[kLanes];
-      store(values, value_of(b));
-      for (int k = 0; k < kBlockHeight; k++) {
-        const int x = block_x(b), y = block_y(b) + k;
-        write(plane + static_cast<size_t>(y) * width + x, values + k * kBlockWidth, x, y);
+    T* row = plane;
+    for (int y = 0; y < kTile; y += kBlockHeight, row += kBlockHeight * width)
+      for (int x = 0; x < kTile; x += kBlockWidth) {
+        T values[kLanes];
+        store(values, value_of(y / kBlockHeight * 4 + x / kBlockWidth));
+        for (int k = 0; k < kBlockHeight; k++)
+          write(row + k * width + x, values + k * kBlockWidth, x, y + k);
       }
-    }
   };
   if (x0 + kTile > c.width || y0 + kTile > c.height)
     each([&](T* to, const T* from, int x, int y) {
@@ -360,6 +373,13 @@ inline Lanes in_image(const Canvas& c, int x0, int y0) {
   return load(a);
 }
 
+// A block before anything is blended into it; `inside` is 1 in the image, 0 beyond it.
+inline BlockPixels untouched(Lanes inside) {
+  const Lanes none = broadcast<Lanes>(0.f);
+  return {inside, none, none, none, none, broadcast_int(0), broadcast_int(0),
+          ge(inside, broadcast<Lanes>(1.f))};
+}
+
 // A tile's list as far as it was blended, for those who want to know afterwards.
 struct TileList {
   Heap<uint32_t> splat;
@@ -390,9 +410,7 @@ struct OpenTile {
   }
   // A block before anything is blended into it.
   BlockPixels untouched(const Canvas& canvas, int b) const {
-    const Lanes inside = in_image(canvas, x + block_x(b), y + block_y(b)), none = inside * 0.f;
-    return {inside, none, none, none, none, broadcast_int(0), broadcast_int(0),
-            ge(inside, broadcast<Lanes>(1.f))};
+    return fp::untouched(in_image(canvas, x + block_x(b), y + block_y(b)));
   }
 };
 
@@ -418,11 +436,16 @@ inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const 
   Blocks todo = 0;
   for (int j = 0; j < count; j++) todo |= tile.reached[j];
   todo &= tile.alive;
+  const BlockCentres centres;
+  const BlockPixels inner = untouched(broadcast<Lanes>(1.f));
+  const bool whole = tile.x + kTile <= canvas.width && tile.y + kTile <= canvas.height;
   int64_t met = 0;
   for (; todo; todo &= todo - 1) {
     const int b = __builtin_ctzll(todo);
-    BlockPixels& pixels = tile.blocks[b];
-    if (!(tile.begun >> b & 1)) pixels = tile.untouched(canvas, b);
+    BlockPixels edge, &pixels = tile.blocks[b];
+    const bool begun = tile.begun >> b & 1;
+    if (!begun && !whole) edge = tile.untouched(canvas, b);
+    const BlockPixels& before = begun ? pixels : whole ? inner : edge;
     tile.begun |= Blocks{1} << b;
     int32_t which[kBatch + kLanes + kInFlight], *last = which;
     for (int w = 0; w < words_of(count); w++) last = expand(words[w][b], w * kWord, last);
@@ -434,12 +457,11 @@ inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const 
         extra->blocks[b].blend(extra->extras, row, first + j, weight, drawn, extra->each);
       };
       met += blend_block<kKeep, true>(batch, which, reached, first, end, extra->samples.x[b],
-                                      extra->samples.y[b], canvas.alpha_max, pixels, also);
+                                      extra->samples.y[b], canvas.alpha_max, before, pixels, also);
     } else {
-      const Lanes px = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
-      const Lanes py = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(b)));
-      met += blend_block<kKeep, kDepth>(batch, which, reached, first, end, px, py,
-                                        canvas.alpha_max, pixels, [](int, Lanes, Mask) {});
+      met += blend_block<kKeep, kDepth>(batch, which, reached, first, end, centres.x(b),
+                                        centres.y(b), canvas.alpha_max, before, pixels,
+                                        [](int, Lanes, Mask) {});
     }
     if (!bits(pixels.alive)) tile.alive &= ~(Blocks{1} << b);
   }
@@ -627,11 +649,7 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
                          const CellSlots& slot, const Asked& asked, LossPixels& loss, float* out) {
   constexpr int base = sums_of(kWant), most = kWant & kExtra ? kMostSums : base;
   const int n = kWant & kExtra ? base + asked.extras.feature_count : base;
-  Lanes xs[4], ys[kBlockRows];  // of each column and row of blocks
-  for (int b = 0; b < 4; b++)
-    xs[b] = lane_x() + broadcast<Lanes>(static_cast<float>(block_x(b)));
-  for (int b = 0; b < kBlockRows; b++)
-    ys[b] = lane_y() + broadcast<Lanes>(static_cast<float>(block_y(4 * b)));
+  const BlockCentres centres;
   std::optional<Samples> samples;
   if (kWant & kExtra)
     samples.emplace(tile, static_cast<int>(asked.width), static_cast<int>(asked.height),
@@ -672,8 +690,8 @@ inline void unblend_tile(const Splat* splats, const Tile& tile, const TilePixels
     for (; todo; todo &= todo - 1) {
       const int b = __builtin_ctzll(todo);
       unblend_block<kWant>(brush, rim, asked, beyond, position,
-                           kWant & kExtra ? samples->x[b] : xs[b % 4],
-                           kWant & kExtra ? samples->y[b] : ys[b / 4], kept.stop, b * kLanes, loss,
+                           kWant & kExtra ? samples->x[b] : centres.x(b),
+                           kWant & kExtra ? samples->y[b] : centres.y(b), kept.stop, b * kLanes, loss,
                            sums);
     }
     float all[most];

@@ -278,12 +278,7 @@ inline int32_t* expand(uint64_t word, int32_t base, int32_t* end) {
     end += __builtin_popcount(some);
   }
 #else
-  int32_t* const last = end + __builtin_popcountll(word);
-  for (; end < last; end += 2) {  // two at once, the second perhaps beyond the end
-    end[0] = base + __builtin_ctzll(word), word &= word - 1;
-    end[1] = base + __builtin_ctzll(word | uint64_t{1} << 63), word &= word - 1;
-  }
-  end = last;
+  for (; word; word &= word - 1) *end++ = base + __builtin_ctzll(word);
 #endif
   return end;
 }
