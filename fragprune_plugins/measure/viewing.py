@@ -80,5 +80,5 @@ def render_view(
     splat, store = (model, None) if isinstance(model, SplatFile) else model
     view = (overview(splat) if view is None else view).to(splat.xyz.device)
     with torch.no_grad():
-        inputs = RasterInputs(view, splat.splats())
+        inputs = RasterInputs(view, splat.splats(), planes=())
         return picture(rasterize(inputs, store, engine=engine).image)
