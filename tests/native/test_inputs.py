@@ -29,7 +29,7 @@ GIVEN = {
 }
 THRESHOLDS = scenes.random_thresholds(0, N)
 
-NO_INPUTS = {"view", "splats", "means2d_hook", "counts", "scores"}
+NO_INPUTS = {"view", "splats", "means2d_hook", "counts", "scores", "planes"}
 """Fields that hold others, whose values are not used, or that say what comes back."""
 
 
