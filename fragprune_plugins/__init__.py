@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.datasets.cameras import load_cameras
     from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.engines import slice_at
-    from fragprune_plugins.finetuning import FinetuneResult, finetune
+    from fragprune_plugins.finetuning import FinetuneResult, finetune, own_pictures
     from fragprune_plugins.injection.api import activate, deactivate, paused
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -62,6 +62,7 @@ _HOME = {
     "load_cameras": "datasets.cameras",
     "load_dataset": "datasets.dataset",
     "overview": "measure.viewing",
+    "own_pictures": "finetuning",
     "paused": "injection.api",
     "rasterize": "plugins.hooks",
     "render_view": "measure.viewing",
@@ -93,6 +94,7 @@ __all__ = [
     "load_cameras",
     "load_dataset",
     "overview",
+    "own_pictures",
     "paused",
     "rasterize",
     "render_view",

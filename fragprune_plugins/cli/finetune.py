@@ -1,4 +1,4 @@
-"""``fragprune finetune``: learns thresholds and opacities of a trained splat on its photographs."""
+"""``fragprune finetune``: learns a trained splat's thresholds from photographs, or from itself."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from fragprune_plugins.cli.common import (
     Command,
     OutFile,
     Report,
-    data_options,
     describe_dropped,
     dropping,
     engine_options,
+    image_options,
     open_engine,
     require_place,
 )
 from fragprune_plugins.cli.learning import learning_options
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.interruption import EXIT_CODE, sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import models
 
 if TYPE_CHECKING:
+    from fragprune_plugins.datasets.dataset import Dataset
+    from fragprune_plugins.engines import Engine
     from fragprune_plugins.finetuning import FinetuneResult
 
 
@@ -34,7 +37,25 @@ if TYPE_CHECKING:
 @click.option(
     "--out", type=OutFile(".ply"), required=True, help="New .ply; its sidecar goes beside it."
 )
-@data_options
+@click.option(
+    "--data",
+    type=FILE,
+    help="Scene folder: COLMAP (sparse/, images/) or Blender (transforms_*.json).",
+)
+@click.option(
+    "--self",
+    "itself",
+    is_flag=True,
+    help="Learn from MODEL's own pictures instead of photographs. Cameras: those of --data or "
+    "--cameras; else all around MODEL, which suits an object. A scene seen from within (a room, a "
+    "street) needs its own cameras: those around it see its walls from behind.",
+)
+@click.option(
+    "--cameras",
+    type=FILE,
+    help="With --self: cameras.json of a 3DGS model, or transforms_*.json; every 8th is held out.",
+)
+@image_options
 @learning_options
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
@@ -45,13 +66,15 @@ if TYPE_CHECKING:
     "--drop-invisible",
     "drop",
     is_flag=True,
-    help="Leave out Gaussians that reach no pixel of any training or held-out view in --data.",
+    help="Leave out Gaussians that reach no pixel of any training or held-out view.",
 )
 @engine_options
 def command(
     model: Path,
     out: Path,
-    data: Path,
+    data: Path | None,
+    itself: bool,
+    cameras: Path | None,
     resolution: int,
     white_background: bool,
     settings: Settings,
@@ -71,12 +94,18 @@ def command(
     models on held-out views. A line below it measures OUT without its thresholds, as other viewers
     draw it. Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
 
+    With --self no photograph is read: MODEL's own pictures are what it must go on showing, also
+    between the cameras. PSNR is against those pictures then.
+
     \b
     Examples:
       fragprune finetune point_cloud.ply --data scene --out pruned.ply --quick
       fragprune finetune point_cloud.ply --data scene --out half.ply --target-speedup 2
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
+      fragprune finetune statue.ply --self --out pruned.ply
+      fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
+    _require_target(data, itself, cameras, settings)
     require_place(out, model)
 
     from copy import deepcopy
@@ -90,8 +119,20 @@ def command(
     rasterizer, where = open_engine(engine, device, threads)
     truncation = settings.truncate and not no_truncation
     splat, store = models.load(model, truncation=truncation, device=where)
-    dataset = load_dataset(data, resolution=resolution, white_background=white_background)
     start = Candidate(splat, deepcopy(store))  # learning changes the store
+    if itself:
+        dataset = _own_pictures(
+            models.Model(splat, store),
+            data,
+            cameras,
+            resolution,
+            white_background,
+            seed,
+            rasterizer,
+        )
+    else:
+        assert data is not None
+        dataset = load_dataset(data, resolution=resolution, white_background=white_background)
 
     with sigterm_interrupts():
         result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
@@ -119,6 +160,7 @@ def command(
     report = {
         "model": str(model),
         "out": str(out),
+        "target": after["target"],
         "before": before,
         "after": after,
         "untruncated": without[0] if without else None,
@@ -151,15 +193,15 @@ def command(
     lines += [_describe_untruncated(before, plain) for plain in without]
     together = " Keep the two together." if without else ""
     lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
-    more = {
-        "curves": rows,
-        "photographs": Photographs(data, Resolution(resolution), white_background).as_dict()
-        | {
+    more: dict[str, Any] = {"curves": rows}
+    if data is not None:
+        more["photographs"] = Photographs(
+            data, Resolution(resolution), white_background
+        ).as_dict() | {
             "models": [str(model.resolve()), str(out.resolve())],
             "filtered": False,
             "drawing": {},
-        },
-    }
+        }
     records.leave(out, "finetune", report | more)
     return Report(report, "\n".join(lines), exit_code=130 if result.interrupted else 0)
 
@@ -182,6 +224,68 @@ def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:
     return Report(data, text, exit_code=EXIT_CODE)
 
 
+def _require_target(
+    data: Path | None, itself: bool, cameras: Path | None, settings: Settings
+) -> None:
+    """Prove, before any work, that it is clear what MODEL must look like.
+
+    Raises:
+        UsageError: nothing says so, or two things do.
+    """
+    if not itself and cameras is not None:
+        raise UsageError(
+            "options",
+            "--cameras without --self",
+            "photographs, or the model's own pictures from those cameras",
+            "Add --self, or pass --data FOLDER instead of --cameras.",
+        )
+    if not itself and data is None:
+        raise UsageError(
+            "options",
+            "neither --data nor --self",
+            "what to learn from",
+            "Pass --data FOLDER with photographs; without any, --self.",
+        )
+    if data is not None and cameras is not None:
+        raise UsageError(
+            "options", "--data with --cameras", "one source of cameras", "Drop one of the two."
+        )
+    if itself and not settings.truncate:
+        raise UsageError(
+            "options",
+            "--self with --control",
+            "something to learn: without truncation the model is its own target already",
+            "Drop --control; what it came in as is the comparison.",
+        )
+
+
+def _own_pictures(
+    model: models.Model,
+    data: Path | None,
+    cameras: Path | None,
+    resolution: int,
+    white_background: bool,
+    seed: int,
+    engine: Engine,
+) -> Dataset:
+    """The pictures of a model from the cameras asked for."""
+    import torch
+
+    from fragprune_plugins.datasets.cameras import divided, load_cameras, load_scene_cameras
+    from fragprune_plugins.datasets.generated import around
+    from fragprune_plugins.finetuning import own_pictures
+
+    held_out = None
+    if data is not None:
+        views, held_out = load_scene_cameras(data, white_background=white_background)
+        held_out = divided(held_out, resolution)
+    elif cameras is not None:
+        views = load_cameras(cameras, white_background=white_background)
+    else:
+        views = around(model.splat, background=torch.full((3,), float(white_background)), seed=seed)
+    return own_pictures(model, divided(views, resolution), held_out, engine=engine, seed=seed)
+
+
 def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
     """A line on the fine-tuned model without its thresholds.
 
@@ -189,8 +293,10 @@ def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
         before: measurement of the model before fine-tuning.
         plain: measurement of the fine-tuned model without thresholds.
     """
+    own = plain["target"] == "itself"
+    compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
     return (
         f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
-        f"({plain['psnr'] - before['psnr']:+.2f}), {plain['fragments_per_pixel']:.1f} fragments "
+        f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "
         f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
     )

@@ -1,4 +1,4 @@
-"""Cameras without photographs, for ``fragprune render --cameras FILE``.
+"""Cameras without their photographs: of a file, or of a scene folder.
 
 Two kinds of file: the ``cameras.json`` a host writes beside its model (a list of ``id, img_name,
 width, height, position, rotation, fx, fy``; rotation is camera to world, principal point centred),
@@ -7,12 +7,15 @@ and a Blender ``transforms_*.json``, which needs ``w`` and ``h`` where its image
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from fragprune_plugins.datasets.blender import load_json, read_transforms
+from fragprune_plugins.datasets.dataset import read_scene
+from fragprune_plugins.datasets.photographs import Resolution
 from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.types import View
@@ -41,6 +44,31 @@ def load_cameras(path: Path, *, white_background: bool = False) -> list[tuple[st
         raise DatasetError(str(path), "0 cameras", "at least one", "Pass another file.")
     background = torch.full((3,), float(white_background))
     return [(name, camera.view(background)) for name, camera in cameras]
+
+
+def load_scene_cameras(
+    folder: Path, *, white_background: bool = False
+) -> tuple[list[tuple[str, View]], list[tuple[str, View]]]:
+    """Read the named training and held-out views of a scene folder, at their cameras' own sizes.
+
+    Raises:
+        DatasetError: see ``dataset.read_scene``.
+    """
+    background = torch.full((3,), float(white_background))
+    train, test = (
+        [(name, camera.view(background)) for name, camera, _ in part] for part in read_scene(folder)
+    )
+    return train, test
+
+
+def divided(views: list[tuple[str, View]], by: int) -> list[tuple[str, View]]:
+    """The same views with both sides of their pictures divided, rounded as photographs are."""
+    size = Resolution(divide=by)
+    sizes = [size.of(view.width, view.height) for _, view in views]
+    return [
+        (name, replace(view, width=width, height=height))
+        for (name, view), (width, height) in zip(views, sizes, strict=True)
+    ]
 
 
 def _camera(entry: dict[str, Any]) -> Camera:

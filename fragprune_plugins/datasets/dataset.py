@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -21,34 +22,55 @@ from fragprune_plugins.types import View
 
 _ASPECT_TOLERANCE = 0.01
 
+SomeShot = TypeVar("SomeShot", bound="Shot")
+
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One photograph with its camera.
+    """A camera, and the picture to be seen from it.
 
     Attributes:
         name: unique in its dataset.
-        view: the camera, with the background colour that the image was composited over.
+        view: the camera, with the background colour of its picture.
+        target: what the picture is: "photographs", or "itself" for the model's own.
+    """
+
+    target: ClassVar[str] = "photographs"
+
+    name: str
+    view: View
+
+    __repr__ = one_line
+
+    @property
+    def image(self) -> Tensor:
+        """(3, H, W) RGB on the view's device."""
+        raise NotImplementedError
+
+    def to(self: SomeShot, device: torch.device | str) -> SomeShot:
+        """The same with its view on a device; ``self`` if it is there already."""
+        if self.view.background.device == torch.device(device):
+            return self
+        return replace(self, view=self.view.to(device))
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph(Shot):
+    """One photograph with its camera; RGB in [0, 1], composited over the view's background.
+
+    Attributes:
         path: the image file. It is read at first use and kept in main memory at 8 bits a channel,
             because a scene's photographs may be larger than a GPU's memory.
     """
 
-    name: str
-    view: View
     path: Path
 
     __repr__ = one_line
 
     @property
     def image(self) -> Tensor:
-        """(3, H, W) RGB in [0, 1], composited over the view's background, on its device."""
+        """(3, H, W) RGB in [0, 1] on the view's device."""
         return self._bytes.to(self.view.background.device).permute(2, 0, 1).float() / 255
-
-    def to(self, device: torch.device | str) -> Shot:
-        """The same photograph with its view on a device; ``self`` if it is there already."""
-        if self.view.background.device == torch.device(device):
-            return self
-        return replace(self, view=self.view.to(device))
 
     @cached_property
     def _bytes(self) -> Tensor:
@@ -126,6 +148,28 @@ def load_dataset(
         DatasetError: the folder has neither layout or both, an image is missing, a camera model is
             unknown, or sizes do not match.
     """
+    background = torch.full((3,), float(white_background))
+    size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
+    train, test = (
+        [make_shot(name, camera, path, background, size) for name, camera, path in part]
+        for part in read_scene(folder, images)
+    )
+    return Dataset(train, test)
+
+
+def read_scene(folder: Path, images: str = "images") -> tuple[list[colmap.Row], list[colmap.Row]]:
+    """Read the training and the held-out cameras of a scene, and where their images should be.
+
+    No image is opened, but for the size of one whose transforms file has no ``w`` and ``h``.
+
+    Args:
+        folder: the scene.
+        images: name of the image folder of a COLMAP scene.
+
+    Raises:
+        DatasetError: the folder has neither layout or both, a file is broken, a camera model is
+            unknown, or there are no training or no held-out cameras.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise DatasetError(
@@ -140,13 +184,7 @@ def load_dataset(
             "Move one of the two aside." if is_colmap else "Pass the folder that contains them."
         )
         raise DatasetError(str(folder), found, layouts, remedy)
-    background = torch.full((3,), float(white_background))
-    size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
-    parts = colmap.read(folder, images) if is_colmap else blender.read(folder)
-    train, test = (
-        [make_shot(name, camera, path, background, size) for name, camera, path in part]
-        for part in parts
-    )
+    train, test = colmap.read(folder, images) if is_colmap else blender.read(folder)
     for name, part in (("training", train), ("held-out", test)):
         if not part:
             raise DatasetError(
@@ -155,12 +193,12 @@ def load_dataset(
                 "at least one training and one held-out view",
                 "Add photographs; every 8th is held out.",
             )
-    return Dataset(train, test)
+    return train, test
 
 
 def make_shot(
     name: str, camera: Camera, path: Path, background: Tensor, resolution: Resolution
-) -> Shot:
+) -> Photograph:
     """Pair an image file with its camera. This reads only the file's header.
 
     Raises:
@@ -174,4 +212,4 @@ def make_shot(
             f"those of its camera, {camera.width}x{camera.height}, or that aspect",
             "Use the images that the cameras were calibrated with.",
         )
-    return Shot(name, camera.resized(*resolution.of(width, height)).view(background), path)
+    return Photograph(name, camera.resized(*resolution.of(width, height)).view(background), path)

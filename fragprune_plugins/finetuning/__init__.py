@@ -1,6 +1,7 @@
-"""Fine-tuning a trained splat on its photographs, without a host."""
+"""Fine-tuning a trained splat on its photographs or its own pictures, without a host."""
 
 from fragprune_plugins.datasets.dataset import Dataset, Shot, load_dataset
+from fragprune_plugins.finetuning.itself import own_pictures
 from fragprune_plugins.finetuning.loop import FinetuneResult, finetune, save
 
-__all__ = ["Dataset", "FinetuneResult", "Shot", "finetune", "load_dataset", "save"]
+__all__ = ["Dataset", "FinetuneResult", "Shot", "finetune", "load_dataset", "own_pictures", "save"]

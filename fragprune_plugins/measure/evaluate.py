@@ -1,4 +1,4 @@
-"""Measures quality, fragments and latency of splats on photographs."""
+"""Measures quality, fragments and latency of splats against photographs or own pictures."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def measure(
     engine: str | Engine = "auto",
     repeats: int = REPEATS,
 ) -> list[dict[str, Any]]:
-    """Measure splats against the same photographs, timing them in turns.
+    """Measure splats against the same pictures, timing them in turns.
 
     Frames of all candidates are timed in turns, so that a busy machine slows them alike. A frame is
     one forward rasterization of activated Gaussians with given thresholds, without reading or
@@ -86,7 +86,8 @@ def measure(
         repeats: number of timed frames for each view and candidate.
 
     Returns:
-        One dict a candidate: psnr (dB), ssim, lpips (None), fragments_per_pixel,
+        One dict a candidate: target ("photographs", or "itself" for a model's own pictures), psnr
+        (dB; infinite against itself), ssim, lpips (None), fragments_per_pixel,
         evaluated_per_pixel, gaussians, frame_ms (median over views and repeats), frame_ms_se
         (standard error over repeats of the median over views), engine, device, views.
     """
@@ -111,6 +112,7 @@ def measure(
         quality, likeness, fragments, evaluated = map(statistics.fmean, zip(*rows, strict=True))
         reports.append(
             {
+                "target": shots[0].target,
                 "psnr": quality,
                 "ssim": likeness,
                 "lpips": None,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from fragprune_plugins.datasets.generated import bounds
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.measure.pictures import picture
 from fragprune_plugins.plugins.hooks import rasterize
@@ -17,8 +18,6 @@ from fragprune_plugins.types import RasterInputs, View
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-
-_SHOWN = 0.9  # share of the Gaussians that a camera has to show: some float far out
 
 
 def overview(
@@ -45,16 +44,14 @@ def overview(
     Raises:
         InputError: there is no such view.
     """
-    centre = splat.xyz.median(dim=0).values.cpu()
-    distances = (splat.xyz.cpu() - centre).norm(dim=1)
-    radius = float(distances.kthvalue(math.ceil(_SHOWN * len(splat))).values)
+    centre, radius = bounds(splat)
     half = math.atan(math.tan(math.radians(fov_y) / 2) * min(1.0, width / height))
     above = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float32), dim=0)
     # As COLMAP's first camera looks: along z, or along y where z is up.
     ahead = torch.eye(3)[2 if abs(float(above[2])) < 0.9 else 1]
     ahead = torch.nn.functional.normalize(ahead - above * (ahead @ above), dim=0)
     away = torch.nn.functional.normalize(0.4 * above - ahead, dim=0)
-    distance = max(radius, 1e-3) / math.sin(half)
+    distance = radius / math.sin(half)
     eye = centre + distance * away
     return View.look_at(eye, centre, up, width=width, height=height, fov_y=fov_y)
 

@@ -22,6 +22,12 @@ _CONTROL = {
 IS_CONTROL = ": a control, nothing is truncated."
 """Ends the sentence on one."""
 
+ITSELF = "itself"
+"""The target of a measurement against the model's own pictures, as it came in."""
+
+VISIBLE = 35.0
+"""A PSNR against itself, in dB, below which one is warned."""
+
 _ROWS = (
     ("PSNR, dB", "psnr", 2),
     ("SSIM", "ssim", 4),
@@ -37,7 +43,14 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
     reports = list(columns.values())
     head = " " * 20 + "".join(f"{name:>16}" for name in columns)
     lines = [head + f"{'change':>12}" if len(columns) > 1 else head]
+    itself = reports[-1].get("target") == ITSELF
     for label, key, digits in _ROWS:
+        if key == "psnr" and itself:  # before, it is infinite: null in a record
+            cells = [
+                "equal" if report is reports[0] else f"{report[key]:.2f}" for report in reports
+            ]
+            lines.append(f"{'PSNR to itself, dB':<20}" + "".join(f"{cell:>16}" for cell in cells))
+            continue
         cells = [f"{report[key]:.{digits}f}" for report in reports]
         if key == "frame_ms":
             cells = [
@@ -63,9 +76,15 @@ def gain(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for the gain of one measurement over another: fragments, frame times, PSNR."""
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
-        f"{_frames(before, after)}, {after['psnr'] - before['psnr']:+.2f} dB PSNR "
-        f"on {after['views']} views"
+        f"{_frames(before, after)}, {_quality(before, after)} on {after['views']} views"
     )
+
+
+def _quality(before: dict[str, Any], after: dict[str, Any]) -> str:
+    """A phrase for what became of the picture."""
+    if after.get("target") == ITSELF:
+        return f"{after['psnr']:.2f} dB PSNR against itself"
+    return f"{after['psnr'] - before['psnr']:+.2f} dB PSNR"
 
 
 def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) -> str:
@@ -80,6 +99,8 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
     gained = f"{gain(before, after)} that were held out"
     if not data["settings"]["truncate"]:
         said = f"{gained}{IS_CONTROL}"
+    elif after.get("target") == ITSELF:
+        said = f"{gained}. No photograph was used."
     elif control is None:
         said = (
             f"{gained}. More training alone may be a part of the dB: no control was run; "
@@ -109,6 +130,9 @@ def missed(data: dict[str, Any]) -> str:
 
 def _fell(before: dict[str, Any], after: dict[str, Any], control: dict[str, Any] | None) -> str:
     """A warning where much PSNR was lost; else nothing."""
+    if after.get("target") == ITSELF:
+        shows = after["psnr"] < VISIBLE
+        return f" Warning: below {VISIBLE:g} dB the change can be seen." if shows else ""
     loss = (control or before)["psnr"] - after["psnr"]
     if loss <= FELL:
         return ""

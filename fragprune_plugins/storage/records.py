@@ -116,7 +116,7 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
         and begun
         and before
         and all(begun[key] == before[key] for key in ("views", "gaussians"))
-        and begun["psnr"] is not None
+        and None not in (begun["psnr"], before["psnr"])
         and abs(begun["psnr"] - before["psnr"]) < _SAME_DB
     )
 

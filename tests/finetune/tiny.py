@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.datasets.dataset import Dataset, Shot
+from fragprune_plugins.datasets.dataset import Dataset, Photograph
 from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.storage.ply import SplatFile, write_ply
 from fragprune_plugins.types import RasterInputs
@@ -166,5 +166,5 @@ def dataset_in_memory(folder: Path, truth: SplatFile) -> Dataset:
     for i, (camera, image) in enumerate(zip(cameras(), photographs(truth), strict=True)):
         path = folder / f"{i}.png"
         save_png(path, image)
-        shots.append(Shot(f"view{i:02d}", camera.view(), path))
+        shots.append(Photograph(f"view{i:02d}", camera.view(), path))
     return Dataset([s for i, s in enumerate(shots) if i % 8], shots[::8])

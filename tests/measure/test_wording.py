@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fragprune_plugins.measure.wording import fewer, gain, outcome
+from fragprune_plugins.measure.wording import describe, fewer, gain, outcome
 
 
 def measured(fragments, ms, psnr, error=0.01):
@@ -97,3 +97,21 @@ def test_a_control_says_that_it_is_one():
     line = outcome("finetune", data(truncate=False), None)
     assert "a control, nothing is truncated" in line
     assert "pruning" not in line
+
+
+ITSELF = {"target": "itself"}
+
+
+@pytest.mark.parametrize("infinite", [float("inf"), None])  # None: read from a record
+@pytest.mark.parametrize(("psnr", "warned"), [(45.2, False), (34.9, True)])
+def test_against_itself_there_is_no_figure_before_and_no_control(infinite, psnr, warned):
+    rows = {"ssim": 1.0, "evaluated_per_pixel": 50.0, "gaussians": 9, "engine": "cpu"}
+    before = measured(39.1, 2.33, infinite) | rows | ITSELF | {"device": "cpu"}
+    after = measured(25.0, 2.07, psnr) | rows | ITSELF | {"device": "cpu"}
+    line = outcome("finetune", data() | {"before": before, "after": after}, None)
+    assert f"{psnr:.2f} dB PSNR against itself on 7 views that were held out." in line
+    assert "No photograph was used." in line
+    assert "control" not in line
+    assert ("Warning: below 35 dB the change can be seen." in line) == warned
+    first, *_ = describe({"before": before, "after": after}).splitlines()[1:]
+    assert first.split() == ["PSNR", "to", "itself,", "dB", "equal", f"{psnr:.2f}"]

@@ -1,0 +1,169 @@
+"""fragprune finetune --self: no photograph, the model's own pictures instead."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+import fragprune_plugins as fp
+from fragprune_plugins.measure.metrics import psnr
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.types import RasterInputs
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return tiny.scene(tmp_path)
+
+
+@pytest.fixture
+def cameras(tmp_path):
+    """The cameras.json that a host writes."""
+    entries = [
+        {
+            "id": i,
+            "img_name": f"view{i:02d}",
+            "width": tiny.SIDE,
+            "height": tiny.SIDE,
+            "position": (-camera.rotation.T @ camera.translation).tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "fx": tiny.FOCAL,
+            "fy": tiny.FOCAL,
+        }
+        for i, camera in enumerate(tiny.cameras(17))
+    ]
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps(entries))
+    return path
+
+
+def finetuned(path, out, *more):
+    return run_json("finetune", path, "--self", "--out", out, "--iters", 40, *more)
+
+
+def forget_photographs(data):
+    for image in data.rglob("*.png"):
+        image.unlink()
+
+
+@pytest.mark.parametrize("write", [tiny.write_colmap, tiny.write_blender])
+def test_no_photograph_is_opened(tmp_path, write):
+    truth = tiny.random_model()
+    data, path = tmp_path / "data", tmp_path / "model.ply"
+    write(data, tiny.photographs(truth))
+    for file in data.glob("transforms_*.json"):  # these may leave the size to the images
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"w": tiny.SIDE, "h": tiny.SIDE}))
+    forget_photographs(data)
+    fp.save(path, fp.Model(truth))
+    report = finetuned(path, tmp_path / "out.ply", "--data", data, "--pressure", 1e-3)
+    assert report["target"] == report["after"]["target"] == "itself"
+    assert report["after"]["views"] == 2  # the folder's held-out cameras
+    assert report["before"]["psnr"] is None  # infinite
+    assert 25 < report["after"]["psnr"] < 80
+    assert report["after"]["fragments_per_pixel"] < report["before"]["fragments_per_pixel"]
+    assert not sidecar.load(tmp_path / "out.ply")[0].neutral
+
+
+def test_the_figure_is_the_difference_to_the_model_s_own_pictures(scene, cameras, tmp_path):
+    _, path, model = scene
+    out = tmp_path / "out.ply"
+    report = finetuned(path, out, "--cameras", cameras, "--pressure", 1e-3)
+    learned = fp.load(out)
+    held_out = fp.load_cameras(cameras)[::8]
+    with torch.no_grad():
+        values = [
+            psnr(
+                fp.rasterize(RasterInputs(view, learned.splat.splats()), learned.thresholds).image,
+                fp.rasterize(RasterInputs(view, model.splats())).image,
+            )
+            for _, view in held_out
+        ]
+    assert report["after"]["views"] == len(values) == 3
+    assert report["after"]["psnr"] == pytest.approx(sum(values) / 3, abs=1e-3)
+
+
+def test_needs_nothing_but_the_model(scene, tmp_path):
+    _, path, _ = scene
+    one, two = (
+        finetuned(path, tmp_path / f"{name}.ply", "--resolution", 16, "--iters", 3, "--threads", 1)
+        for name in ("one", "two")
+    )
+    assert one["after"]["views"] == 12
+    for key in ("psnr", "fragments_per_pixel"):
+        assert one["after"][key] == two["after"][key]
+
+
+def test_the_lines_say_against_what(scene, cameras, tmp_path):
+    _, path, _ = scene
+    out = tmp_path / "out.ply"
+    arguments = ("finetune", path, "--self", "--cameras", cameras, "--out", out, "--iters", 20)
+    text = run(*arguments).stdout
+    assert "dB PSNR against itself on 3 views that were held out. No photograph was used." in text
+    assert "PSNR to itself, dB             equal" in text
+    assert "control" not in text
+    assert "inf" not in text
+    assert "Warning" not in text
+
+
+def test_a_page_of_it_can_be_made(scene, cameras, tmp_path):
+    _, path, _ = scene
+    finetuned(path, tmp_path / "out.ply", "--cameras", cameras)
+    assert "against itself" in run_json("report", tmp_path)["result"]
+    assert "PSNR to itself, dB" in (tmp_path / "report.html").read_text()
+
+
+def test_a_pruned_model_goes_on_showing_what_it_shows(scene, cameras, tmp_path):
+    """Its target is truncated as it came in: without its thresholds it is another picture."""
+    _, path, _ = scene
+    first, second = tmp_path / "first.ply", tmp_path / "second.ply"
+    once = finetuned(path, first, "--cameras", cameras, "--pressure", 0.1)
+    step = ("--cameras", cameras, "--pressure", 0, "--iters", 1)
+    again = finetuned(first, second, *step)
+    assert again["before"]["fragments_per_pixel"] == once["after"]["fragments_per_pixel"]
+    assert again["after"]["psnr"] > once["after"]["psnr"] + 5
+    other = finetuned(first, second, *step, "--no-truncation")
+    assert other["before"]["fragments_per_pixel"] > again["before"]["fragments_per_pixel"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), ("neither --data nor --self", "Pass --data FOLDER with photographs", "--self")),
+        (("--cameras", "c.json"), ("--cameras without --self", "Add --self")),
+        (
+            ("--self", "--data", "scene", "--cameras", "c.json"),
+            ("--data with --cameras", "Drop one of the two"),
+        ),
+        (("--self", "--control"), ("--self with --control", "Drop --control")),
+    ],
+)
+def test_what_contradicts_itself_is_refused_with_a_remedy(scene, tmp_path, options, words):
+    _, path, _ = scene
+    out = tmp_path / "out.ply"
+    result = run("finetune", path, "--out", out, *options)
+    assert result.exit_code == 2
+    for word in words:
+        assert word in result.stderr
+    assert not out.exists()
+
+
+def test_a_single_camera_is_too_few(scene, cameras, tmp_path):
+    _, path, _ = scene
+    cameras.write_text(json.dumps(json.loads(cameras.read_text())[:1]))
+    words = ("--self", "--cameras", cameras, "--out", tmp_path / "out.ply")
+    result = run("finetune", path, *words)
+    assert result.exit_code == 1
+    assert "at least two" in result.stderr
+
+
+def test_in_python(scene):
+    _, _, model = scene
+    dataset = fp.own_pictures(model)
+    result = fp.finetune(
+        model, dataset.__class__(dataset.train[:2], dataset.test[:1]), fp.Settings(iterations=2)
+    )
+    assert result.progress.steps == 2

@@ -1,0 +1,137 @@
+"""Cameras around a splat and between given ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from finetune import tiny
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from fragprune_plugins.datasets.generated import around, between, bounds, hold_out, interpolate
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.types import View
+
+NUMBER = st.floats(-3, 3, width=32)
+PLACE = st.tuples(NUMBER, NUMBER, NUMBER)
+FIELDS = ("viewmatrix", "projmatrix", "campos")
+
+
+def pose(axis, place, cx=20.0):
+    """A camera turned by a rotation vector, at a place, its principal point off centre."""
+    rotation = torch.from_numpy(Rotation.from_rotvec(axis).as_matrix())
+    centre = torch.tensor(place, dtype=torch.float64)
+    lens = {"width": 48, "height": 32, "fx": 40.0, "fy": 42.0, "cx": cx, "cy": 15.0}
+    return View.pinhole(rotation, -rotation @ centre, **lens)
+
+
+POSE = st.builds(pose, PLACE, PLACE)
+
+
+def angle(one: View, other: View) -> float:
+    turn = one.viewmatrix[:3, :3].T @ other.viewmatrix[:3, :3]
+    return float(Rotation.from_matrix(turn.numpy()).magnitude())
+
+
+@given(POSE, POSE)
+def test_the_ends_of_the_way_are_the_cameras(a, b):
+    for end, t in ((a, 0.0), (b, 1.0)):
+        there = interpolate(a, b, t)
+        for name in FIELDS:
+            torch.testing.assert_close(
+                getattr(there, name), getattr(end, name), atol=1e-6, rtol=1e-6
+            )
+
+
+@given(POSE, POSE, st.floats(0, 1))
+def test_between_two_cameras_a_rotation_is_one_and_the_centre_on_the_line(a, b, t):
+    view = interpolate(a, b, t)
+    rotation = view.viewmatrix[:3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3).double(), atol=1e-9, rtol=0)
+    assert float(torch.det(rotation)) == pytest.approx(1)
+    torch.testing.assert_close(view.campos, torch.lerp(a.campos, b.campos, t))
+    at_itself = torch.cat([view.campos, torch.ones(1)]) @ view.viewmatrix
+    torch.testing.assert_close(at_itself[:3], torch.zeros(3).double(), atol=1e-9, rtol=0)
+    assert angle(a, view) == pytest.approx(t * angle(a, b), abs=1e-6)
+    assert angle(view, b) == pytest.approx((1 - t) * angle(a, b), abs=1e-6)
+
+
+def test_the_lens_and_the_background_are_the_first_camera_s():
+    a = replace(pose((0, 0, 0), (0, 0, 0)), background=torch.ones(3))
+    b = pose((0, 1, 0), (1, 0, 0), cx=30.0)
+    view = interpolate(a, b, 0.5)
+    clip = torch.linalg.solve(view.viewmatrix, view.projmatrix)
+    torch.testing.assert_close(clip, torch.linalg.solve(a.viewmatrix, a.projmatrix))
+    assert torch.equal(view.background, torch.ones(3))
+    assert (view.width, view.height, view.tan_fov_x) == (a.width, a.height, a.tan_fov_x)
+
+
+def ring():
+    return [(f"view{i}", camera.view()) for i, camera in enumerate(tiny.cameras(12))]
+
+
+def test_every_camera_goes_towards_the_four_nearest():
+    pairs = [tuple(map(int, name.replace("view", "").split("~"))) for name, _ in between(ring())]
+    assert len(pairs) == 48
+    for i, j in pairs:
+        assert min((i - j) % 12, (j - i) % 12) in (1, 2)
+
+
+def test_a_camera_nearby_that_looks_away_is_not_near():
+    ahead = [pose((0, 0, 0), (float(x), 0, 0)) for x in range(5)]
+    back = [pose((0, 3.14, 0), (x + 0.1, 0, 0)) for x in range(5)]
+    named = [
+        (f"{name}{i}", view)
+        for name, part in (("a", ahead), ("b", back))
+        for i, view in enumerate(part)
+    ]
+    assert all(name[0] == name.split("~")[1][0] for name, _ in between(named))
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_nothing_lies_between_fewer_than_two(count):
+    assert between(ring()[:count]) == []
+
+
+def test_two_cameras_have_one_way_each():
+    assert [name for name, _ in between(ring()[:2])] == ["view0~view1", "view1~view0"]
+
+
+def same(one, other):
+    return all(
+        name == also and torch.equal(view.projmatrix, again.projmatrix)
+        for (name, view), (also, again) in zip(one, other, strict=True)
+    )
+
+
+def test_a_seed_gives_the_same_cameras_and_another_seed_others():
+    model = tiny.random_model()
+    for make in (lambda seed: around(model, seed=seed), lambda seed: between(ring(), seed=seed)):
+        assert same(make(3), make(3))
+        assert not same(make(3), make(4))
+
+
+def test_cameras_around_look_at_the_centre_from_all_sides_and_not_from_within():
+    model = tiny.random_model()
+    model.xyz[0] = 1e4  # floats far out
+    centre, radius = bounds(model)
+    assert radius < 3
+    views = [view for _, view in around(model, 64)]
+    sides = torch.stack([view.campos - centre for view in views])
+    assert float(sides.norm(dim=1).min()) > radius
+    signs = {tuple(side) for side in (sides > 0).tolist()}
+    assert len(signs) == 8
+    for view in views:
+        middle = torch.cat([centre, torch.ones(1)]) @ view.projmatrix
+        torch.testing.assert_close(middle[:2] / middle[3], torch.zeros(2), atol=1e-4, rtol=0)
+
+
+def test_one_in_eight_is_held_out():
+    learned, held = hold_out(list(range(20)))
+    assert held == [0, 8, 16]
+    assert sorted(learned + held) == list(range(20))
+    with pytest.raises(DatasetError, match="at least two"):
+        hold_out([1])
