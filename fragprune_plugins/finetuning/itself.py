@@ -54,8 +54,8 @@ def own_pictures(
 
     Args:
         model: what ``load`` gave, or a splat without thresholds. It is kept.
-        cameras: named views to learn from; views between near ones are added. When None, cameras
-            all around the splat: good for an object, not for a scene seen from within.
+        cameras: named views to learn from; views between near ones are added. None takes cameras
+            all around the splat, which suit an object but no scene seen from within.
         held_out: named views for the figures; every eighth of ``cameras`` when None.
         engine: a name or an engine.
         seed: of what is generated.
