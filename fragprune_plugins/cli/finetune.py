@@ -95,7 +95,8 @@ def command(
     draw it. Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
 
     With --self no photograph is read: MODEL's own pictures are what it must go on showing, also
-    between the cameras. PSNR is against those pictures then.
+    between the cameras. PSNR is against those pictures then. The defaults are 1000 iterations at
+    --pressure 2e-4.
 
     \b
     Examples:

@@ -59,7 +59,8 @@ _EXCLUDE = (
 def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of learning to a command.
 
-    The command gets their values, and its own ``seed`` if it has one, as ``settings``.
+    The command gets their values, and its own ``seed`` and ``itself`` if it has them, as
+    ``settings``.
 
     Raises:
         UsageError: options contradict each other, or a value is out of range.
@@ -86,12 +87,14 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
         for one, other in _EXCLUDE:
             if asked[one] and asked[other]:
                 raise UsageError("options", f"{one} with {other}", "one of the two", "Remove one.")
-        default = QUICK_ITERATIONS if quick else FINETUNE_ITERATIONS
+        itself = kwargs.get("itself", False)
+        default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
         settings = Settings(
             iterations=default if iters is None else iters,
             train=train,
             pressure=pressure,
             target_speedup=target_speedup,
+            itself=itself,
             truncate=not control,
             seed=kwargs.get("seed", 0),
         )

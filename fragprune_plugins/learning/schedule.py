@@ -8,6 +8,7 @@ from typing import Any, Literal
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import (
     ELASTICITY,
+    OWN_PRESSURE,
     ElasticPressure,
     FixedPressure,
     Pressure,
@@ -56,6 +57,8 @@ class Settings:
             on the training views that calibration measures, to steer for; overrides pressure.
         threshold_lr: initial learning rate of threshold logits.
         opacity_lr: initial learning rate of opacity logits in stage 2.
+        itself: True where the model's own pictures are the target. The default pressure is
+            ``OWN_PRESSURE`` then, and no warm-up comes first, for it would have nothing to learn.
         truncate: False trains without thresholds: the control to compare with.
         seed: of the order of views in ``finetune``; hosts have their own.
     """
@@ -66,6 +69,7 @@ class Settings:
     target_speedup: float | None = None
     threshold_lr: float = 0.05
     opacity_lr: float = 0.01
+    itself: bool = False
     truncate: bool = True
     seed: int = 0
 
@@ -96,13 +100,15 @@ class Settings:
             return PressureController(self.target_speedup)
         if self.pressure is not None:
             return FixedPressure(self.pressure)
+        if self.itself:
+            return FixedPressure(OWN_PRESSURE)
         return ElasticPressure(elasticity=_RECIPES[self.train].elasticity)
 
     @property
     def warmup(self) -> int:
         """Steps that train without truncation before thresholds open."""
         learning = _RECIPES[self.train].steps
-        return 0 if learning is None else max(0, self.iterations - learning)
+        return 0 if learning is None or self.itself else max(0, self.iterations - learning)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
+from fragprune_plugins.learning.pressure import OWN_PRESSURE
+from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.measure.metrics import psnr
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.types import RasterInputs
@@ -95,6 +97,21 @@ def test_needs_nothing_but_the_model(scene, tmp_path):
     assert one["after"]["views"] == 12
     for key in ("psnr", "fragments_per_pixel"):
         assert one["after"][key] == two["after"][key]
+
+
+def test_it_has_iterations_and_a_pressure_of_its_own(scene, cameras, tmp_path):
+    _, path, _ = scene
+    arguments = ("finetune", path, "--self", "--cameras", cameras, "--out", tmp_path / "out.ply")
+    report = run_json(*arguments)
+    assert report["iterations"] == 1000
+    assert report["settings"]["itself"] is True
+    assert report["pressure"] == OWN_PRESSURE
+    assert run_json(*arguments, "--iters", 2, "--pressure", 3e-3)["pressure"] == 3e-3
+
+
+def test_thresholds_learn_from_its_first_step():
+    assert Schedule(Settings(iterations=9000, itself=True)).at(1).learn
+    assert not Schedule(Settings(iterations=9000)).at(1).learn
 
 
 def test_the_lines_say_against_what(scene, cameras, tmp_path):

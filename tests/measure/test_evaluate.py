@@ -12,6 +12,7 @@ from fragprune_plugins.measure import Candidate, evaluate, measure
 from fragprune_plugins.measure.pictures import save_heatmap, save_image, save_panel
 
 NAMES = {
+    "target",
     "psnr",
     "ssim",
     "lpips",
