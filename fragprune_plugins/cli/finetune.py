@@ -96,7 +96,7 @@ def command(
 
     With --self no photograph is read: MODEL's own pictures are what it must go on showing, also
     between the cameras. PSNR is against those pictures then. The defaults are 1000 iterations at
-    --pressure 2e-4.
+    --pressure 1.5e-4.
 
     \b
     Examples:

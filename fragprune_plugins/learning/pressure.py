@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 LEAST_PRESSURE = 1e-4
 """Least lambda by default, for models whose loss per fragment is very small (overfitted ones)."""
 
-OWN_PRESSURE = 2e-4
+OWN_PRESSURE = 1.5e-4
 """What a model that learns from its own pictures gets: its loss is next to nothing at first."""
 
 ELASTICITY = 0.1

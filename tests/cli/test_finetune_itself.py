@@ -183,10 +183,20 @@ def test_a_single_camera_is_too_few(scene, cameras, tmp_path):
     assert "at least two" in result.stderr
 
 
-def test_in_python(scene):
+def test_in_python(scene, cameras, tmp_path):
+    _, path, _ = scene
+    model, out = fp.load(path), tmp_path / "out.ply"
+    pictures = fp.own_pictures(model, fp.load_cameras(cameras))
+    result = fp.finetune(model.splat, pictures, fp.Settings(iterations=2, itself=True))
+    fp.save(out, fp.Model(result.model, result.store))
+    assert not fp.load(out).thresholds.neutral
+
+
+def test_in_python_needs_no_cameras(scene):
     _, _, model = scene
     dataset = fp.own_pictures(model)
-    result = fp.finetune(
-        model, dataset.__class__(dataset.train[:2], dataset.test[:1]), fp.Settings(iterations=2)
-    )
-    assert result.progress.steps == 2
+    assert {shot.target for shot in (*dataset.train, *dataset.test)} == {"itself"}
+    assert len(dataset.test) == 12
+    image = dataset.test[0].image
+    assert image.shape == (3, 800, 800)
+    assert float(image.max()) > 0.1
