@@ -71,7 +71,7 @@ def own_pictures(
 
     @torch.no_grad()
     def draw(view: View) -> Tensor:
-        return drawer.rasterize(RasterInputs(view, splats), thresholds).image
+        return drawer.rasterize(RasterInputs(view, splats, planes=()), thresholds).image
 
     views = around(splat, seed=seed) if cameras is None else cameras
     if held_out is None:

@@ -25,7 +25,11 @@ LEAST_PRESSURE = 1e-4
 """Least lambda by default, for models whose loss per fragment is very small (overfitted ones)."""
 
 OWN_PRESSURE = 1.5e-4
-"""What a model that learns from its own pictures gets: its loss is next to nothing at first."""
+"""The default for a model that learns from its own pictures; its loss is next to nothing at first.
+
+In 1,000 iterations it gave 1.6x fewer fragments on three scenes, and -0.03 to +0.04 dB on
+photographs that were not used.
+"""
 
 ELASTICITY = 0.1
 """Per cent of the loss that one per cent of the fragments is worth by default."""
