@@ -20,6 +20,7 @@ _COMMANDS = {
     "adapters": "adapters",
     "check": "check",
     "bench": "bench",
+    "experiment": "experiment",
     "doctor": "doctor",
 }
 """Modules of this package by command name, in the order of --help; each defines ``command``."""

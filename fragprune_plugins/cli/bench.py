@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +83,7 @@ def command(
 
     import torch
 
+    from fragprune_plugins.bench.machine import describe_machine
     from fragprune_plugins.bench.timing import Case, measure, scaling, translation
     from fragprune_plugins.plugins.hooks import thresholds_for
     from fragprune_plugins.types import RasterInputs
@@ -104,15 +104,9 @@ def command(
 
     results = measure(cases, [rasterizer], repeats=repeats, say=say)
     others = _peers(scenes, rasterizer, repeats, say) if peers else []
-    machine = {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
+    machine = describe_machine(where) | {
         "load_before": before,
         "load_after": os.getloadavg()[0],
-        "platform": platform.platform(),
-        "torch": torch.__version__,
-        "native": _native(),
-        "gpu": torch.cuda.get_device_name(where) if where.type == "cuda" else None,
     }
     share = translation(results, rasterizer.name)
     one_scene = len({row["scene"] for row in results}) == 1
@@ -230,20 +224,3 @@ def _table(data: dict[str, Any]) -> str:
         f"load {machine['load_before']:.1f} to {machine['load_after']:.1f}"
     )
     return "\n".join(lines)
-
-
-def _native() -> str | None:
-    from fragprune_plugins.engines.cpu import binding
-
-    found = binding.describe()
-    return str(found["build"]) if found["available"] else None
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

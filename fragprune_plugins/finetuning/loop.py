@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -77,6 +77,7 @@ def finetune(
     *,
     store: ThresholdStore | None = None,
     schedule: Schedule | None = None,
+    rule: Callable[[Tensor], Tensor] | None = None,
     engine: str | Engine = "auto",
     progress: bool = False,
 ) -> FinetuneResult:
@@ -92,6 +93,9 @@ def finetune(
         settings: iterations, what moves, pressure or target; defaults when None.
         store: thresholds to start from, changed in place; neutral ones when None.
         schedule: gives the plan of each step; when None a plugin's, or the default one.
+        rule: gives thresholds (N,) from activated opacities (N,), instead of learning: in the steps
+            that would learn, views are drawn with them. They get no gradient, and nothing presses
+            on fragments: the settings' pressure and target have no effect.
         engine: a name or an engine.
         progress: draw a bar on stderr.
 
@@ -102,6 +106,8 @@ def finetune(
         DivergedError: NaN or infinity in what trains.
     """
     settings, device = settings or Settings(), model.xyz.device
+    if rule is not None:
+        settings = replace(settings, pressure=0.0, target_speedup=None, truncate=True)
     dataset = dataset.to(device)
     store = ThresholdStore(len(model), device) if store is None else store  # empty ones are false
     if len(store) != len(model):
@@ -117,6 +123,7 @@ def finetune(
         settings,
         store,
         schedule or schedule_for(settings),
+        rule,
         engine_for(engine, device) if isinstance(engine, str) else engine,
     )
     started = time.perf_counter()
@@ -172,9 +179,11 @@ class _Run:
         settings: Settings,
         store: ThresholdStore,
         schedule: Schedule,
+        rule: Callable[[Tensor], Tensor] | None,
         engine: Engine,
     ) -> None:
         self.dataset, self.settings, self.engine = dataset, settings, engine
+        self.rule = rule
         self.curves: list[StepStats] = []
         self.done = 0
         again = {shot: partial(self._draw, shot) for shot in dataset.train}
@@ -182,7 +191,7 @@ class _Run:
             store,
             settings,
             schedule,
-            truncate=thresholds_for,
+            truncate=thresholds_for if rule is None else self._ruled,
             views=again,
             watch=self.curves.append,
             parameters=lambda: {name: getattr(self.model, name) for name in self.rates},
@@ -212,7 +221,9 @@ class _Run:
         from tqdm import tqdm
 
         total = self.settings.iterations
-        with tqdm(total=total, disable=not progress, desc="fine-tuning", unit="it") as bar:
+        with tqdm(
+            total=total, disable=not progress, desc="fine-tuning", unit="it", leave=None
+        ) as bar:
             for shot in self._order():
                 self._learn_from(shot)
                 bar.update()
@@ -224,6 +235,19 @@ class _Run:
                     )
                     bar.set_postfix(loss=f"{loss:.4f}", fragments=f"{drawn:.1f}/px")
         self.stage.close()
+        if self.rule is not None:
+            self._follow(self.rule, torch.sigmoid(self.model.opacity[:, 0].detach()))
+
+    def _follow(self, rule: Callable[[Tensor], Tensor], opacities: Tensor) -> None:
+        """Put what the rule gives for these opacities (N,) into the store."""
+        self.stage.store.place(torch.logit(rule(opacities)))
+
+    def _ruled(self, inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
+        """The rule's thresholds for the opacities as they are now; None before thresholds open."""
+        if self.rule is None or not self.stage.learning:
+            return None
+        self._follow(self.rule, inputs.splats.opacities.detach())
+        return store.values.detach()
 
     def _order(self) -> Iterator[Shot]:
         """Permutations of the training views, one after the other, for all steps."""

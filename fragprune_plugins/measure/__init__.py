@@ -1,6 +1,6 @@
 """Measuring a splat: quality, fragments, latency, pictures."""
 
-from fragprune_plugins.measure.evaluate import Candidate, evaluate, measure
+from fragprune_plugins.measure.evaluate import Candidate, evaluate, frame_times, measure
 from fragprune_plugins.measure.metrics import lpips, psnr, ssim
 from fragprune_plugins.measure.visibility import drop_invisible, visible
 
@@ -8,6 +8,7 @@ __all__ = [
     "Candidate",
     "drop_invisible",
     "evaluate",
+    "frame_times",
     "lpips",
     "measure",
     "psnr",

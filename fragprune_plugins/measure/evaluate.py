@@ -122,27 +122,54 @@ def measure(
             }
         )
 
+    frames = frame_times(candidates, [shot.view for shot in shots], engine, repeats=repeats)
+    for report, frame in zip(reports, frames, strict=True):
+        report |= frame | {"engine": engine.name, "device": str(device), "views": len(shots)}
+    return reports
+
+
+@torch.no_grad()
+def frame_times(
+    candidates: Sequence[Candidate],
+    views: Sequence[View],
+    engine: Engine,
+    *,
+    repeats: int = REPEATS,
+) -> list[dict[str, float]]:
+    """Time frames of splats in turns, as ``measure`` does.
+
+    Args:
+        candidates: the splats, all on the device of the views.
+        views: the cameras.
+        engine: draws them.
+        repeats: number of timed frames for each view and candidate.
+
+    Returns:
+        One dict a candidate: frame_ms and frame_ms_se, as those of ``measure``.
+    """
+    device = candidates[0].model.xyz.device
+    drawn = [candidate.model.splats() for candidate in candidates]
     times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
     turns = list(zip(candidates, drawn, times, strict=True))
     for _ in range(repeats):
         for rounds in times:
             rounds.append([])
-        for shot in shots:
+        for view in views:
             turns.reverse()  # neither is always the one that finds a cold cache
             for candidate, splats, rounds in turns:
-                inputs = candidate.inputs(shot.view, splats)
+                inputs = candidate.inputs(view, splats)
                 frame = partial(
                     engine.rasterize, inputs, thresholds_for(inputs, candidate.thresholds)
                 )
                 rounds[-1].append(timed(frame, device)[1])
-    for report, rounds in zip(reports, times, strict=True):
+    reports = []
+    for rounds in times:
         medians = [statistics.median(frames) for frames in rounds]
         spread = statistics.stdev(medians) if len(medians) > 1 else 0.0
-        report |= {
-            "frame_ms": statistics.median(ms for frames in rounds for ms in frames),
-            "frame_ms_se": spread / len(medians) ** 0.5,
-            "engine": engine.name,
-            "device": str(device),
-            "views": len(shots),
-        }
+        reports.append(
+            {
+                "frame_ms": statistics.median(ms for frames in rounds for ms in frames),
+                "frame_ms_se": spread / len(medians) ** 0.5,
+            }
+        )
     return reports

@@ -1,0 +1,44 @@
+"""What times were taken on."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.engines.cpu import binding
+
+
+def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The processor, and the versions that decide about speed.
+
+    Args:
+        device: where the work is done.
+
+    Returns:
+        processor, cores, platform, torch, native (build of the cpu engine, or None), gpu (name of
+        the device, None for the CPU).
+    """
+    device = torch.device(device)
+    native = binding.describe()
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "platform": platform.platform(),
+        "torch": torch.__version__,
+        "native": str(native["build"]) if native["available"] else None,
+        "gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
+    }
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -1,0 +1,148 @@
+"""What experiments compare: data alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import get_args
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.experiments.rules import Rule, alpha_cutoff, falloff_threshold
+from fragprune_plugins.learning.pressure import LEAST_PRESSURE
+from fragprune_plugins.learning.schedule import Settings, Train
+
+_FALLOFFS = (0.03, 0.07, 0.12, 0.2)
+_ALPHA_LEVELS = (4, 8, 12, 16)
+_PRESSURES = tuple(factor * LEAST_PRESSURE for factor in (0.5, 1, 2, 4))
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One training of an experiment.
+
+    Attributes:
+        series: arms of one series are joined in the plot.
+        variant: what sets the arm apart in its series; empty where the series has one arm.
+        settings: of the training; every seed replaces theirs.
+        rule: gives the thresholds; None where they are learned, or where nothing is truncated.
+    """
+
+    series: str
+    variant: str
+    settings: Settings
+    rule: Rule | None = None
+
+    @property
+    def label(self) -> str:
+        """The arm's name in tables."""
+        return f"{self.series} {self.variant}".strip()
+
+    @property
+    def is_control(self) -> bool:
+        """Whether the arm trains without truncation."""
+        return not self.settings.truncate
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A comparison.
+
+    Attributes:
+        name: of the experiment, and of its files.
+        asks: what it asks, one sentence.
+        arms: what is compared.
+    """
+
+    name: str
+    asks: str
+    arms: tuple[Arm, ...]
+
+    def control_of(self, arm: Arm) -> Arm | None:
+        """The control of equal length that moves the same parameters; None for a control."""
+        if arm.is_control:
+            return None
+        return next((c for c in self.arms if c.settings == _control(arm.settings)), None)
+
+
+def _control(settings: Settings) -> Settings:
+    return replace(settings, truncate=False, pressure=None, target_speedup=None)
+
+
+def rules(iterations: int, train: Train | None = None) -> Experiment:
+    """Learned thresholds against one threshold for all, everything trained equally long.
+
+    Args:
+        iterations: of every arm.
+        train: what moves in every arm; all parameters when None.
+    """
+    settings = Settings(iterations=iterations, train=train or "all")
+    return Experiment(
+        "rules",
+        "Are learned thresholds better than one falloff threshold, or one alpha cut-off, for all "
+        "Gaussians, if everything else trains equally long?",
+        (
+            Arm("control", "", _control(settings)),
+            Arm("learned", "default", settings),
+            *(
+                Arm("learned", f"pressure {pressure:g}", replace(settings, pressure=pressure))
+                for pressure in _PRESSURES
+            ),
+            *(Arm("falloff", f"{tau:g}", settings, falloff_threshold(tau)) for tau in _FALLOFFS),
+            *(Arm("alpha", f"{cut}/255", settings, alpha_cutoff(cut)) for cut in _ALPHA_LEVELS),
+        ),
+    )
+
+
+def moves(iterations: int, train: Train | None = None) -> Experiment:
+    """What should move beside the thresholds, each choice with its own control.
+
+    Args:
+        iterations: of every arm.
+        train: must be None, because it is what the arms differ in.
+
+    Raises:
+        UsageError: ``train`` was given.
+    """
+    if train is not None:
+        raise UsageError(
+            "--train",
+            f"{train} for the experiment moves",
+            "none, because its arms differ in what moves",
+            "Remove --train.",
+        )
+    every = [Settings(iterations=iterations, train=each) for each in get_args(Train)]
+    return Experiment(
+        "moves",
+        "Which parameters should move beside the thresholds?",
+        (
+            *(Arm("control", each.train, _control(each)) for each in every),
+            *(Arm("learned", each.train, each) for each in every),
+        ),
+    )
+
+
+def iterations(longest: int, train: Train | None = None) -> Experiment:
+    """How long stage 2 should last: a 25th, a fifth and all of the longest.
+
+    Args:
+        longest: iterations of the longest arms.
+        train: what moves in every arm; all parameters when None.
+    """
+    lengths = dict.fromkeys(max(1, round(longest / share)) for share in (25, 5, 1))
+    every = [Settings(iterations=length, train=train or "all") for length in lengths]
+    return Experiment(
+        "iterations",
+        "How many iterations does stage 2 need, and what do they cost?",
+        (
+            *(Arm("control", f"{each.iterations:,}", _control(each)) for each in every),
+            *(Arm("learned", f"{each.iterations:,}", each) for each in every),
+        ),
+    )
+
+
+EXPERIMENTS: dict[str, Callable[[int, Train | None], Experiment]] = {
+    "rules": rules,
+    "moves": moves,
+    "iterations": iterations,
+}
+"""By name: makes the experiment from the iterations of its longest arms and from what moves."""

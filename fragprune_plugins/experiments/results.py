@@ -1,0 +1,197 @@
+"""The table and the plot of an experiment."""
+
+from __future__ import annotations
+
+import csv
+import io
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.experiments.catalogue import Experiment
+from fragprune_plugins.experiments.running import ENLARGED, Outcome
+from fragprune_plugins.storage.atomic import replacing
+
+AS_IT_CAME = "as it came"
+"""Label of the row of the untruncated model before any training."""
+
+_FIGURES: dict[str, Callable[[Outcome], float]] = {
+    "fragments_per_pixel": lambda o: o.after["fragments_per_pixel"],
+    "psnr": lambda o: o.after["psnr"],
+    "ssim": lambda o: o.after["ssim"],
+    "frame_ms": lambda o: o.after["frame_ms"],
+    "speedup": lambda o: o.before["frame_ms"] / o.after["frame_ms"],
+    "frame_ms_enlarged": lambda o: o.after["frame_ms_enlarged"],
+    "speedup_enlarged": lambda o: o.before["frame_ms_enlarged"] / o.after["frame_ms_enlarged"],
+    "train_seconds": lambda o: o.train_seconds,
+}
+
+_COLUMNS = (
+    ("fragments/px", "fragments_per_pixel", "{:.2f}"),
+    ("PSNR, dB", "psnr", "{:.2f}"),
+    ("SSIM", "ssim", "{:.4f}"),
+    ("frame, ms", "frame_ms", "{:.2f}"),
+    ("faster", "speedup", "{:.2f}x"),
+    (f"frame at {ENLARGED}x, ms", "frame_ms_enlarged", "{:.2f}"),
+    (f"faster at {ENLARGED}x", "speedup_enlarged", "{:.2f}x"),
+    ("against control, dB", "against_control", "{:+.2f}"),
+    ("training, s", "train_seconds", "{:.0f}"),
+)
+
+
+def rows(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """One dict for the model as it came, then one for each arm.
+
+    Args:
+        experiment: what was compared.
+        outcomes: of every arm with every seed.
+
+    Returns:
+        label, series, variant, and means over seeds, each with its standard deviation as
+        ``KEY_spread`` (None for one seed): fragments_per_pixel, psnr (dB), ssim, frame_ms,
+        speedup (frame time of the model as it came over frame_ms), frame_ms_enlarged and
+        speedup_enlarged (the same with longer sides), train_seconds, against_control (dB, PSNR
+        over that of the control of equal length; None where there is none).
+    """
+    came = [Outcome(each.arm, each.seed, each.before, each.before, 0.0) for each in outcomes]
+    table = [{"label": AS_IT_CAME, "series": AS_IT_CAME, "variant": ""} | _means(came)]
+    table[0] |= {"against_control": None, "against_control_spread": None}
+    for arm in experiment.arms:
+        mine = [each for each in outcomes if each.arm == arm]
+        row = {"label": arm.label, "series": arm.series, "variant": arm.variant} | _means(mine)
+        control = experiment.control_of(arm)
+        theirs = {each.seed: each for each in outcomes if each.arm == control}
+        gains = [o.after["psnr"] - theirs[o.seed].after["psnr"] for o in mine if o.seed in theirs]
+        table.append(row | _mean("against_control", gains))
+    return table
+
+
+def write(
+    out: Path, experiment: Experiment, table: Sequence[dict[str, Any]], asked: dict[str, Any]
+) -> list[Path]:
+    """Write NAME.md, NAME.csv and NAME.png into a folder; returns their paths.
+
+    Args:
+        out: the folder.
+        experiment: what was compared.
+        table: the result of ``rows``.
+        asked: the configuration.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    paths = [out / f"{experiment.name}.{suffix}" for suffix in ("md", "csv", "png")]
+    page, sheet, picture = paths
+    with replacing(page) as temporary:
+        temporary.write_text(_page(experiment, table, asked), encoding="utf-8")
+    with replacing(sheet) as temporary:
+        temporary.write_text(_csv(table), encoding="utf-8")
+    with replacing(picture) as temporary:
+        _plot(temporary, table)
+    return paths
+
+
+def markdown(table: Sequence[dict[str, Any]]) -> str:
+    """The table as Markdown."""
+    head = ["", *(title for title, _, _ in _COLUMNS)]
+    lines = [head, ["---"] + ["---:"] * len(_COLUMNS)]
+    lines += [
+        [row["label"], *(_cell(row, key, form) for _, key, form in _COLUMNS)] for row in table
+    ]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _mean(key: str, values: Sequence[float]) -> dict[str, Any]:
+    return {
+        key: statistics.fmean(values) if values else None,
+        f"{key}_spread": statistics.stdev(values) if len(values) > 1 else None,
+    }
+
+
+def _means(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    means: dict[str, Any] = {}
+    for key, figure in _FIGURES.items():
+        means |= _mean(key, [figure(each) for each in outcomes])
+    return means
+
+
+def _cell(row: dict[str, Any], key: str, form: str) -> str:
+    mean, spread = row[key], row[f"{key}_spread"]
+    if mean is None:
+        return "-"
+    text = form.format(mean)
+    return text if spread is None else f"{text} ± {form.format(spread).strip('+x')}"
+
+
+def _page(experiment: Experiment, table: Sequence[dict[str, Any]], asked: dict[str, Any]) -> str:
+    seeds, machine, scene = asked["seeds"], asked["machine"], asked["photographs"]
+    spread = " ± is the standard deviation over seeds." if len(seeds) > 1 else ""
+    text = f"""# {experiment.name}
+
+{experiment.asks}
+
+{markdown(table)}
+
+Means over {scene["held_out_views"]} held-out views and seeds {", ".join(map(str, seeds))}.{spread}
+Frames are timed in turns with the model as it came, without truncation: "faster" is its frame time
+over the arm's, at the photographs' size and with sides {ENLARGED} times as long. The control of an
+arm trains equally long, moves the same parameters and truncates nothing.
+
+{asked["model"]["name"]} (SHA-256 {asked["model"]["sha256"][:12]}), photographs of
+{Path(scene["folder"]).name}, fragprune {asked["version"]}, {asked["engine"]} engine on
+{machine["gpu"] or machine["processor"]}, {asked["threads"]} threads. The whole configuration is in
+{experiment.name}.json.
+
+![Held-out PSNR against fragments and frame time]({experiment.name}.png)
+"""
+    return text
+
+
+def _csv(table: Sequence[dict[str, Any]]) -> str:
+    sheet = io.StringIO()
+    writer = csv.DictWriter(sheet, table[0].keys(), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    return sheet.getvalue()
+
+
+def _plot(path: Path, table: Sequence[dict[str, Any]]) -> None:
+    """Held-out PSNR against fragments and against both frame times; a line for each series."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = (
+        ("fragments_per_pixel", "drawn fragments per pixel"),
+        ("frame_ms", "frame, ms"),
+        ("frame_ms_enlarged", f"frame with sides {ENLARGED} times as long, ms"),
+    )
+    for axes, (key, label) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        for series in dict.fromkeys(row["series"] for row in table):
+            line = sorted((r for r in table if r["series"] == series), key=lambda r: r[key])
+            x, y = [row[key] for row in line], [row["psnr"] for row in line]
+            axes.errorbar(
+                x,
+                y,
+                xerr=[row[f"{key}_spread"] or 0.0 for row in line],
+                yerr=[row["psnr_spread"] or 0.0 for row in line],
+                marker="*" if series == AS_IT_CAME else "o",
+                markersize=10 if series == AS_IT_CAME else 5,
+                linewidth=1.2,
+                elinewidth=0.6,
+                label=series,
+            )
+            for row in line:
+                axes.annotate(
+                    row["variant"],
+                    (row[key], row["psnr"]),
+                    xytext=(4, 4),
+                    textcoords="offset points",
+                    fontsize=7,
+                )
+        axes.set(xlabel=label, ylabel="held-out PSNR, dB")
+        axes.grid(alpha=0.25)
+    axes.legend(fontsize=8)
+    figure.savefig(path, format="png", dpi=110)

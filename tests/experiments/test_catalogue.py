@@ -1,0 +1,45 @@
+"""What experiments compare."""
+
+from __future__ import annotations
+
+import pytest
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.experiments.catalogue import EXPERIMENTS
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_arm_has_a_label_of_its_own_and_a_control_of_equal_length(name):
+    experiment = EXPERIMENTS[name](5000, None)
+    assert experiment.name == name
+    assert len({arm.label for arm in experiment.arms}) == len(experiment.arms)
+    for arm in experiment.arms:
+        control = experiment.control_of(arm)
+        assert (control is None) == arm.is_control
+        if control is not None:
+            assert control.is_control
+            assert control.settings.iterations == arm.settings.iterations
+            assert control.settings.train == arm.settings.train
+
+
+def test_rules_trains_everything_equally_long_and_moves_the_same():
+    arms = EXPERIMENTS["rules"](700, "appearance").arms
+    assert {(arm.settings.iterations, arm.settings.train) for arm in arms} == {(700, "appearance")}
+    assert [arm.rule.name for arm in arms if arm.rule] == [
+        *(f"falloff_threshold({tau})" for tau in (0.03, 0.07, 0.12, 0.2)),
+        *(f"alpha_cutoff({levels})" for levels in (4, 8, 12, 16)),
+    ]
+    pressures = [arm.settings.pressure for arm in arms if arm.series == "learned"]
+    assert pressures == [None, 5e-5, 1e-4, 2e-4, 4e-4]
+
+
+def test_moves_compares_what_moves():
+    arms = EXPERIMENTS["moves"](700, None).arms
+    assert {arm.settings.train for arm in arms} == {"opacity", "appearance", "all"}
+    with pytest.raises(UsageError, match="--train"):
+        EXPERIMENTS["moves"](700, "all")
+
+
+def test_iterations_compares_lengths():
+    lengths = [arm.settings.iterations for arm in EXPERIMENTS["iterations"](5000, None).arms]
+    assert lengths == [200, 1000, 5000] * 2

@@ -1,0 +1,188 @@
+"""fragprune experiment, end to end on a tiny scene with few arms."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+from cli.commands import run, run_json
+from finetune import tiny
+from PIL import Image
+
+from fragprune_plugins.experiments import catalogue, running
+from fragprune_plugins.experiments.catalogue import Arm, Experiment
+from fragprune_plugins.experiments.rules import alpha_cutoff
+from fragprune_plugins.learning.schedule import Settings
+
+
+def few(iterations, train=None):
+    settings = Settings(iterations=iterations, train=train or "opacity", pressure=1e-2)
+    control = replace(settings, truncate=False, pressure=None)
+    return Experiment(
+        "rules",
+        "What wins?",
+        (
+            Arm("control", "", control),
+            Arm("learned", "", settings),
+            Arm("alpha", "16/255", settings, alpha_cutoff(16)),
+        ),
+    )
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Settings and rules that trainings were asked for."""
+    calls = []
+    finetune = running.finetune
+
+    def counted(*arguments, **options):
+        calls.append((arguments[2], options["rule"]))
+        return finetune(*arguments, **options)
+
+    monkeypatch.setattr(running, "finetune", counted)
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", few)
+    monkeypatch.setattr(running, "ENLARGED", 2)
+    return calls
+
+
+@pytest.fixture
+def words(tmp_path):
+    data, model, _ = tiny.scene(tmp_path)
+    return ["experiment", "rules", model, "--data", data, "--out", tmp_path / "out", "--iters", 3]
+
+
+def test_writes_table_sheet_plot_and_configuration(words, trained, tmp_path):
+    result = run(*words, "--seeds", "0,1")
+    assert result.exit_code == 0, result.stderr
+    assert "rules" in result.stderr  # the bar
+    assert len(trained) == 6
+    out = tmp_path / "out"
+    page = (out / "rules.md").read_text()
+    for label in ("as it came", "control", "learned", "alpha 16/255", "±", "What wins?"):
+        assert label in page
+    with open(out / "rules.csv") as file:
+        sheet = list(csv.DictReader(file))
+    assert [row["label"] for row in sheet] == ["as it came", "control", "learned", "alpha 16/255"]
+    assert float(sheet[3]["fragments_per_pixel"]) < float(sheet[1]["fragments_per_pixel"])
+    with Image.open(out / "rules.png") as picture:
+        assert len(picture.convert("RGB").getcolors(1 << 24)) > 10
+    asked = json.loads((out / "rules.json").read_text())
+    assert asked["seeds"] == [0, 1]
+    assert asked["arms"]["alpha 16/255"]["rule"] == "alpha_cutoff(16)"
+    assert asked["arms"]["learned"]["settings"]["pressure"] == 1e-2
+    assert {"version", "model", "machine", "photographs", "engine", "threads"} <= asked.keys()
+
+
+def test_the_gain_over_the_control_is_the_difference_of_the_rows(words, trained):
+    report = run_json(*words, "--seeds", "0,1")
+    came, control, *others = report["rows"]
+    assert came["against_control"] is None
+    assert control["against_control"] is None
+    assert came["speedup"] == 1
+    for row in others:
+        assert row["against_control"] == pytest.approx(row["psnr"] - control["psnr"], abs=1e-9)
+        assert row["frame_ms_enlarged"] > 0
+
+
+def test_goes_on_without_training_again(words, trained, tmp_path):
+    first = run_json(*words)
+    assert len(trained) == 3
+    assert run_json(*words) == first
+    assert len(trained) == 3
+    (lost,) = (tmp_path / "out" / "arms").glob("*learned*")
+    lost.unlink()
+    run_json(*words)
+    assert len(trained) == 4
+    settings, rule = trained[-1]
+    assert settings.truncate
+    assert rule is None
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--iters", 4], "arms.control.settings.iterations was 3 and is 4"),
+        (["--seeds", "0,1"], "seeds was [0] and is [0, 1]"),
+        (["--resolution", 2], "photographs.resolution.divide was 1 and is 2"),
+    ],
+)
+def test_another_configuration_is_refused(words, trained, more, said):
+    run_json(*words)
+    result = run(*words, *more)
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert len(trained) == 3
+
+
+def test_a_changed_list_of_arms_is_refused(words, trained, monkeypatch):
+    run_json(*words)
+    monkeypatch.setitem(
+        catalogue.EXPERIMENTS,
+        "rules",
+        lambda *asked: replace(few(*asked), arms=few(*asked).arms[:2]),
+    )
+    result = run(*words)
+    assert result.exit_code == 1
+    assert "arms.alpha 16/255.rule was alpha_cutoff(16) and is absent" in result.stderr
+    monkeypatch.setitem(
+        catalogue.EXPERIMENTS,
+        "rules",
+        lambda *asked: replace(few(*asked), arms=few(*asked).arms[::-1]),
+    )
+    assert "the same arms in another order" in run(*words).stderr
+
+
+def test_results_of_another_configuration_are_not_taken_over(words, trained, tmp_path):
+    run_json(*words)
+    (tmp_path / "out" / "rules.json").unlink()
+    result = run(*words, "--train", "appearance")
+    assert result.exit_code == 1
+    assert "a result of another configuration" in result.stderr
+
+
+def test_ctrl_c_keeps_finished_arms(words, trained, monkeypatch, tmp_path):
+    counted = running.finetune
+
+    def interrupted(*arguments, **options):
+        result = counted(*arguments, **options)
+        return replace(result, interrupted=len(trained) == 2)
+
+    monkeypatch.setattr(running, "finetune", interrupted)
+    result = run(*words)
+    assert result.exit_code == 130
+    assert "Repeat the command" in result.stderr
+    assert len(list((tmp_path / "out" / "arms").iterdir())) == 1
+    run_json(*words)
+    assert len(trained) == 2 + 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["moves", "x.ply", "--train", "all"], "none, because its arms differ"),
+        (["rules", "x.ply", "--iters", 3, "--scale", 2], "--iters with --scale"),
+        (["rules", "x.ply", "--seeds", "a"], "not a list such as 0,1,2"),
+        (["rulers", "x.ply"], "rulers"),
+    ],
+)
+def test_contradictions_are_usage_errors(words, said, tmp_path):
+    result = run("experiment", *words, "--data", tmp_path, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert said in result.stderr
+
+
+def test_the_configuration_tells_models_apart(words, trained, tmp_path):
+    run_json(*words)
+    model = words[2]
+    other = tmp_path / "other"
+    other.mkdir()
+    shutil.copy(model, other / model.name)
+    words[2] = other / model.name
+    run_json(*words)  # the same model elsewhere
+    tiny.write_ply(words[2], tiny.random_model(seed=5))
+    result = run(*words)
+    assert result.exit_code == 1
+    assert "model.sha256 was" in result.stderr
