@@ -84,7 +84,7 @@ def rules(iterations: int, train: Train | None = None) -> Experiment:
             Arm("control", "", _control(settings)),
             Arm("learned", "default", settings),
             *(
-                Arm("learned", f"pressure {pressure:g}", replace(settings, pressure=pressure))
+                Arm("learned", f"λ={pressure:g}", replace(settings, pressure=pressure))
                 for pressure in _PRESSURES
             ),
             *(Arm("falloff", f"{tau:g}", settings, falloff_threshold(tau)) for tau in _FALLOFFS),

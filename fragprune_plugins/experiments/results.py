@@ -55,8 +55,9 @@ def rows(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[dict[str, 
         over that of the control of equal length; None where there is none).
     """
     came = [Outcome(each.arm, each.seed, each.before, each.before, 0.0) for each in outcomes]
-    table = [{"label": AS_IT_CAME, "series": AS_IT_CAME, "variant": ""} | _means(came)]
-    table[0] |= {"against_control": None, "against_control_spread": None}
+    first = _means(came) | _mean("against_control", []) | _mean("train_seconds", [])
+    first = {key: None if key.endswith("_spread") else value for key, value in first.items()}
+    table = [{"label": AS_IT_CAME, "series": AS_IT_CAME, "variant": ""} | first]
     for arm in experiment.arms:
         mine = [each for each in outcomes if each.arm == arm]
         row = {"label": arm.label, "series": arm.series, "variant": arm.variant} | _means(mine)
@@ -127,25 +128,27 @@ def _cell(row: dict[str, Any], key: str, form: str) -> str:
 def _page(experiment: Experiment, table: Sequence[dict[str, Any]], asked: dict[str, Any]) -> str:
     seeds, machine, scene = asked["seeds"], asked["machine"], asked["photographs"]
     spread = " ± is the standard deviation over seeds." if len(seeds) > 1 else ""
-    text = f"""# {experiment.name}
+    device = machine["gpu"] or machine["processor"]
+    return f"""# {experiment.name}
 
 {experiment.asks}
 
 {markdown(table)}
 
 Means over {scene["held_out_views"]} held-out views and seeds {", ".join(map(str, seeds))}.{spread}
-Frames are timed in turns with the model as it came, without truncation: "faster" is its frame time
-over the arm's, at the photographs' size and with sides {ENLARGED} times as long. The control of an
-arm trains equally long, moves the same parameters and truncates nothing.
 
-{asked["model"]["name"]} (SHA-256 {asked["model"]["sha256"][:12]}), photographs of
-{Path(scene["folder"]).name}, fragprune {asked["version"]}, {asked["engine"]} engine on
-{machine["gpu"] or machine["processor"]}, {asked["threads"]} threads. The whole configuration is in
-{experiment.name}.json.
+"Faster" is the frame time of the model {AS_IT_CAME}, without truncation, over the arm's, timed in
+turns: at the photographs' size, and with sides {ENLARGED} times as long. Compare arms by this
+ratio, because their frame times were taken at different moments. The control of an arm trains
+equally long, moves the same parameters and truncates nothing.
+
+* model: {asked["model"]["name"]}, SHA-256 {asked["model"]["sha256"][:12]}
+* photographs: {scene["folder"]}, {scene["training_views"]} training views
+* fragprune {asked["version"]}, {asked["engine"]} engine on {device}, {asked["threads"]} threads
+* everything else: {experiment.name}.json
 
 ![Held-out PSNR against fragments and frame time]({experiment.name}.png)
 """
-    return text
 
 
 def _csv(table: Sequence[dict[str, Any]]) -> str:
@@ -157,41 +160,52 @@ def _csv(table: Sequence[dict[str, Any]]) -> str:
 
 
 def _plot(path: Path, table: Sequence[dict[str, Any]]) -> None:
-    """Held-out PSNR against fragments and against both frame times; a line for each series."""
+    """Held-out PSNR against fragments, and against frame times at both sizes.
+
+    Arms are measured one after the other, maybe hours apart. Their frame times are therefore shown
+    relative to those of the model as it came, which were taken in turns with them.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15, 5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = (
-        ("fragments_per_pixel", "drawn fragments per pixel"),
-        ("frame_ms", "frame, ms"),
-        ("frame_ms_enlarged", f"frame with sides {ENLARGED} times as long, ms"),
+        ("drawn fragments per pixel", "fragments_per_pixel", 1),
+        (f"frame time / that of the model {AS_IT_CAME}", "speedup", -1),
+        (f"the same, sides {ENLARGED} times as long", "speedup_enlarged", -1),
     )
-    for axes, (key, label) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+    subplots = figure.subplots(1, len(panels))
+    for axes, (label, key, power) in zip(subplots, panels, strict=True):
         for series in dict.fromkeys(row["series"] for row in table):
-            line = sorted((r for r in table if r["series"] == series), key=lambda r: r[key])
-            x, y = [row[key] for row in line], [row["psnr"] for row in line]
+            line = [row for row in table if row["series"] == series]
+            line.sort(key=lambda row: float(row["fragments_per_pixel"]))
+            x, y = [row[key] ** power for row in line], [row["psnr"] for row in line]
             axes.errorbar(
                 x,
                 y,
-                xerr=[row[f"{key}_spread"] or 0.0 for row in line],
-                yerr=[row["psnr_spread"] or 0.0 for row in line],
+                xerr=[
+                    at * (row[f"{key}_spread"] or 0) / row[key]
+                    for row, at in zip(line, x, strict=True)
+                ],
+                yerr=[row["psnr_spread"] or 0 for row in line],
                 marker="*" if series == AS_IT_CAME else "o",
                 markersize=10 if series == AS_IT_CAME else 5,
                 linewidth=1.2,
                 elinewidth=0.6,
                 label=series,
             )
-            for row in line:
+            for row, *point in zip(line, x, y, strict=True):
                 axes.annotate(
                     row["variant"],
-                    (row[key], row["psnr"]),
+                    point,
                     xytext=(4, 4),
                     textcoords="offset points",
                     fontsize=7,
+                    rotation=30,
                 )
         axes.set(xlabel=label, ylabel="held-out PSNR, dB")
+        axes.margins(0.1)
         axes.grid(alpha=0.25)
-    axes.legend(fontsize=8)
+    subplots[0].legend(fontsize=8)
     figure.savefig(path, format="png", dpi=110)

@@ -29,6 +29,8 @@ from fragprune_plugins.storage.records import strict
 ENLARGED = 4
 """Frames are timed at the photographs' size, and with sides this many times as long."""
 
+_SAID = 5  # differences that a refusal lists
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -173,7 +175,12 @@ def _configuration(
         "version": fragprune_plugins.__version__,
         "model": {"name": model.name, "sha256": digest(model)},
         "photographs": photographs.as_dict()
-        | {"training_views": len(dataset.train), "held_out_views": len(dataset.test)},
+        | {
+            "folder": photographs.folder.resolve().name,
+            "sha256": _digest(dataset),
+            "training_views": len(dataset.train),
+            "held_out_views": len(dataset.test),
+        },
         "engine": engine.name,
         "device": str(device),
         "threads": torch.get_num_threads(),
@@ -183,34 +190,44 @@ def _configuration(
     return plain
 
 
+def _digest(dataset: Dataset) -> str:
+    """The SHA-256 digest of the photographs and their cameras."""
+    sha = hashlib.sha256()
+    for shot in (*dataset.train, *dataset.test):
+        sha.update(f"{shot.name} {digest(shot.path)}".encode())
+        sha.update(shot.view.projmatrix.cpu().numpy().tobytes())
+    return sha.hexdigest()
+
+
 def _settle(path: Path, asked: dict[str, Any]) -> None:
     """Write the configuration; if one is there already, it has to be the same."""
     if not path.exists():
         _write(path, asked)
         return
-    was, now = _flat(_load(path)), _flat(asked)
-    differ = [
-        f"{key} was {was.get(key, 'absent')} and is {now.get(key, 'absent')}"
-        for key in dict.fromkeys((*was, *now))
-        if was.get(key, "absent") != now.get(key, "absent")
-    ]
-    if differ or list(was) != list(now):
+    was = _load(path)
+    differ = _differences(was, asked)
+    if differ or list(was["arms"]) != list(asked["arms"]):
+        more = f"; and {len(differ) - _SAID} more" if len(differ) > _SAID else ""
         raise RecordError(
             str(path),
-            "; ".join(differ) or "the same arms in another order",
+            "; ".join(differ[:_SAID]) + more or "the same arms in another order",
             "the configuration that the folder was begun with",
             "Choose another --out, or repeat the command as it was.",
         )
 
 
-def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """The leaves of nested dicts, by their keys joined with dots."""
-    if not isinstance(value, dict):
-        return {name: value}
-    flat: dict[str, Any] = {}
-    for key, each in value.items():
-        flat |= _flat(each, f"{name}.{key}" if name else key)
-    return flat
+def _differences(was: Any, now: Any, name: str = "") -> list[str]:
+    """What differs between plain values, in words; keys of nested dicts are joined with dots."""
+    if not (isinstance(was, dict) and isinstance(now, dict)):
+        return [] if was == now else [f"{name} was {was} and is {now}"]
+    said = []
+    for key in dict.fromkeys((*was, *now)):
+        inner = f"{name}.{key}" if name else key
+        if key in was and key in now:
+            said += _differences(was[key], now[key], inner)
+        else:
+            said.append(f"{inner} is {'missing' if key in was else 'new'}")
+    return said
 
 
 def _read(path: Path, mark: str, arm: Arm, seed: int) -> Outcome:

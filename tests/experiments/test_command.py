@@ -82,6 +82,7 @@ def test_the_gain_over_the_control_is_the_difference_of_the_rows(words, trained)
     assert came["against_control"] is None
     assert control["against_control"] is None
     assert came["speedup"] == 1
+    assert came["train_seconds"] is None
     for row in others:
         assert row["against_control"] == pytest.approx(row["psnr"] - control["psnr"], abs=1e-9)
         assert row["frame_ms_enlarged"] > 0
@@ -126,13 +127,22 @@ def test_a_changed_list_of_arms_is_refused(words, trained, monkeypatch):
     )
     result = run(*words)
     assert result.exit_code == 1
-    assert "arms.alpha 16/255.rule was alpha_cutoff(16) and is absent" in result.stderr
+    assert "arms.alpha 16/255 is missing" in result.stderr
     monkeypatch.setitem(
         catalogue.EXPERIMENTS,
         "rules",
         lambda *asked: replace(few(*asked), arms=few(*asked).arms[::-1]),
     )
     assert "the same arms in another order" in run(*words).stderr
+
+
+def test_changed_photographs_are_refused(words, trained):
+    run_json(*words)
+    data = words[4]
+    shutil.copy(data / "images" / "view01.png", data / "images" / "view02.png")
+    result = run(*words)
+    assert result.exit_code == 1
+    assert "photographs.sha256 was" in result.stderr
 
 
 def test_results_of_another_configuration_are_not_taken_over(words, trained, tmp_path):
@@ -182,6 +192,7 @@ def test_the_configuration_tells_models_apart(words, trained, tmp_path):
     shutil.copy(model, other / model.name)
     words[2] = other / model.name
     run_json(*words)  # the same model elsewhere
+    assert len(trained) == 3
     tiny.write_ply(words[2], tiny.random_model(seed=5))
     result = run(*words)
     assert result.exit_code == 1
