@@ -10,6 +10,7 @@ from finetune import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fragprune_plugins.engines import create_engine
 from fragprune_plugins.experiments.rules import alpha_cutoff, falloff_threshold
 from fragprune_plugins.finetuning import finetune
 from fragprune_plugins.learning.schedule import Settings
@@ -51,13 +52,29 @@ def test_a_training_follows_a_rule_as_opacities_move(scene, rule):
 
 
 def test_a_rule_that_cuts_nothing_trains_as_the_control_does(scene):
-    """No gradient and no pressure come from a rule."""
+    """Nothing presses on fragments."""
     model, dataset = scene
     ruled = finetune(
         model, dataset, Settings(iterations=6, train="opacity"), rule=falloff_threshold(1e-6)
     )
     control = finetune(model, dataset, Settings(iterations=6, train="opacity", truncate=False))
     assert torch.equal(ruled.model.opacity, control.model.opacity)
+
+
+def test_thresholds_of_a_rule_get_no_gradient(scene):
+    model, dataset = scene
+    engine, wanted = create_engine("auto"), []
+
+    class Watched:
+        name = "watched"
+
+        def rasterize(self, inputs, thresholds):
+            if thresholds is not None:
+                wanted.append(thresholds.requires_grad)
+            return engine.rasterize(inputs, thresholds)
+
+    finetune(model, dataset, Settings(iterations=3), rule=alpha_cutoff(8), engine=Watched())
+    assert wanted == [False] * 3
 
 
 def test_a_rule_waits_as_long_as_learned_thresholds_do(scene, monkeypatch):
