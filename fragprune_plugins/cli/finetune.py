@@ -296,8 +296,14 @@ def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
     """
     own = plain["target"] == "itself"
     compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
+    from fragprune_plugins.measure.wording import FELL
+
+    advice = ""
+    if before["psnr"] is not None and plain["psnr"] < before["psnr"] - FELL:
+        advice = " For viewers that ignore thresholds, fine-tune with --train opacity."
     return (
         f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
         f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "
         f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
+        f"{advice}"
     )

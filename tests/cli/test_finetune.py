@@ -17,6 +17,7 @@ from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
+from fragprune_plugins.cli.finetune import _describe_untruncated
 from fragprune_plugins.finetuning import loop
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.storage import sidecar
@@ -83,6 +84,14 @@ def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
     text = run(*arguments, "--control").stdout
     assert "Without its thresholds" not in text
     assert "together" not in text
+
+
+@pytest.mark.parametrize(("drop", "advised"), [(0.4, False), (0.6, True)])
+def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
+    before = {"psnr": 30.0}
+    plain = {"psnr": 30.0 - drop, "target": "photographs", "fragments_per_pixel": 9.0}
+    line = _describe_untruncated(before, plain | {"frame_ms": 1.0, "frame_ms_se": 0.1})
+    assert ("--train opacity" in line) == advised
 
 
 def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
