@@ -144,7 +144,7 @@ def test_an_unknown_engine_is_refused_with_those_that_are_known(command, scene, 
 def test_help_names_our_engines_and_devices(command):
     said = " ".join(run(command, "--help").stdout.split())
     assert "--engine NAME" in said
-    assert "reference, cpu, cuda, or the name of a plugin's" in said
+    assert "reference, cpu, cuda, or a plugin's engine" in said
     assert "--device auto|cpu|cuda[:N]" in said
 
 
