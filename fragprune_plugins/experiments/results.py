@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.experiments.catalogue import Experiment
-from fragprune_plugins.experiments.running import ENLARGED, Outcome
+from fragprune_plugins.experiments.running import ENLARGED, RESULTS, Outcome
 from fragprune_plugins.storage.atomic import replacing
 
 AS_IT_CAME = "as it came"
@@ -82,7 +82,7 @@ def write(
     Raises:
         OutputError: a file cannot be written.
     """
-    paths = [out / f"{experiment.name}.{suffix}" for suffix in ("md", "csv", "png")]
+    paths = [out / f"{experiment.name}{suffix}" for suffix in RESULTS]
     page, sheet, picture = paths
     with replacing(page) as temporary:
         temporary.write_text(_page(experiment, table, asked), encoding="utf-8")

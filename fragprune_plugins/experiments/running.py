@@ -29,6 +29,9 @@ from fragprune_plugins.storage.records import strict
 ENLARGED = 4
 """Frames are timed at the photographs' size, and with sides this many times as long."""
 
+RESULTS = (".md", ".csv", ".png")
+"""Endings of the files that results are written to, after the experiment's name."""
+
 _SAID = 5  # differences that a refusal lists
 
 
@@ -201,8 +204,19 @@ def _digest(dataset: Dataset) -> str:
 
 
 def _settle(path: Path, asked: dict[str, Any]) -> None:
-    """Write the configuration; if one is there already, it has to be the same."""
+    """Write the configuration; if one is there already, it has to be the same.
+
+    A table or plot without a configuration is somebody else's, and stays.
+    """
     if not path.exists():
+        taken = [path.with_suffix(end) for end in RESULTS if path.with_suffix(end).exists()]
+        if taken:
+            raise RecordError(
+                str(taken[0]),
+                "a file that no experiment wrote",
+                f"a folder without {', '.join(each.name for each in taken)}",
+                "Choose another --out.",
+            )
         _write(path, asked)
         return
     was = _load(path)

@@ -212,6 +212,14 @@ class SessionState:
             # Loading would refuse the sidecar of an earlier model with this name as stale.
             sidecar.path_beside(path).unlink(missing_ok=True)
         else:
+            if state.stage is not None and state.stage.warming_up:
+                log.warning(
+                    "%s: saved in step %d of %d, before thresholds open: nothing is truncated yet. "
+                    "If training ends here, give its length as Settings.iterations.",
+                    path,
+                    state.stage.steps,
+                    self.settings.iterations,
+                )
             self.write_sidecar(path, state.store)
 
     def write_sidecar(self, path: Path, store: ThresholdStore) -> None:

@@ -92,8 +92,12 @@ class Settings:
         """Plain values, for the sidecar and ``--json``."""
         return asdict(self)
 
-    def make_pressure(self) -> Pressure:
-        """The pressure these settings ask for."""
+    def make_pressure(self, elasticity: float | None = None) -> Pressure:
+        """The pressure these settings ask for.
+
+        Args:
+            elasticity: of the default pressure; by what ``train`` names when None.
+        """
         if not self.truncate:
             return FixedPressure(0.0)
         if self.target_speedup is not None:
@@ -102,7 +106,9 @@ class Settings:
             return FixedPressure(self.pressure)
         if self.itself:
             return FixedPressure(OWN_PRESSURE)
-        return ElasticPressure(elasticity=_RECIPES[self.train].elasticity)
+        return ElasticPressure(
+            elasticity=_RECIPES[self.train].elasticity if elasticity is None else elasticity
+        )
 
     @property
     def warmup(self) -> int:
@@ -159,6 +165,10 @@ class Schedule:
             decay=decay,
         )
 
+    def make_pressure(self) -> Pressure:
+        """The pressure of the run, a new one."""
+        return self.settings.make_pressure()
+
 
 def _share(steps: int, of: int) -> float:
     """Steps over all steps, 0 to 1."""
@@ -186,3 +196,7 @@ class JointSchedule(Schedule):
         )
         rate = self.settings.threshold_lr * _DECAY**progress
         return StepPlan(on, rate, None, progress, counted=on)
+
+    def make_pressure(self) -> Pressure:
+        """As for opacities, whatever ``train`` names: the host trains, and presses for longer."""
+        return self.settings.make_pressure(ELASTICITY)

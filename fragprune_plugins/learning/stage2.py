@@ -100,7 +100,7 @@ class Stage2:
     ) -> None:
         self.store, self.settings = store, settings
         self.schedule = schedule or Schedule(settings)
-        self.pressure = settings.make_pressure()
+        self.pressure = self.schedule.make_pressure()
         self.steps = 0  # begun
         self.taken = 0  # the last that the driver's optimizer took: hosts take none at their end
         self.plan: StepPlan | None = None
@@ -119,6 +119,11 @@ class Stage2:
         """Whether this step moves thresholds."""
         plan = self.plan
         return plan is not None and plan.learn and self.settings.truncate and not self._held
+
+    @property
+    def warming_up(self) -> bool:
+        """Whether steps were made, and thresholds that will learn have not opened yet."""
+        return self.settings.truncate and self.steps > 0 and not self._open
 
     @property
     def viewed(self) -> bool:

@@ -77,6 +77,7 @@ def test_settings_out_of_range_are_usage_errors(wrong):
 def test_settings_choose_their_pressure():
     assert Settings(train="opacity").make_pressure() == ElasticPressure()
     assert Settings().make_pressure() == ElasticPressure(elasticity=2 * ELASTICITY)
+    assert JointSchedule(Settings(), 1).make_pressure() == ElasticPressure()
     assert Settings(pressure=3e-4).make_pressure() == FixedPressure(3e-4)
     assert isinstance(Settings(target_speedup=1.8).make_pressure(), PressureController)
     assert Settings(truncate=False, target_speedup=1.8).make_pressure() == FixedPressure(0.0)

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
+from fragprune_plugins.learning.pressure import ELASTICITY
+from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
@@ -120,6 +121,12 @@ def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
     assert it.progress().fragments_before == 20.0
     assert [stats.fragments_per_pixel for stats in told] == [20.0, it.progress().fragments_after]
     assert told[1].fragments_per_pixel < 20.0
+
+
+def test_the_pressure_is_the_schedules():
+    settings = Settings(iterations=10)
+    assert stage(schedule=JointSchedule(settings, 1)).pressure.elasticity == ELASTICITY
+    assert stage(schedule=Schedule(settings)).pressure.elasticity == 2 * ELASTICITY
 
 
 def test_rates_follow_the_schedule():

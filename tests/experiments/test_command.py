@@ -76,6 +76,18 @@ def test_writes_table_sheet_plot_and_configuration(words, trained, tmp_path):
     assert {"version", "model", "machine", "photographs", "engine", "threads"} <= asked.keys()
 
 
+@pytest.mark.parametrize("name", ["rules.md", "rules.csv", "rules.png"])
+def test_a_file_that_no_experiment_wrote_stays(words, trained, tmp_path, name):
+    mine = tmp_path / "out" / name
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    result = run(*words)
+    assert result.exit_code == 1
+    assert name in result.stderr
+    assert mine.read_text() == "mine"
+    assert not trained
+
+
 def test_the_gain_over_the_control_is_the_difference_of_the_rows(words, trained):
     report = run_json(*words, "--seeds", "0,1")
     came, control, *others = report["rows"]
@@ -147,7 +159,8 @@ def test_changed_photographs_are_refused(words, trained):
 
 def test_results_of_another_configuration_are_not_taken_over(words, trained, tmp_path):
     run_json(*words)
-    (tmp_path / "out" / "rules.json").unlink()
+    for file in (tmp_path / "out").glob("rules.*"):
+        file.unlink()
     result = run(*words, "--train", "appearance")
     assert result.exit_code == 1
     assert "a result of another configuration" in result.stderr
