@@ -1,10 +1,12 @@
 """Builds the cpu engine once per instruction set; all else about the project is in pyproject.toml.
 
 The loader opens the best build that the machine runs. Each is a plain shared library behind a C
-interface, opened with ctypes: neither Python nor torch headers. A build that fails (no compiler,
+interface, opened with ctypes: neither Python nor torch headers. So their names and the wheel's name
+no Python version: one wheel per platform serves all of them. A build that fails (no compiler,
 another architecture) is skipped, and `fragprune doctor` says so.
 """
 
+import os
 from pathlib import Path
 
 NATIVE = Path("fragprune_plugins", "native")
@@ -19,8 +21,20 @@ BUILDS = {  # name: floats in a vector, compiler flags
     "avx512": (16, [*FLAGS, *AVX512, "-mfma", "-mbmi", "-mbmi2"]),
 }
 
+SUFFIX = ".pyd" if os.name == "nt" else ".so"
+
 if __name__ == "__main__":
     from setuptools import Extension, setup
+    from setuptools.command.bdist_wheel import bdist_wheel
+    from setuptools.command.build_ext import build_ext
+
+    class Libraries(build_ext):
+        def get_ext_filename(self, fullname: str) -> str:
+            return str(Path(*fullname.split("."))) + SUFFIX
+
+    class Wheel(bdist_wheel):
+        def get_tag(self) -> tuple[str, str, str]:
+            return "py3", "none", super().get_tag()[2]
 
     modules = [
         Extension(
@@ -33,4 +47,4 @@ if __name__ == "__main__":
         )
         for name, (lanes, flags) in BUILDS.items()
     ]
-    setup(ext_modules=modules)
+    setup(ext_modules=modules, cmdclass={"build_ext": Libraries, "bdist_wheel": Wheel})

@@ -28,3 +28,7 @@ def test_a_change_to_any_header_that_the_engine_includes_rebuilds_it(shipped):
     text = "".join(path.read_text() for path in sources)
     included = set(re.findall(r'^#include "(?:.*/)?(\w+\.h)"', text, re.MULTILINE))
     assert included == {path.name for path in shipped["HEADERS"]}
+
+
+def test_every_build_has_the_name_that_the_loader_opens(shipped):
+    assert shipped["SUFFIX"] == binding._SUFFIX

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 import re
 import subprocess
 import sys
@@ -63,12 +62,15 @@ def test_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_absent_is_remembered_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(binding.ENVIRONMENT, raising=False)
     calls = []
+    path_of = binding._path_of
 
-    def nothing(name: str) -> None:
-        calls.append(name)
+    def counted(build: str) -> str:
+        calls.append(build)
+        return path_of(build)
 
     with monkeypatch.context() as patch:
-        patch.setattr(importlib.util, "find_spec", nothing)
+        patch.setattr(binding, "_SUFFIX", ".absent")
+        patch.setattr(binding, "_path_of", counted)
         assert not binding.available()
         assert "not installed" in binding.describe()["reason"]
         assert not binding.available()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 import os
 import threading
 import weakref
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
+
+from fragprune_plugins import native
 
 API_VERSION: Final = 5
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
@@ -18,6 +20,8 @@ ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
 
 BUILDS: Final = {"avx512": 2, "avx2": 1, "baseline": 0}
 """Best first, each with the bit of fragprune_cpu_features that it needs."""
+
+_SUFFIX: Final = ".pyd" if os.name == "nt" else ".so"  # as setup.py names them
 
 OK: Final = 0
 OUT_OF_MEMORY: Final = 2
@@ -191,10 +195,10 @@ class Unavailable(Exception):  # noqa: N818 - a state of this machine, reported 
 
 def _path_of(build: str) -> str:
     """The path of a build's file. The file is not a Python module and is not imported."""
-    spec = importlib.util.find_spec(f"fragprune_plugins.native._cpu_{build}")
-    if spec is None or spec.origin is None:
+    path = Path(native.__file__).with_name(f"_cpu_{build}{_SUFFIX}")
+    if not path.is_file():
         raise Unavailable(f"the {build} build is not installed (was there a C++17 compiler?)")
-    return spec.origin
+    return str(path)
 
 
 def open_build(build: str) -> Library:
