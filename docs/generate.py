@@ -111,15 +111,7 @@ def command_line() -> str:
 prints one object on stdout, and progress on stderr. [Errors](errors.md) lists the exit codes."""
     context = cli.make_context("fragprune", [], resilient_parsing=True)
     context.terminal_width = context.max_content_width = 96
-    parts = []
-    for name in cli.list_commands(context):
-        command = cli.get_command(context, name)
-        assert command is not None
-        inner = click.Context(
-            command, parent=context, info_name=name, terminal_width=96, max_content_width=96
-        )
-        parts.append(f"## fragprune {name}\n\n```text\n{command.get_help(inner)}\n```")
-    return _page("Command line", intro, *parts)
+    return _page("Command line", intro, *_commands(cli, context))
 
 
 def errors() -> str:
@@ -145,6 +137,19 @@ PAGES: dict[str, Callable[[], str]] = {
     "command-line.md": command_line,
     "errors.md": errors,
 }
+
+
+def _commands(group: click.Group, context: click.Context) -> Iterator[str]:
+    """The help of every command of a group, and of those below it."""
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
+        inner = click.Context(
+            command, parent=context, info_name=name, terminal_width=96, max_content_width=96
+        )
+        yield f"## {inner.command_path}\n\n```text\n{command.get_help(inner)}\n```"
+        if isinstance(command, click.Group):
+            yield from _commands(command, inner)
 
 
 def _page(title: str, intro: str, *parts: str) -> str:

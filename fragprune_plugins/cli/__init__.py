@@ -8,6 +8,8 @@ from importlib.util import find_spec
 
 import click
 
+from fragprune_plugins.cli.common import Group
+
 _COMMANDS = {
     "demo": "demo",
     "run": "run",
@@ -26,7 +28,7 @@ _COMMANDS = {
 """Modules of this package by command name, in the order of --help; each defines ``command``."""
 
 
-class _LazyGroup(click.Group):
+class _LazyGroup(Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return [name for name in _COMMANDS if _present(name)]
 
@@ -35,17 +37,6 @@ class _LazyGroup(click.Group):
             return None
         command: click.Command = import_module(f"{__name__}.{_COMMANDS[cmd_name]}").command
         return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        words = list(args)
-        try:
-            return super().resolve_command(ctx, args)
-        except click.UsageError as error:
-            from fragprune_plugins.cli.common import usage_error
-
-            raise usage_error(error, words) from error
 
 
 def _present(name: str) -> bool:

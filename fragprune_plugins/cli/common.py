@@ -142,6 +142,20 @@ class Command(click.Command):
         ctx.exit(report.exit_code)
 
 
+class Group(click.Group):
+    """Commands under one name; with --json, an unknown one is printed as JSON."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that the first word names, and the other words."""
+        words = list(args)
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            raise usage_error(error, words) from error
+
+
 def usage_error(error: click.UsageError, words: list[str]) -> Exception:
     """The exception to raise for a usage error. With --json, prints the error and returns an exit.
 
@@ -160,7 +174,7 @@ def usage_error(error: click.UsageError, words: list[str]) -> Exception:
     return click.exceptions.Exit(2)
 
 
-def _together(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:
+def together(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:
     """Several options as one decorator; --help shows them in this order."""
 
     def decorate(function: Function) -> Function:
@@ -169,7 +183,7 @@ def _together(*options: Callable[[Function], Function]) -> Callable[[Function], 
     return decorate
 
 
-image_options = _together(
+image_options = together(
     click.option(
         "--resolution",
         type=click.IntRange(1, 16),
@@ -184,7 +198,7 @@ image_options = _together(
     ),
 )
 
-data_options = _together(
+data_options = together(
     click.option(
         "--data",
         type=FILE,
@@ -226,7 +240,7 @@ threads_option = click.option(
     "--threads", type=click.IntRange(min=1), help="Number of CPU threads; default: all cores."
 )
 
-engine_options = _together(
+engine_options = together(
     engine_option("Engine that rasterizes"),
     device_option("Device; auto takes a GPU if our cuda engine can draw on it, else the CPU."),
     threads_option,

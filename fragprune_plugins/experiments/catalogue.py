@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Literal, get_args
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.experiments.rules import Rule, alpha_cutoff, falloff_threshold
@@ -25,12 +25,14 @@ class Arm:
         variant: what sets the arm apart in its series; empty where the series has one arm.
         settings: of the training; every seed replaces theirs.
         rule: gives the thresholds; None where they are learned, or where nothing is truncated.
+        opens: iterations before anything is truncated; None for ``Settings.warmup``.
     """
 
     series: str
     variant: str
     settings: Settings
     rule: Rule | None = None
+    opens: int | None = None
 
     @property
     def label(self) -> str:
@@ -51,11 +53,13 @@ class Experiment:
         name: of the experiment, and of its files.
         asks: what it asks, one sentence.
         arms: what is compared.
+        over: what the plot shows quality over: fragments and frame time, or iterations.
     """
 
     name: str
     asks: str
     arms: tuple[Arm, ...]
+    over: Literal["fragments", "iterations"] = "fragments"
 
     def control_of(self, arm: Arm) -> Arm | None:
         """The control of equal length that moves the same parameters; None for a control."""
@@ -140,9 +144,34 @@ def iterations(longest: int, train: Train | None = None) -> Experiment:
     )
 
 
+def overfitting(longest: int, train: Train | None = None) -> Experiment:
+    """Training views beside held-out ones, over the length of stage 2 and of truncation in it.
+
+    Args:
+        longest: iterations of the longest arms.
+        train: what moves in every arm; all parameters when None.
+    """
+    settings = Settings(iterations=longest, train=train or "all")
+    lengths = dict.fromkeys(max(1, round(longest * share)) for share in (0.1, 0.2, 0.4, 1))
+    every = [replace(settings, iterations=length) for length in lengths]
+    later = dict.fromkeys(round(longest * share) for share in (0.4, 0.6, 0.8))
+    return Experiment(
+        "overfitting",
+        "Does a longer stage 2, or longer truncation in it, improve held-out views, or only those "
+        "it learns from?",
+        (
+            *(Arm("control", f"{each.iterations:,}", _control(each)) for each in every),
+            *(Arm("from the first step", f"{e.iterations:,}", e, opens=0) for e in every),
+            *(Arm("opens later", f"after {opens:,}", settings, opens=opens) for opens in later),
+        ),
+        over="iterations",
+    )
+
+
 EXPERIMENTS: dict[str, Callable[[int, Train | None], Experiment]] = {
     "rules": rules,
     "moves": moves,
     "iterations": iterations,
+    "overfitting": overfitting,
 }
 """By name: makes the experiment from the iterations of its longest arms and from what moves."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import statistics
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.experiments.catalogue import Experiment
-from fragprune_plugins.experiments.running import ENLARGED, RESULTS, Outcome
-from fragprune_plugins.storage.atomic import replacing
+from fragprune_plugins.experiments.folder import Findings, Folder, markdown
+from fragprune_plugins.experiments.running import ENLARGED, Outcome
 
 AS_IT_CAME = "as it came"
 """Label of the row of the untruncated model before any training."""
@@ -20,6 +20,7 @@ _FIGURES: dict[str, Callable[[Outcome], float]] = {
     "fragments_per_pixel": lambda o: o.after["fragments_per_pixel"],
     "psnr": lambda o: o.after["psnr"],
     "ssim": lambda o: o.after["ssim"],
+    "psnr_training": lambda o: o.after["psnr_training"],
     "frame_ms": lambda o: o.after["frame_ms"],
     "speedup": lambda o: o.before["frame_ms"] / o.after["frame_ms"],
     "frame_ms_enlarged": lambda o: o.after["frame_ms_enlarged"],
@@ -30,6 +31,7 @@ _FIGURES: dict[str, Callable[[Outcome], float]] = {
 _COLUMNS = (
     ("fragments/px", "fragments_per_pixel", "{:.2f}"),
     ("PSNR, dB", "psnr", "{:.2f}"),
+    ("training views, dB", "psnr_training", "{:.2f}"),
     ("SSIM", "ssim", "{:.4f}"),
     ("frame, ms", "frame_ms", "{:.2f}"),
     ("faster", "speedup", "{:.2f}x"),
@@ -48,19 +50,21 @@ def rows(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[dict[str, 
         outcomes: of every arm with every seed.
 
     Returns:
-        label, series, variant, and means over seeds, each with its standard deviation as
-        ``KEY_spread`` (None for one seed): fragments_per_pixel, psnr (dB), ssim, frame_ms,
-        speedup (frame time of the model as it came over frame_ms), frame_ms_enlarged and
-        speedup_enlarged (the same with longer sides), train_seconds, against_control (dB, PSNR
-        over that of the control of equal length; None where there is none).
+        label, series, variant, iterations, and means over seeds, each with its standard deviation
+        as ``KEY_spread`` (None for one seed): fragments_per_pixel, psnr (dB), ssim, psnr_training
+        (on the views learned from; all else is on held-out views), frame_ms, speedup (frame time
+        of the model as it came over frame_ms), frame_ms_enlarged and speedup_enlarged (the same
+        with longer sides), train_seconds, against_control (dB, PSNR over that of the control of
+        equal length; None where there is none).
     """
     came = [Outcome(each.arm, each.seed, each.before, each.before, 0.0) for each in outcomes]
     first = _means(came) | _mean("against_control", []) | _mean("train_seconds", [])
     first = {key: None if key.endswith("_spread") else value for key, value in first.items()}
-    table = [{"label": AS_IT_CAME, "series": AS_IT_CAME, "variant": ""} | first]
+    table = [{"label": AS_IT_CAME, "series": AS_IT_CAME, "variant": "", "iterations": 0} | first]
     for arm in experiment.arms:
         mine = [each for each in outcomes if each.arm == arm]
-        row = {"label": arm.label, "series": arm.series, "variant": arm.variant} | _means(mine)
+        row = {"label": arm.label, "series": arm.series, "variant": arm.variant}
+        row |= {"iterations": arm.settings.iterations} | _means(mine)
         control = experiment.control_of(arm)
         theirs = {each.seed: each for each in outcomes if each.arm == control}
         gains = [o.after["psnr"] - theirs[o.seed].after["psnr"] for o in mine if o.seed in theirs]
@@ -68,39 +72,25 @@ def rows(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[dict[str, 
     return table
 
 
-def write(
-    out: Path, experiment: Experiment, table: Sequence[dict[str, Any]], asked: dict[str, Any]
-) -> list[Path]:
-    """Write NAME.md, NAME.csv and NAME.png into a folder; returns their paths.
+def findings(experiment: Experiment, outcomes: Sequence[Outcome], folder: Folder) -> Findings:
+    """Table, page and plot of an experiment.
 
     Args:
-        out: the folder.
         experiment: what was compared.
-        table: the result of ``rows``.
-        asked: the configuration.
-
-    Raises:
-        OutputError: a file cannot be written.
+        outcomes: of every arm with every seed.
+        folder: of the experiment.
     """
-    paths = [out / f"{experiment.name}{suffix}" for suffix in RESULTS]
-    page, sheet, picture = paths
-    with replacing(page) as temporary:
-        temporary.write_text(_page(experiment, table, asked), encoding="utf-8")
-    with replacing(sheet) as temporary:
-        temporary.write_text(_csv(table), encoding="utf-8")
-    with replacing(picture) as temporary:
-        _plot(temporary, table)
-    return paths
-
-
-def markdown(table: Sequence[dict[str, Any]]) -> str:
-    """The table as Markdown."""
+    table = rows(experiment, outcomes)
     head = ["", *(title for title, _, _ in _COLUMNS)]
-    lines = [head, ["---"] + ["---:"] * len(_COLUMNS)]
-    lines += [
-        [row["label"], *(_cell(row, key, form) for _, key, form in _COLUMNS)] for row in table
-    ]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    cells = [[row["label"], *(_cell(row, key, form) for _, key, form in _COLUMNS)] for row in table]
+    return Findings(
+        folder,
+        experiment.asks,
+        table,
+        markdown(head, cells),
+        _text(folder.asked),
+        partial(_plot, experiment=experiment, table=table),
+    )
 
 
 def _mean(key: str, values: Sequence[float]) -> dict[str, Any]:
@@ -125,17 +115,12 @@ def _cell(row: dict[str, Any], key: str, form: str) -> str:
     return text if spread is None else f"{text} ± {form.format(spread).strip('+x')}"
 
 
-def _page(experiment: Experiment, table: Sequence[dict[str, Any]], asked: dict[str, Any]) -> str:
+def _text(asked: dict[str, Any]) -> str:
     seeds, machine, scene = asked["seeds"], asked["machine"], asked["photographs"]
     spread = " ± is the standard deviation over seeds." if len(seeds) > 1 else ""
     device = machine["gpu"] or machine["processor"]
-    return f"""# {experiment.name}
-
-{experiment.asks}
-
-{markdown(table)}
-
-Means over {scene["held_out_views"]} held-out views and seeds {", ".join(map(str, seeds))}.{spread}
+    trained = ", ".join(map(str, seeds))
+    return f"""Means over {scene["held_out_views"]} held-out views and seeds {trained}.{spread}
 
 "Faster" is the frame time of the model {AS_IT_CAME}, without truncation, over the arm's, timed in
 turns: at the photographs' size, and with sides {ENLARGED} times as long. Compare arms by this
@@ -145,50 +130,31 @@ equally long, moves the same parameters and truncates nothing.
 * model: {asked["model"]["name"]}, SHA-256 {asked["model"]["sha256"][:12]}
 * photographs: {scene["folder"]}, {scene["training_views"]} training views
 * fragprune {asked["version"]}, {asked["engine"]} engine on {device}, {asked["threads"]} threads
-* everything else: {experiment.name}.json
-
-![Held-out PSNR against fragments and frame time]({experiment.name}.png)
-"""
+* everything else: {asked["experiment"]}.json"""
 
 
-def _csv(table: Sequence[dict[str, Any]]) -> str:
-    sheet = io.StringIO()
-    writer = csv.DictWriter(sheet, table[0].keys(), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
-    return sheet.getvalue()
-
-
-def _plot(path: Path, table: Sequence[dict[str, Any]]) -> None:
-    """Held-out PSNR against fragments, and against frame times at both sizes.
-
-    Arms are measured one after the other, maybe hours apart. Their frame times are therefore shown
-    relative to those of the model as it came, which were taken in turns with them.
-    """
+def _plot(path: Path, experiment: Experiment, table: Sequence[dict[str, Any]]) -> None:
+    """Write the plot as PNG: quality over what the experiment names."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15, 5), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = (
-        ("drawn fragments per pixel", "fragments_per_pixel", 1),
-        (f"frame time / that of the model {AS_IT_CAME}", "speedup", -1),
-        (f"the same, sides {ENLARGED} times as long", "speedup_enlarged", -1),
-    )
-    subplots = figure.subplots(1, len(panels))
-    for axes, (label, key, power) in zip(subplots, panels, strict=True):
+    panels = _PANELS[experiment.over]
+    subplots = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, panel in zip(subplots, panels, strict=True):
         for series in dict.fromkeys(row["series"] for row in table):
             line = [row for row in table if row["series"] == series]
             line.sort(key=lambda row: float(row["fragments_per_pixel"]))
-            x, y = [row[key] ** power for row in line], [row["psnr"] for row in line]
+            x, y = [panel.at(row) for row in line], [row[panel.quality] for row in line]
             axes.errorbar(
                 x,
                 y,
                 xerr=[
-                    at * (row[f"{key}_spread"] or 0) / row[key]
+                    at * (row.get(f"{panel.over}_spread") or 0) / (row[panel.over] or 1)
                     for row, at in zip(line, x, strict=True)
                 ],
-                yerr=[row["psnr_spread"] or 0 for row in line],
+                yerr=[row[f"{panel.quality}_spread"] or 0 for row in line],
                 marker="*" if series == AS_IT_CAME else "o",
                 markersize=10 if series == AS_IT_CAME else 5,
                 linewidth=1.2,
@@ -204,8 +170,51 @@ def _plot(path: Path, table: Sequence[dict[str, Any]]) -> None:
                     fontsize=7,
                     rotation=30,
                 )
-        axes.set(xlabel=label, ylabel="held-out PSNR, dB")
+        axes.set(xlabel=panel.label, ylabel=_QUALITIES[panel.quality])
         axes.margins(0.1)
         axes.grid(alpha=0.25)
     subplots[0].legend(fontsize=8)
     figure.savefig(path, format="png", dpi=110)
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """One panel of a plot.
+
+    Arms are measured one after the other, maybe hours apart. Their frame times are therefore shown
+    relative to those of the model as it came, which were taken in turns with them.
+
+    Attributes:
+        label: of what lies across.
+        over: its key in the table.
+        power: -1 shows the reciprocal.
+        quality: key of what lies upwards.
+    """
+
+    label: str
+    over: str
+    power: int = 1
+    quality: str = "psnr"
+
+    def at(self, row: dict[str, Any]) -> float:
+        """Where a row of the table lies across."""
+        return float(row[self.over]) ** self.power
+
+
+_QUALITIES = {"psnr": "held-out PSNR, dB", "psnr_training": "PSNR on training views, dB"}
+
+_FRAGMENTS = _Panel("drawn fragments per pixel", "fragments_per_pixel")
+
+_PANELS = {
+    "fragments": (
+        _FRAGMENTS,
+        _Panel(f"frame time / that of the model {AS_IT_CAME}", "speedup", -1),
+        _Panel(f"the same, sides {ENLARGED} times as long", "speedup_enlarged", -1),
+    ),
+    "iterations": (
+        _Panel("iterations", "iterations", quality="psnr_training"),
+        _Panel("iterations", "iterations"),
+        _FRAGMENTS,
+    ),
+}
+"""Panels by what an experiment's plot shows quality over."""

@@ -3,36 +3,30 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-import fragprune_plugins
 from fragprune_plugins.bench.machine import describe_machine
 from fragprune_plugins.datasets.dataset import Dataset, load_photographs
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import Interrupted, RecordError, Terminated
+from fragprune_plugins.errors import Interrupted, Terminated
 from fragprune_plugins.experiments.catalogue import Arm, Experiment
+from fragprune_plugins.experiments.folder import Folder
 from fragprune_plugins.finetuning import FinetuneResult, finetune
+from fragprune_plugins.learning.schedule import Schedule
 from fragprune_plugins.measure import Candidate, frame_times, measure
 from fragprune_plugins.storage import models
-from fragprune_plugins.storage.atomic import digest, replacing, writable_folder
+from fragprune_plugins.storage.atomic import digest
 from fragprune_plugins.storage.ply import SplatFile
-from fragprune_plugins.storage.records import strict
 
 ENLARGED = 4
 """Frames are timed at the photographs' size, and with sides this many times as long."""
-
-RESULTS = (".md", ".csv", ".png")
-"""Endings of the files that results are written to, after the experiment's name."""
-
-_SAID = 5  # differences that a refusal lists
 
 
 @dataclass(frozen=True)
@@ -42,8 +36,9 @@ class Outcome:
     Attributes:
         arm: what was trained.
         seed: of the order of views.
-        before: measurement of the model as it came, without thresholds (``measure``), and
-            "frame_ms_enlarged" with "frame_ms_enlarged_se"; timed in turns with ``after``.
+        before: measurement of the model as it came, without thresholds (``measure``), with
+            "frame_ms_enlarged", "frame_ms_enlarged_se", and "psnr_training" and "ssim_training" on
+            the views that it learned from; timed in turns with ``after``.
         after: of the model as trained, with its thresholds.
         train_seconds: wall-clock seconds of the training.
     """
@@ -65,11 +60,11 @@ def run(
     device: torch.device | str = "cpu",
     seeds: Sequence[int] = (0,),
     progress: bool = False,
-) -> tuple[dict[str, Any], list[Outcome]]:
+) -> tuple[Folder, list[Outcome]]:
     """Train and measure what is missing of an experiment.
 
     Writes OUT/NAME.json, the configuration, and a file for each arm and seed into OUT/arms as soon
-    as it is measured, so that an interrupted experiment goes on where it was.
+    as it is measured, so that an interrupted experiment goes on where it was (``Folder``).
 
     Args:
         experiment: what to compare.
@@ -82,7 +77,7 @@ def run(
         progress: draw bars on stderr.
 
     Returns:
-        The configuration, and the outcomes in the order of arms and seeds.
+        The folder with the configuration, and the outcomes in the order of arms and seeds.
 
     Raises:
         RecordError: the folder holds this experiment in another configuration, or a file of it
@@ -95,38 +90,34 @@ def run(
     splat, _ = models.load(model, truncation=False, device=device)
     dataset = load_photographs(photographs).to(device)
     asked = _configuration(experiment, model, photographs, dataset, engine, device, seeds)
-    writable_folder(out / "arms")
-    _settle(out / f"{experiment.name}.json", asked)
-    mark = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
-    jobs = list(_jobs(experiment, seeds, out))
+    folder = Folder(out, experiment.name, asked)
+    jobs = [(index, arm, seed) for index, arm in enumerate(experiment.arms) for seed in seeds]
     outcomes = []
     with tqdm(jobs, disable=not progress, desc=experiment.name, unit="training") as bar:
-        for arm, seed, path in bar:
-            bar.set_postfix_str(f"{arm.label}, seed {seed}")
-            if not path.exists():
-                result = _train(arm, seed, splat, dataset, engine, progress)
-                before, after = _measure(splat, result, dataset, engine)
-                done = {"before": before, "after": after, "train_seconds": result.train_seconds}
-                _write(path, {"configuration": mark, "arm": arm.label, "seed": seed} | done)
-            outcomes.append(_read(path, mark, arm, seed))
-    return asked, outcomes
+        for index, arm, seed in bar:
+            label = f"{arm.label}, seed {seed}"
+            bar.set_postfix_str(label)
+            work = partial(_outcome, arm, seed, splat, dataset, engine, progress)
+            content = folder.part(index, label, work)
+            figures = (content[key] for key in ("before", "after", "train_seconds"))
+            outcomes.append(Outcome(arm, seed, *figures))
+    return folder, outcomes
 
 
-def _jobs(
-    experiment: Experiment, seeds: Sequence[int], out: Path
-) -> Iterator[tuple[Arm, int, Path]]:
-    """Every training and the file of its result."""
-    for index, arm in enumerate(experiment.arms):
-        slug = re.sub(r"[^a-z0-9.]+", "-", arm.label.lower())
-        for seed in seeds:
-            yield arm, seed, out / "arms" / f"{experiment.name}-{index:02d}-{slug}-seed{seed}.json"
-
-
-def _train(
+def _outcome(
     arm: Arm, seed: int, splat: SplatFile, dataset: Dataset, engine: Engine, progress: bool
-) -> FinetuneResult:
+) -> dict[str, Any]:
+    """What ``Outcome`` holds of an arm, as plain values."""
     settings = replace(arm.settings, seed=seed)
-    result = finetune(splat, dataset, settings, rule=arm.rule, engine=engine, progress=progress)
+    result = finetune(
+        splat,
+        dataset,
+        settings,
+        schedule=None if arm.opens is None else Schedule(settings, warmup=arm.opens),
+        rule=arm.rule,
+        engine=engine,
+        progress=progress,
+    )
     if result.interrupted:
         raise (Terminated if result.terminated else Interrupted)(
             arm.label,
@@ -134,7 +125,8 @@ def _train(
             "all of them",
             "Repeat the command: finished arms are kept.",
         )
-    return result
+    before, after = _measure(splat, result, dataset, engine)
+    return {"before": before, "after": after, "train_seconds": result.train_seconds}
 
 
 def _measure(
@@ -148,9 +140,12 @@ def _measure(
     ]
     measured = measure(candidates, dataset.test, engine=engine)
     enlarged = frame_times(candidates, views, engine)
+    learned_from = measure(candidates, dataset.train, engine=engine, repeats=1)
     return [
-        usual | {f"{key}_enlarged": value for key, value in large.items()}
-        for usual, large in zip(measured, enlarged, strict=True)
+        usual
+        | {f"{key}_enlarged": value for key, value in large.items()}
+        | {f"{key}_training": seen[key] for key in ("psnr", "ssim")}
+        for usual, large, seen in zip(measured, enlarged, learned_from, strict=True)
     ]
 
 
@@ -164,18 +159,17 @@ def _configuration(
     seeds: Sequence[int],
 ) -> dict[str, Any]:
     """Everything that decides about the figures, as plain values."""
-    asked = {
-        "experiment": experiment.name,
+    return {
         "asks": experiment.asks,
         "arms": {
             arm.label: {
                 "settings": {k: v for k, v in arm.settings.as_dict().items() if k != "seed"},
                 "rule": arm.rule and arm.rule.name,
+                "opens": arm.opens,
             }
             for arm in experiment.arms
         },
         "seeds": list(seeds),
-        "version": fragprune_plugins.__version__,
         "model": {"name": model.name, "sha256": digest(model)},
         "photographs": photographs.as_dict()
         | {
@@ -189,8 +183,6 @@ def _configuration(
         "threads": torch.get_num_threads(),
         "machine": describe_machine(device),
     }
-    plain: dict[str, Any] = json.loads(json.dumps(asked))
-    return plain
 
 
 def _digest(dataset: Dataset) -> str:
@@ -201,74 +193,3 @@ def _digest(dataset: Dataset) -> str:
         sha.update((255 * shot.image).round().byte().cpu().numpy().tobytes())
         sha.update(shot.view.projmatrix.cpu().numpy().tobytes())
     return sha.hexdigest()
-
-
-def _settle(path: Path, asked: dict[str, Any]) -> None:
-    """Write the configuration; if one is there already, it has to be the same.
-
-    A table or plot without a configuration is somebody else's, and stays.
-    """
-    if not path.exists():
-        taken = [path.with_suffix(end) for end in RESULTS if path.with_suffix(end).exists()]
-        if taken:
-            raise RecordError(
-                str(taken[0]),
-                "a file that no experiment wrote",
-                f"a folder without {', '.join(each.name for each in taken)}",
-                "Choose another --out.",
-            )
-        _write(path, asked)
-        return
-    was = _load(path)
-    differ = _differences(was, asked)
-    if differ or list(was["arms"]) != list(asked["arms"]):
-        more = f"; and {len(differ) - _SAID} more" if len(differ) > _SAID else ""
-        raise RecordError(
-            str(path),
-            "; ".join(differ[:_SAID]) + more or "the same arms in another order",
-            "the configuration that the folder was begun with",
-            "Choose another --out, or repeat the command as it was.",
-        )
-
-
-def _differences(was: Any, now: Any, name: str = "") -> list[str]:
-    """What differs between plain values, in words; keys of nested dicts are joined with dots."""
-    if not (isinstance(was, dict) and isinstance(now, dict)):
-        return [] if was == now else [f"{name} was {was} and is {now}"]
-    said = []
-    for key in dict.fromkeys((*was, *now)):
-        inner = f"{name}.{key}" if name else key
-        if key in was and key in now:
-            said += _differences(was[key], now[key], inner)
-        else:
-            said.append(f"{inner} is {'missing' if key in was else 'new'}")
-    return said
-
-
-def _read(path: Path, mark: str, arm: Arm, seed: int) -> Outcome:
-    content = _load(path)
-    if content.get("configuration") != mark:
-        raise RecordError(
-            str(path),
-            "a result of another configuration",
-            "one of the configuration that is asked for",
-            "Choose another --out, or remove the file.",
-        )
-    return Outcome(arm, seed, content["before"], content["after"], content["train_seconds"])
-
-
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(content, dict):
-            raise ValueError("not an object")
-        return content
-    except (OSError, ValueError) as error:
-        raise RecordError(
-            str(path), f"unreadable ({error})", "a file that an experiment wrote", "Remove it."
-        ) from error
-
-
-def _write(path: Path, content: dict[str, Any]) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(strict(content), indent=1) + "\n", encoding="utf-8")

@@ -144,21 +144,25 @@ class StepPlan:
 class Schedule:
     """Stage 2 after training: thresholds learn after a warm-up, learning rates decay tenfold.
 
-    The warm-up is ``Settings.warmup``: none in a run of 2,000 steps or less.
-
     Subclass and return an instance from ``fragprune_create_schedule`` to change it.
+
+    Args:
+        settings: of the run.
+        warmup: steps without truncation; ``Settings.warmup`` when None, which is none in a run of
+            2,000 steps or less.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, warmup: int | None = None) -> None:
         self.settings = settings
+        self.warmup = settings.warmup if warmup is None else warmup
 
     def at(self, step: int) -> StepPlan:
         """The plan of a step, counted from 1 by the session."""
         settings = self.settings
         decay = _DECAY ** _share(step - 1, settings.iterations - 1)
-        over = _share(step - 1 - settings.warmup, settings.iterations - 1 - settings.warmup)
+        over = _share(step - 1 - self.warmup, settings.iterations - 1 - self.warmup)
         return StepPlan(
-            learn=step > settings.warmup,
+            learn=step > self.warmup,
             threshold_lr=settings.threshold_lr * _DECAY**over,
             opacity_lr=settings.opacity_lr * decay,
             progress=over,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from cli.commands import run
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.experiments.catalogue import EXPERIMENTS
@@ -43,3 +44,20 @@ def test_moves_compares_what_moves():
 def test_iterations_compares_lengths():
     lengths = [arm.settings.iterations for arm in EXPERIMENTS["iterations"](5000, None).arms]
     assert lengths == [200, 1000, 5000] * 2
+
+
+def test_overfitting_compares_lengths_and_openings():
+    experiment = EXPERIMENTS["overfitting"](5000, None)
+    truncated = [
+        (arm.settings.iterations, arm.opens) for arm in experiment.arms if not arm.is_control
+    ]
+    assert truncated == [(500, 0), (1000, 0), (2000, 0), (5000, 0)] + [
+        (5000, opens) for opens in (2000, 3000, 4000)
+    ]
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_is_listed_with_its_question(name):
+    listed = "".join(run("experiment", "--help").stdout.split())
+    asks = EXPERIMENTS[name](5000, None).asks
+    assert name + "".join(asks.split()) in listed

@@ -73,6 +73,8 @@ def test_writes_table_sheet_plot_and_configuration(words, trained, tmp_path):
     assert asked["seeds"] == [0, 1]
     assert asked["arms"]["alpha 16/255"]["rule"] == "alpha_cutoff(16)"
     assert asked["arms"]["learned"]["settings"]["pressure"] == 1e-2
+    assert {row["iterations"] for row in sheet} == {"0", "3"}
+    assert all(0 < float(row["psnr_training"]) < 100 for row in sheet)
     assert {"version", "model", "machine", "photographs", "engine", "threads"} <= asked.keys()
 
 
@@ -210,3 +212,18 @@ def test_the_configuration_tells_models_apart(words, trained, tmp_path):
     result = run(*words)
     assert result.exit_code == 1
     assert "model.sha256 was" in result.stderr
+
+
+def test_an_arm_truncates_from_where_it_opens(words, trained, monkeypatch):
+    """Until then it trains as the control does, to the bit."""
+    learned = Settings(iterations=3, train="opacity", pressure=1e-2)
+    arms = (
+        Arm("control", "", replace(learned, truncate=False, pressure=None)),
+        *(Arm("learned", str(opens), learned, opens=opens) for opens in (0, 3)),
+    )
+    experiment = Experiment("rules", "When?", arms, over="iterations")
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", lambda *asked: experiment)
+    _, control, early, never = run_json(*words)["rows"]
+    for key in ("fragments_per_pixel", "psnr", "psnr_training"):
+        assert never[key] == control[key]
+    assert early["fragments_per_pixel"] < control["fragments_per_pixel"]
