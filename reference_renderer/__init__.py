@@ -11,7 +11,7 @@ rasterizer, including the derivatives that it leaves out.
 """
 
 from reference_renderer.project import Footprints
-from reference_renderer.render import render, render_footprints
+from reference_renderer.render import fragment_weights, render, render_footprints
 from reference_renderer.scene import Camera, Gaussians, Options, Rendering
 from reference_renderer.spacetime import SpacetimeGaussians, slice_gaussians
 
@@ -22,6 +22,7 @@ __all__ = [
     "Options",
     "Rendering",
     "SpacetimeGaussians",
+    "fragment_weights",
     "render",
     "render_footprints",
     "slice_gaussians",

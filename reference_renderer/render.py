@@ -95,6 +95,39 @@ def render(
     return collect(camera, front, none.index_add(0, front, radii), blocks, drawings)
 
 
+def fragment_weights(
+    camera: Camera,
+    gaussians: Gaussians,
+    thresholds: Tensor | None = None,
+    *,
+    options: Options | None = None,
+    every: int = 1,
+) -> Tensor:
+    """(F,) weights alpha T of the drawn fragments, one by one, by tiles.
+
+    Args:
+        camera: the view.
+        gaussians: N of them.
+        thresholds: as in ``render``.
+        options: as in ``render``.
+        every: only each so-manieth tile is drawn.
+    """
+    options = options or Options()
+    front = rows_in_front(camera, gaussians.means, options.near)
+    footprints = project(camera, gaussians.take(front), options)
+    tau = None if thresholds is None else thresholds[front]
+    rects = tile_rects(camera, footprints)
+    blocks = list(cut(camera, footprints, rects, footprints.radius > 0, options))[::every]
+    found = [camera.background.new_empty(0)]
+    for block in blocks:
+        here = footprints.take(block.rows)
+        points = sample_points(block, options, here.mean2d)
+        there = fragments(here, points, None if tau is None else tau[block.rows], options)
+        live = alive(there.alpha, options.transmittance_min)
+        found.append(weights_of(there.alpha * live)[there.drawn & live])
+    return torch.cat(found)
+
+
 def render_footprints(
     camera: Camera,
     footprints: Footprints,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,15 +12,18 @@ import click
 from fragprune_plugins.cli.common import (
     FILE,
     Command,
+    Function,
     Group,
     Report,
     data_options,
+    engine_option,
     engine_options,
     open_engine,
+    threads_option,
     together,
 )
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.experiments.catalogue import EXPERIMENTS
+from fragprune_plugins.experiments.catalogue import EXPERIMENTS, QUESTIONS
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS
 
@@ -55,7 +59,7 @@ _out_option = click.option(
 )
 
 
-def _seeds_option(default: str) -> Any:
+def _seeds_option(default: str) -> Callable[[Function], Function]:
     return click.option(
         "--seeds",
         default=default,
@@ -158,3 +162,110 @@ for _name, _make in EXPERIMENTS.items():
     command.command(
         _name, cls=Command, short_help=_asks, help=_TRAINING.format(asks=_asks, name=_name)
     )(_training_options(partial(_train, _name)))
+
+
+@command.command("signals", cls=Command, short_help=QUESTIONS["signals"])
+@_out_option
+@click.option(
+    "--iters",
+    type=click.IntRange(min=2),
+    default=1000,
+    show_default=True,
+    help="Steps of every fit.",
+)
+@_seeds_option("0,1,2,3,4")
+@engine_option("Engine that draws, on the CPU")
+@threads_option
+def _fit_signals(
+    out: Path, iters: int, seeds: tuple[int, ...], engine: str, threads: int | None
+) -> Report:
+    """Fit lines and small pictures with Gaussians and with truncated ones.
+
+    It needs no model and no photographs, and takes some minutes. A square wave, a step, a smooth
+    line, a line of a photograph, and pictures of each kind are fitted with few primitives; as many
+    parameters are compared too. Every other pixel is held out.
+
+    \b
+    Example:
+      fragprune experiment signals --out experiments
+    """
+    from fragprune_plugins.experiments import signals
+
+    drawer, _ = open_engine(engine, "cpu", threads)
+    return _report(signals.run(out, engine=drawer, seeds=seeds, iterations=iters, progress=True))
+
+
+_views_options = together(
+    click.argument("models", metavar="MODEL...", type=FILE, nargs=-1, required=True),
+    data_options,
+    _out_option,
+    engine_options,
+)
+
+
+@command.command("stages", cls=Command, short_help=QUESTIONS["stages"])
+@_views_options
+@click.option(
+    "--repeats", type=click.IntRange(min=2), default=9, show_default=True, help="Timed rounds."
+)
+def _time_stages(
+    models: tuple[Path, ...],
+    data: Path,
+    resolution: int,
+    white_background: bool,
+    out: Path,
+    engine: str,
+    device: str,
+    threads: int | None,
+    repeats: int,
+) -> Report:
+    """Time the stages of frames on held-out views, from 256 pixels to 4K.
+
+    Every MODEL is drawn with the thresholds stored beside it, all of them in turns. One MODEL alone
+    is drawn without its thresholds too. Use an idle machine.
+
+    \b
+    Example:
+      fragprune experiment stages point_cloud.ply pruned.ply --data scene --out experiments
+    """
+    from fragprune_plugins.datasets.photographs import Photographs, Resolution
+    from fragprune_plugins.experiments import stages
+
+    drawer, where = open_engine(engine, device, threads)
+    photographs = Photographs(data, Resolution(resolution), white_background)
+    return _report(
+        stages.run(
+            models, photographs, out, engine=drawer, device=where, repeats=repeats, progress=True
+        )
+    )
+
+
+@command.command("fragments", cls=Command, short_help=QUESTIONS["fragments"])
+@_views_options
+def _count_fragments(
+    models: tuple[Path, ...],
+    data: Path,
+    resolution: int,
+    white_background: bool,
+    out: Path,
+    engine: str,
+    device: str,
+    threads: int | None,
+) -> Report:
+    """Count fragments by Gaussian, opacity, size and weight on held-out views.
+
+    Every MODEL is drawn with the thresholds stored beside it. One MODEL alone is drawn without its
+    thresholds too.
+
+    \b
+    Example:
+      fragprune experiment fragments point_cloud.ply pruned.ply --data scene --out experiments
+    """
+    from fragprune_plugins.datasets.photographs import Photographs, Resolution
+    from fragprune_plugins.experiments import fragments
+
+    drawer, where = open_engine(engine, device, threads)
+    photographs = Photographs(data, Resolution(resolution), white_background)
+    return _report(
+        fragments.run(models, photographs, out, engine=drawer, device=where, progress=True)
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Final
 
+from fragprune_plugins.constants import TILE
 from fragprune_plugins.engines.slicing import check_harmonics
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import (
@@ -27,6 +28,7 @@ from reference_renderer import (
     slice_gaussians,
 )
 from reference_renderer import Footprints as Projected
+from reference_renderer import fragment_weights as weights_one_by_one
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -110,6 +112,27 @@ def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:
     projected = projected_of(splats)
     return render_footprints(
         camera, projected, splats.tiles, thresholds, means2d_hook=hook, options=options
+    )
+
+
+def fragment_weights(inputs: RasterInputs, thresholds: Tensor | None, tiles: int) -> Tensor:
+    """(F,) weights alpha T of drawn fragments of evenly spread tiles, one by one.
+
+    Args:
+        inputs: with Gaussians in the world.
+        thresholds: (N,) falloff in (0, 1), or None for no truncation.
+        tiles: how many tiles are looked at, at most.
+    """
+    inputs.check_thresholds(thresholds)
+    assert isinstance(inputs.splats, Splats)
+    view = inputs.view
+    count = -(-view.width // TILE) * -(-view.height // TILE)
+    return weights_one_by_one(
+        camera_of(inputs),
+        gaussians_of(inputs.splats),
+        None if thresholds is None else thresholds.to(inputs.splats.opacities),
+        options=options_of(inputs),
+        every=-(-count // tiles),
     )
 
 

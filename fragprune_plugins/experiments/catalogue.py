@@ -175,3 +175,10 @@ EXPERIMENTS: dict[str, Callable[[int, Train | None], Experiment]] = {
     "overfitting": overfitting,
 }
 """By name: makes the experiment from the iterations of its longest arms and from what moves."""
+
+QUESTIONS = {
+    "signals": "Which signals do truncated Gaussians fit better than Gaussians, and why?",
+    "fragments": "Which Gaussians own the fragments, and how many fragments are hardly seen?",
+    "stages": "Where does the time of a frame go, from small pictures to 4K?",
+}
+"""What the other experiments ask, each a module of this package by its name."""

@@ -79,6 +79,15 @@ class Folder:
             )
         return content
 
+    def measured_with(self) -> str:
+        """Lines of Markdown for the end of a page: version, engine, machine."""
+        machine = self.asked["machine"]
+        device = machine["gpu"] or machine["processor"]
+        return (
+            f"* fragprune {self.asked['version']}, {self.asked['engine']} engine on {device}, "
+            f"{self.asked['threads']} threads\n* everything else: {self.name}.json"
+        )
+
     def file(self, suffix: str) -> Path:
         """The path of NAME with this suffix, such as ".md"."""
         return self.out / f"{self.name}{suffix}"

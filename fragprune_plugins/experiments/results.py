@@ -88,7 +88,7 @@ def findings(experiment: Experiment, outcomes: Sequence[Outcome], folder: Folder
         experiment.asks,
         table,
         markdown(head, cells),
-        _text(folder.asked),
+        _text(folder),
         partial(_plot, experiment=experiment, table=table),
     )
 
@@ -115,10 +115,10 @@ def _cell(row: dict[str, Any], key: str, form: str) -> str:
     return text if spread is None else f"{text} ± {form.format(spread).strip('+x')}"
 
 
-def _text(asked: dict[str, Any]) -> str:
-    seeds, machine, scene = asked["seeds"], asked["machine"], asked["photographs"]
+def _text(folder: Folder) -> str:
+    asked, seeds = folder.asked, folder.asked["seeds"]
+    scene = asked["photographs"]
     spread = " ± is the standard deviation over seeds." if len(seeds) > 1 else ""
-    device = machine["gpu"] or machine["processor"]
     trained = ", ".join(map(str, seeds))
     return f"""Means over {scene["held_out_views"]} held-out views and seeds {trained}.{spread}
 
@@ -129,8 +129,7 @@ equally long, moves the same parameters and truncates nothing.
 
 * model: {asked["model"]["name"]}, SHA-256 {asked["model"]["sha256"][:12]}
 * photographs: {scene["folder"]}, {scene["training_views"]} training views
-* fragprune {asked["version"]}, {asked["engine"]} engine on {device}, {asked["threads"]} threads
-* everything else: {asked["experiment"]}.json"""
+{folder.measured_with()}"""
 
 
 def _plot(path: Path, experiment: Experiment, table: Sequence[dict[str, Any]]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,6 +17,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import Interrupted, Terminated
 from fragprune_plugins.experiments.catalogue import Arm, Experiment
 from fragprune_plugins.experiments.folder import Folder
+from fragprune_plugins.experiments.scene import describe_photographs
 from fragprune_plugins.finetuning import FinetuneResult, finetune
 from fragprune_plugins.learning.schedule import Schedule
 from fragprune_plugins.measure import Candidate, frame_times, measure
@@ -171,25 +171,9 @@ def _configuration(
         },
         "seeds": list(seeds),
         "model": {"name": model.name, "sha256": digest(model)},
-        "photographs": photographs.as_dict()
-        | {
-            "folder": photographs.folder.resolve().name,
-            "sha256": _digest(dataset),
-            "training_views": len(dataset.train),
-            "held_out_views": len(dataset.test),
-        },
+        "photographs": describe_photographs(photographs, dataset),
         "engine": engine.name,
         "device": str(device),
         "threads": torch.get_num_threads(),
         "machine": describe_machine(device),
     }
-
-
-def _digest(dataset: Dataset) -> str:
-    """The SHA-256 digest of the photographs and their cameras."""
-    sha = hashlib.sha256()
-    for shot in (*dataset.train, *dataset.test):
-        sha.update(shot.name.encode())
-        sha.update((255 * shot.image).round().byte().cpu().numpy().tobytes())
-        sha.update(shot.view.projmatrix.cpu().numpy().tobytes())
-    return sha.hexdigest()

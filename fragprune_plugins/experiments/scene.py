@@ -1,0 +1,69 @@
+"""What experiments measure: models with their thresholds, on the views of photographs."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.datasets.dataset import Dataset
+from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.measure import Candidate
+from fragprune_plugins.storage import models, sidecar
+from fragprune_plugins.storage.atomic import digest
+
+
+def load_columns(
+    paths: Sequence[Path], device: torch.device | str = "cpu"
+) -> tuple[dict[str, Candidate], dict[str, Any]]:
+    """The columns of a table, by label, and what they are, as plain values.
+
+    Each model is drawn with its thresholds. One model alone is drawn without them and with them.
+
+    Args:
+        paths: of the models; a label is a file's name, or its path if two names are equal.
+        device: of the models.
+
+    Raises:
+        ModelFileError: a model cannot be read.
+        SidecarError: its thresholds cannot.
+    """
+    names = [path.stem for path in paths]
+    labels = names if len(set(names)) == len(names) else [str(path) for path in paths]
+    columns: dict[str, Candidate] = {}
+    said: dict[str, Any] = {}
+    for label, path in zip(labels, paths, strict=True):
+        splat, store = models.load(path, device=device)
+        said[label] = {"sha256": digest(path), "thresholds": None, "learned": None}
+        if store is not None:
+            values = store.values.detach().cpu().numpy().tobytes()
+            said[label]["thresholds"] = hashlib.sha256(values).hexdigest()
+        if sidecar.lies_beside(path):
+            said[label]["learned"] = sidecar.load(path)[1].settings
+        if store is not None and len(paths) == 1:
+            columns[f"{label}, untruncated"] = Candidate(splat)
+        columns[label] = Candidate(splat, store)
+    return columns, said
+
+
+def describe_photographs(photographs: Photographs, dataset: Dataset) -> dict[str, Any]:
+    """What photographs are, as plain values, wherever they lie."""
+    return photographs.as_dict() | {
+        "folder": photographs.folder.resolve().name,
+        "sha256": _digest(dataset),
+        "training_views": len(dataset.train),
+        "held_out_views": len(dataset.test),
+    }
+
+
+def _digest(dataset: Dataset) -> str:
+    """The SHA-256 digest of the photographs and their cameras."""
+    sha = hashlib.sha256()
+    for shot in (*dataset.train, *dataset.test):
+        sha.update(shot.name.encode())
+        sha.update((255 * shot.image).round().byte().cpu().numpy().tobytes())
+        sha.update(shot.view.projmatrix.cpu().numpy().tobytes())
+    return sha.hexdigest()
