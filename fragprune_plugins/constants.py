@@ -41,6 +41,19 @@ COEFFICIENTS_MAX: Final = 1024
 THREADS_MAX: Final = 1024
 """Most threads of one call of the cpu engine; results do not depend on their number."""
 
+SIDE_MAX: Final = 1 << 16
+"""Most pixels of a side of a picture."""
+
+FOCAL_MIN: Final = 1e-3
+FOCAL_MAX: Final = 1e4
+"""Focal lengths, in sides of the picture: fields of view from 179.9 to 0.006 degrees."""
+
+ROTATION_TOLERANCE: Final = 1e-2
+"""Most that R R^T of a camera's rotation differs from 1; matrices come rounded to a few digits."""
+
+DISTANCE_MAX: Final = 1e12
+"""Most world units of a camera from the origin: float32 holds its square with room to spare."""
+
 MARGINAL_MIN: Final = 0.05
 """A Gaussian is not there when the moment is this unlikely for it, 1 at its mean in time."""
 

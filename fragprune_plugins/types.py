@@ -11,8 +11,13 @@ from fragprune_plugins.constants import (
     ALPHA_MIN,
     COEFFICIENTS_MAX,
     DILATION,
+    DISTANCE_MAX,
     FEATURES_MAX,
+    FOCAL_MAX,
+    FOCAL_MIN,
     NEAR,
+    ROTATION_TOLERANCE,
+    SIDE_MAX,
 )
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.reprs import one_line
@@ -72,6 +77,51 @@ def _check_size(width: int, height: int) -> None:
     """Raise InputError unless the picture has a pixel."""
     if width < 1 or height < 1:
         raise InputError("View", f"{width}x{height} pixels", "at least 1x1", "Check the camera.")
+
+
+def check_lens(
+    width: int, height: int, fx: float, fy: float, cx: float | None, cy: float | None
+) -> None:
+    """Check that numbers are those of a lens: arguments of ``View.pinhole``.
+
+    Raises:
+        InputError: the picture has no pixel or more than engines draw, or a focal length or the
+            principal point is not finite or out of proportion to the picture.
+    """
+    if not (1 <= width <= SIDE_MAX and 1 <= height <= SIDE_MAX):
+        expected = f"at least 1x1, and sides up to {SIDE_MAX}"
+        raise InputError("View", f"{width}x{height} pixels", expected, "Check the camera.")
+    for name, focal, side in (("fx", fx, width), ("fy", fy, height)):
+        if not FOCAL_MIN * side <= focal <= FOCAL_MAX * side:
+            expected = f"a focal length of {FOCAL_MIN:g} to {FOCAL_MAX:g} times {side} pixels"
+            raise InputError(name, f"{focal:g}", expected, "Check the camera.")
+    for name, centre, side in (("cx", cx, width), ("cy", cy, height)):
+        if centre is not None and not abs(centre) <= FOCAL_MAX * side:
+            raise InputError(
+                name, f"{centre:g}", f"a place near {side} pixels", "Check the camera."
+            )
+
+
+def check_pose(rotation: Tensor, translation: Tensor) -> None:
+    """Check that tensors are a camera's pose: arguments of ``View.pinhole``. Waits for a GPU.
+
+    Raises:
+        InputError: the rotation is none, or the camera is not within ``DISTANCE_MAX``.
+    """
+    import torch
+
+    _check("rotation", rotation, 3, 3)
+    _check("translation", translation, 3)
+    exact = rotation.detach().double()
+    skew = float((exact @ exact.T - torch.eye(3).to(exact)).abs().max())
+    # NaN, too, is not within the tolerance.
+    if not (skew <= ROTATION_TOLERANCE and float(torch.linalg.det(exact)) > 0):
+        found = f"{[[float(f'{value:.4g}') for value in row] for row in exact.tolist()]}"
+        expected = "a rotation: finite, orthonormal, not mirrored"
+        raise InputError("rotation", found, expected, "Check the camera.")
+    if not float(translation.detach().abs().max()) <= DISTANCE_MAX:
+        expected = f"finite, at most {DISTANCE_MAX:g} world units"
+        raise InputError("translation", f"{translation.tolist()}", expected, "Check the camera.")
 
 
 def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
@@ -177,10 +227,13 @@ class View:
             cx: principal point, pixels, COLMAP convention (centre of the image = width / 2).
             cy: principal point, pixels.
             background: (3,) RGB; black when None.
+
+        Raises:
+            InputError: these are no numbers of a lens, see ``check_lens``.
         """
         import torch
 
-        _check_size(width, height)
+        check_lens(width, height, fx, fy, cx, cy)
         tan_x, tan_y = width / (2 * fx), height / (2 * fy)
         view = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
         view[:3, :3] = rotation.T

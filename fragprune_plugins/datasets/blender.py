@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,28 @@ import torch
 from fragprune_plugins.datasets.images import image_size
 from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.storage.reading import MEBIBYTE, Door
 
 Row = tuple[str, Camera, Path]
 """name, camera, image file"""
 
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+_JSON_MAX = 256 * MEBIBYTE
+
+_JSON = Door(
+    DatasetError,
+    "not readable as JSON",
+    "a JSON file of cameras",
+    "Save it again.",
+    limit=_JSON_MAX,
+)
+_TRANSFORMS = Door(
+    DatasetError,
+    "not a transforms file",
+    "frames with file_path and transform_matrix, and camera_angle_x or fl_x",
+    "Export it again.",
+)
 
 
 def read(folder: Path) -> tuple[list[Row], list[Row]]:
@@ -41,23 +57,21 @@ def read_transforms(path: Path) -> list[Row]:
         DatasetError: see ``read``.
     """
     content = load_json(path)
-    try:
+    with _TRANSFORMS.stated(path) as reading:
         distortion = [key for key in _DISTORTION if float(content.get(key, 0)) != 0]
-        if distortion:
+        distortion += ["fisheye"] if "FISHEYE" in str(content.get("camera_model", "")) else []
+        if distortion or content.get("is_fisheye"):
             raise DatasetError(
                 str(path),
-                f"lens distortion ({', '.join(distortion)})",
+                f"lens distortion ({', '.join(distortion) or 'fisheye'})",
                 "undistorted images: rasterization has no lens distortion",
                 "Undistort them first (colmap image_undistorter).",
             )
-        return [_row(path.parent, content, frame) for frame in content["frames"]]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(
-            str(path),
-            f"not a transforms file ({error!r})",
-            "frames with file_path and transform_matrix, and camera_angle_x or fl_x",
-            "Export it again.",
-        ) from error
+        rows = []
+        for number, frame in enumerate(content["frames"]):
+            reading.place = f"frames[{number}]"
+            rows.append(_row(path.parent, content, frame))
+        return rows
 
 
 def load_json(path: Path) -> Any:
@@ -66,16 +80,18 @@ def load_json(path: Path) -> Any:
     Raises:
         DatasetError: the file is missing or not JSON.
     """
-    try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DatasetError(
-            str(path), "no such file", "a JSON file of cameras", "Check the path."
-        ) from error
-    except (OSError, ValueError) as error:
-        raise DatasetError(
-            str(path), f"not readable as JSON ({error})", "a JSON file of cameras", "Save it again."
-        ) from error
+    with _JSON.reading(path) as reading:
+        return reading.json()
+
+
+def matrix(values: Any, *shapes: tuple[int, ...]) -> torch.Tensor:
+    """Nested lists of numbers as float64, in one of the shapes; raises ValueError."""
+    found = torch.tensor(values, dtype=torch.float64)
+    if tuple(found.shape) not in shapes:
+        raise ValueError(
+            f"numbers of shape {tuple(found.shape)}, not {' or '.join(map(str, shapes))}"
+        )
+    return found
 
 
 def _row(folder: Path, content: dict[str, Any], frame: dict[str, Any]) -> Row:
@@ -88,7 +104,7 @@ def _row(folder: Path, content: dict[str, Any], frame: dict[str, Any]) -> Row:
         if "fl_x" in content
         else width / (2 * math.tan(float(content["camera_angle_x"]) / 2))
     )
-    pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64).reshape(-1, 4)[:3]
+    pose = matrix(frame["transform_matrix"], (4, 4), (3, 4))[:3]
     to_world = pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])  # OpenGL's y up, z back, to COLMAP's
     rotation = to_world.T.contiguous()
     camera = Camera(

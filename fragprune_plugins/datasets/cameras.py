@@ -13,12 +13,20 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.datasets.blender import load_json, read_transforms
+from fragprune_plugins.datasets.blender import load_json, matrix, read_transforms
 from fragprune_plugins.datasets.dataset import read_scene
 from fragprune_plugins.datasets.photographs import Resolution
 from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.storage.reading import Door
 from fragprune_plugins.types import View
+
+_CAMERAS = Door(
+    DatasetError,
+    "not a cameras file",
+    "cameras.json of a 3DGS model, or a transforms file",
+    "Pass the cameras.json that a training wrote.",
+)
 
 
 def load_cameras(path: Path, *, white_background: bool = False) -> list[tuple[str, View]]:
@@ -31,15 +39,11 @@ def load_cameras(path: Path, *, white_background: bool = False) -> list[tuple[st
     if isinstance(content, dict):
         cameras = [(name, camera) for name, camera, _ in read_transforms(path)]
     else:
-        try:
-            cameras = [(str(entry["img_name"]), _camera(entry)) for entry in content]
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise DatasetError(
-                str(path),
-                f"not a cameras file ({error!r})",
-                "cameras.json of a 3DGS model, or a transforms file",
-                "Pass the cameras.json that a training wrote.",
-            ) from error
+        cameras = []
+        with _CAMERAS.stated(path) as reading:
+            for number, entry in enumerate(content):
+                reading.place = f"[{number}]"
+                cameras.append((str(entry["img_name"]), _camera(entry)))
     if not cameras:
         raise DatasetError(str(path), "0 cameras", "at least one", "Pass another file.")
     background = torch.full((3,), float(white_background))
@@ -72,8 +76,8 @@ def divided(views: list[tuple[str, View]], by: int) -> list[tuple[str, View]]:
 
 
 def _camera(entry: dict[str, Any]) -> Camera:
-    rotation = torch.tensor(entry["rotation"], dtype=torch.float64).reshape(3, 3).T.contiguous()
-    position = torch.tensor(entry["position"], dtype=torch.float64).reshape(3)
+    rotation = matrix(entry["rotation"], (3, 3)).T.contiguous()
+    position = matrix(entry["position"], (3,))
     width, height = int(entry["width"]), int(entry["height"])
     return Camera(
         rotation,

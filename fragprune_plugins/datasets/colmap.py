@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.storage.reading import Door, Reading
 
 HOLD_OUT = 8
 """Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""
@@ -19,7 +21,15 @@ HOLD_OUT = 8
 Row = tuple[str, Camera, Path]
 """name, camera, image file"""
 
-Parsed = TypeVar("Parsed")
+_DOOR = Door(
+    DatasetError,
+    "cut off or not COLMAP's",
+    "COLMAP's cameras and images files, complete",
+    "Export the model again (colmap model_converter).",
+    missing="Copy both files from COLMAP's model.",
+)
+
+_NAME_MAX = 4096  # bytes of an image's name
 
 # COLMAP's numbers for camera models, src/colmap/sensor/models.h, with their parameter counts.
 _MODELS = {
@@ -65,32 +75,26 @@ def read(folder: Path, images: str = "images") -> tuple[list[Row], list[Row]]:
     assert model is not None, "the caller looked"
     # Binary first, as hosts do: COLMAP writes binary files, and text files are an export.
     if (model / "images.bin").exists():
-        cameras = _parsed(model / "cameras.bin", _cameras_binary)
-        poses = _parsed(model / "images.bin", _images_binary)
+        found = model / "cameras.bin", model / "images.bin"
+        parsers = _cameras_binary, _images_binary
     else:
-        cameras = _parsed(model / "cameras.txt", _cameras_text)
-        poses = _parsed(model / "images.txt", _images_text)
+        found = model / "cameras.txt", model / "images.txt"
+        parsers = _cameras_text, _images_text
+    with _DOOR.reading(found[0]) as reading:
+        cameras = dict(parsers[0](reading))
     rows = []
-    for name, camera_id, quaternion, translation in poses:
-        if camera_id not in cameras:
-            raise DatasetError(
-                str(model),
-                f"image {name} of camera {camera_id}",
-                f"one of the cameras {sorted(cameras)}",
-                "Export images and cameras from the same COLMAP model.",
-            )
-        width, height, fx, fy, cx, cy = cameras[camera_id]
-        camera = Camera(
-            _rotation(quaternion),
-            torch.tensor(translation, dtype=torch.float64),
-            width,
-            height,
-            fx,
-            fy,
-            cx,
-            cy,
-        )
-        rows.append((name, camera, _image_path(folder / images, name)))
+    with _DOOR.reading(found[1]) as reading:
+        for name, camera_id, quaternion, translation in parsers[1](reading):
+            if camera_id not in cameras:
+                raise DatasetError(
+                    str(model),
+                    f"image {name} of camera {camera_id}",
+                    f"one of the cameras {sorted(cameras)[:20]}",
+                    "Export images and cameras from the same COLMAP model.",
+                )
+            place = torch.tensor(translation, dtype=torch.float64)
+            camera = Camera(_rotation(quaternion), place, *cameras[camera_id])
+            rows.append((name, camera, _image_path(folder / images, name)))
     rows.sort(key=lambda row: Path(row[0]).stem)
     train = [row for index, row in enumerate(rows) if index % HOLD_OUT]
     return train, rows[::HOLD_OUT]
@@ -103,8 +107,10 @@ def _image_path(images: Path, name: str) -> Path:
 
 
 def _rotation(quaternion: tuple[float, ...]) -> Tensor:
-    """(3, 3) float64 rotation from a quaternion w, x, y, z of any length."""
+    """(3, 3) float64 rotation from a quaternion w, x, y, z of any length but 0."""
     q = torch.tensor(quaternion, dtype=torch.float64)
+    if not 0 < float(q.norm()) < math.inf:
+        raise ValueError(f"the quaternion {list(quaternion)}, which is no rotation")
     w, x, y, z = (q / q.norm()).tolist()
     return torch.tensor(
         [
@@ -114,23 +120,6 @@ def _rotation(quaternion: tuple[float, ...]) -> Tensor:
         ],
         dtype=torch.float64,
     )
-
-
-def _parsed(path: Path, parse: Callable[[BinaryIO], Parsed]) -> Parsed:
-    try:
-        with open(path, "rb") as file:
-            return parse(file)
-    except FileNotFoundError as error:
-        raise DatasetError(
-            str(path), "no such file", "COLMAP's cameras and images files", "Copy both."
-        ) from error
-    except (struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
-        raise DatasetError(
-            str(path),
-            f"cut off or not COLMAP's ({error})",
-            "a complete COLMAP file",
-            "Export the model again (colmap model_converter).",
-        ) from error
 
 
 def _intrinsics(model: str, width: int, height: int, values: Sequence[float]) -> Intrinsics:
@@ -148,57 +137,67 @@ def _intrinsics(model: str, width: int, height: int, values: Sequence[float]) ->
     )
 
 
-def _text_lines(file: BinaryIO) -> list[str]:
-    lines = file.read().decode("utf-8").splitlines()
-    return [line for line in lines if not line.startswith("#")]
+def _text_lines(reading: Reading) -> Iterator[str]:
+    """The lines of a text file that are no comments; empty ones too."""
+    for number, line in enumerate(reading.text().splitlines(), start=1):
+        if not line.startswith("#"):
+            reading.place = f"line {number}"
+            yield line
 
 
-def _cameras_text(file: BinaryIO) -> dict[int, Intrinsics]:
-    cameras = {}
-    for line in _text_lines(file):
+def _cameras_text(reading: Reading) -> Iterator[tuple[int, Intrinsics]]:
+    for line in _text_lines(reading):
         if line.strip():
             number, model, width, height, *values = line.split()
-            cameras[int(number)] = _intrinsics(
-                model, int(width), int(height), [float(value) for value in values]
-            )
-    return cameras
+            lens = [float(value) for value in values]
+            yield int(number), _intrinsics(model, int(width), int(height), lens)
 
 
-def _images_text(file: BinaryIO) -> list[Pose]:
-    poses = []
+def _images_text(reading: Reading) -> Iterator[Pose]:
     # Two lines an image; the second, its 2D points, may be empty.
-    for line in _text_lines(file)[::2]:
-        if line.strip():
+    for index, line in enumerate(_text_lines(reading)):
+        if index % 2 == 0 and line.strip():
             fields = line.split(maxsplit=9)
             numbers = tuple(float(value) for value in fields[1:8])
-            poses.append((fields[9].strip(), int(fields[8]), numbers[:4], numbers[4:]))
-    return poses
+            yield fields[9].strip(), int(fields[8]), numbers[:4], numbers[4:]
 
 
-def _unpack(file: BinaryIO, layout: str) -> tuple[Any, ...]:
-    return struct.unpack("<" + layout, file.read(struct.calcsize("<" + layout)))
+def _unpack(reading: Reading, layout: str) -> tuple[Any, ...]:
+    return struct.unpack("<" + layout, reading.take(struct.calcsize("<" + layout)))
 
 
-def _cameras_binary(file: BinaryIO) -> dict[int, Intrinsics]:
-    cameras = {}
-    for _ in range(_unpack(file, "Q")[0]):
-        number, code, width, height = _unpack(file, "iiQQ")
+def _announced(reading: Reading, least: int) -> Iterator[int]:
+    """Count through what the next number announces, of at least so many bytes each."""
+    count = _unpack(reading, "Q")[0]
+    if count * least > reading.left:
+        raise EOFError(f"{count} announced, in {reading.left} bytes")
+    for number in range(count):
+        reading.place = f"number {number + 1} of {count}, byte {reading.file.tell()}"
+        yield number
+
+
+def _cameras_binary(reading: Reading) -> Iterator[tuple[int, Intrinsics]]:
+    for _ in _announced(reading, least=24):
+        number, code, width, height = _unpack(reading, "iiQQ")
         if code not in _MODELS:
             raise ValueError(f"camera model number {code}")
         model, count = _MODELS[code]
-        cameras[number] = _intrinsics(model, width, height, _unpack(file, f"{count}d"))
-    return cameras
+        yield number, _intrinsics(model, width, height, _unpack(reading, f"{count}d"))
 
 
-def _images_binary(file: BinaryIO) -> list[Pose]:
-    poses = []
-    for _ in range(_unpack(file, "Q")[0]):
-        _number, *numbers, camera_id = _unpack(file, "i7di")
-        name = bytearray()
-        while (byte := _unpack(file, "c")[0]) != b"\0":
-            name += byte
-        points = _unpack(file, "Q")[0]
-        if len(file.read(24 * points)) != 24 * points:
-            raise ValueError("2D points end early")
-        poses.append((name.decode("utf-8"), camera_id, tuple(numbers[:4]), tuple(numbers[4:])))
-    return poses
+def _images_binary(reading: Reading) -> Iterator[Pose]:
+    for _ in _announced(reading, least=73):
+        _number, *numbers, camera_id = _unpack(reading, "i7di")
+        name = _name(reading)
+        reading.skip(24 * _unpack(reading, "Q")[0])  # 2D points: x, y, id
+        yield name, camera_id, tuple(numbers[:4]), tuple(numbers[4:])
+
+
+def _name(reading: Reading) -> str:
+    """A name that a zero byte ends."""
+    begin = reading.file.tell()
+    name, zero, _ = reading.file.read(_NAME_MAX).partition(b"\0")
+    if not zero:
+        raise ValueError(f"a name without end at byte {begin}")
+    reading.file.seek(begin + len(name) + 1)
+    return name.decode("utf-8")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.datasets import blender, colmap
-from fragprune_plugins.datasets.images import image_size, unreadable
+from fragprune_plugins.datasets.images import image_size, opened
 from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.errors import DatasetError
@@ -21,6 +21,7 @@ from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import View
 
 _ASPECT_TOLERANCE = 0.01
+_ROWS = 256  # of a picture, composited at a time
 
 SomeShot = TypeVar("SomeShot", bound="Shot")
 
@@ -74,23 +75,22 @@ class Photograph(Shot):
 
     @cached_property
     def _bytes(self) -> Tensor:
-        from PIL import Image
-
-        try:
-            with Image.open(self.path) as file:
-                picture = file.convert("RGBA") if "A" in file.getbands() else file.convert("RGB")
-                size = (self.view.width, self.view.height)
-                if picture.size != size:
-                    picture = picture.resize(size)
-        except (OSError, SyntaxError) as error:
-            raise unreadable(self.path, error) from error
+        with opened(self.path) as file:
+            picture = file.convert("RGBA") if "A" in file.getbands() else file.convert("RGB")
+            size = (self.view.width, self.view.height)
+            if picture.size != size:
+                picture = picture.resize(size)
         values = np.asarray(picture)
-        if values.shape[2] == 4:
-            alpha = values[..., 3:].astype(np.float32) / 255
-            behind = 255 * self.view.background.cpu().numpy()
-            over = values[..., :3] * alpha + behind * (1 - alpha)
-            values = np.round(over).astype(np.uint8)
-        return torch.from_numpy(values.copy())
+        if values.shape[2] == 3:
+            return torch.from_numpy(values.copy())
+        behind = 255 * self.view.background.cpu().numpy()
+        flat = np.empty((*values.shape[:2], 3), np.uint8)
+        for begin in range(0, len(values), _ROWS):  # as floats, a large picture takes gigabytes
+            rows = values[begin : begin + _ROWS]
+            alpha = rows[..., 3:].astype(np.float32) / 255
+            over = rows[..., :3] * alpha + behind * (1 - alpha)
+            flat[begin : begin + _ROWS] = np.round(over).astype(np.uint8)
+        return torch.from_numpy(flat)
 
 
 @dataclass(frozen=True, eq=False)

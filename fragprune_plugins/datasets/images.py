@@ -1,33 +1,63 @@
-"""Sizes of image files, without decoding them."""
+"""Opens image files: PNG, JPEG, WebP, TIFF and BMP, of bounded size."""
 
 from __future__ import annotations
 
+import contextlib
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.storage.reading import Door
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+PIXELS_MAX = 160_000_000
+"""Most pixels of a photograph; cameras reach 151 million. Pillow itself refuses 179 million."""
+
+_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP")
+"""All that Pillow may take a file for. Some of its other readers run programs."""
+
+_DOOR = Door(
+    DatasetError,
+    "not readable",
+    "a PNG or JPEG image",
+    "Save the image again.",
+    missing="Add it, or remove the view.",
+    noun="image",
+)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Image]:
+    """Open an image for the length of a block; its pixels are read on use.
+
+    Raises:
+        DatasetError: the file is missing, no image, or too large; or the block raised.
+    """
+    from PIL import Image
+
+    with _DOOR.reading(path) as reading, warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # PIXELS_MAX decides
+        with Image.open(reading.file, formats=_FORMATS) as image:
+            width, height = image.size
+            if width * height > PIXELS_MAX:
+                raise DatasetError(
+                    str(path),
+                    f"{width}x{height} pixels",
+                    f"at most {PIXELS_MAX:,} pixels",
+                    "Make the image smaller.",
+                )
+            yield image
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, pixels.
+    """Width and height of an image file, pixels. Only its header is read.
 
     Raises:
         DatasetError: the file is missing or not an image.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as file:
-            return file.size
-    except FileNotFoundError as error:
-        raise DatasetError(
-            str(path), "no such image", "the image its camera names", "Add it, or remove the view."
-        ) from error
-    except (OSError, SyntaxError) as error:
-        raise unreadable(path, error) from error
-
-
-def unreadable(path: Path, error: Exception) -> DatasetError:
-    """The error for an image file that Pillow cannot read."""
-    return DatasetError(
-        str(path), f"not readable ({error})", "a PNG or JPEG image", "Save the image again."
-    )
+    with opened(path) as image:
+        return image.size

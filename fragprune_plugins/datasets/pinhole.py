@@ -8,12 +8,14 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import View
+from fragprune_plugins.types import View, check_lens, check_pose
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera and its pose.
+    """A pinhole camera and its pose; construction checks that they are plausible.
+
+    Every reader of cameras makes these, so this is where geometry is checked.
 
     Attributes:
         rotation: (3, 3) float64, world to camera (x right, y down, z forward).
@@ -36,6 +38,10 @@ class Camera:
     cy: float
 
     __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+        check_pose(self.rotation, self.translation)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with another number of pixels."""

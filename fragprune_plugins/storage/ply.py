@@ -10,8 +10,8 @@ of Mip-Splatting.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from torch import Tensor
 from fragprune_plugins.errors import InputError, ModelFileError
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage.atomic import replacing
+from fragprune_plugins.storage.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
+from fragprune_plugins.storage.reading import Door
 from fragprune_plugins.types import Splats
 
 THRESHOLD_COLUMN = "trunc_threshold"
@@ -36,6 +38,21 @@ _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _FILTER = "filter_3D"
 _REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
 _REMEDY = "Pass the point_cloud.ply that a 3DGS training saved."
+_DOOR = Door(
+    ModelFileError,
+    "not readable as PLY",
+    "a complete trained splat (.ply)",
+    "The file is of another kind or was cut off: copy or save it again.",
+    missing=_REMEDY,
+)
+
+LOG_SCALE_MAX = 30.0
+"""Largest logarithm of a standard deviation: 1e13 world units. Projection multiplies it by the
+focal length and squares it, and float32 ends at 1e38."""
+
+_QUATERNION_MIN = 1e-12  # torch's normalize divides by no less
+
+_SHOWN_ROWS = 5  # of those that a message is about
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +152,26 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
         ModelFileError: missing, truncated, not a PLY, not a Gaussian splat, empty or not finite.
     """
     path = Path(path)
-    rows = _read_vertices(path)
-    names = rows.dtype.names or ()
+    if path.suffix == ".pth":
+        raise ModelFileError(
+            str(path),
+            "a training codebase's checkpoint, which only that codebase can draw",
+            "a trained splat (.ply)",
+            "Pass its PLY. Fine-tune and draw a host without PLYs (4D models) through its own "
+            "script, with fragprune run.",
+        )
+    with _DOOR.reading(path) as reading:
+        try:
+            columns = read_vertices(reading)
+        except KeyError as error:
+            found = "a PLY without a vertex element"
+            raise ModelFileError(str(path), found, "a Gaussian splat", _REMEDY) from error
+        return _splat(path, columns, filtered)
+
+
+def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
+    """The splat of a file's columns; raises ModelFileError."""
+    names, count = columns.keys(), len(next(iter(columns.values())))
     missing = [name for name in (*_XYZ, *_DC, "opacity", *_SCALES, *_ROTATION) if name not in names]
     if missing == list(_DC):
         raise ModelFileError(
@@ -160,8 +195,8 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
             "Fuse the filter first (create_fused_ply.py there), or fine-tune with fragprune run.",
         )
     rest = sorted(
-        (name for name in names if name.startswith("f_rest_") and name[7:].isdigit()),
-        key=lambda name: int(name[7:]),
+        (name for name in names if name.startswith("f_rest_") and name[7:].isdecimal()),
+        key=lambda name: (len(name), name),
     )
     if len(rest) not in _REST_COUNTS or rest != [f"f_rest_{i}" for i in range(len(rest))]:
         raise ModelFileError(
@@ -170,21 +205,22 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
             "0, 9, 24 or 45 (SH degree 0 to 3), numbered from 0",
             _REMEDY,
         )
-    if len(rows) == 0:
+    if count == 0:
         raise ModelFileError(str(path), "0 Gaussians", "at least one", _REMEDY)
 
     def column(*wanted: str) -> Tensor:
-        data = np.stack([np.asarray(rows[name], dtype=np.float32) for name in wanted], axis=1)
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is refused
+            data = np.stack([columns[name].astype(np.float32) for name in wanted], axis=1)
         _require_finite(path, wanted, data)
         return torch.from_numpy(data)
 
-    return SplatFile(
+    splat = SplatFile(
         xyz=column(*_XYZ),
         f_dc=column(*_DC)[:, None, :],
         f_rest=(
-            column(*rest).reshape(len(rows), 3, -1).transpose(1, 2).contiguous()
+            column(*rest).reshape(count, 3, -1).transpose(1, 2).contiguous()
             if rest
-            else torch.zeros(len(rows), 0, 3)
+            else torch.zeros(count, 0, 3)
         ),
         opacity=column("opacity"),
         scaling=column(*_SCALES),
@@ -196,6 +232,8 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
         ),
         filter_3d=column(_FILTER) if _FILTER in names else None,
     )
+    _require_shapes(path, splat)
+    return splat
 
 
 def write_ply(
@@ -247,40 +285,13 @@ def is_marked(path: Path) -> bool:
     if not path.is_file():
         return False
     with open(path, "rb") as file:
-        if file.readline().strip() != b"ply":
-            return False
-        header = list(takewhile(lambda line: line != b"end_header", map(bytes.strip, file)))
-    column = any(line.endswith(f" {THRESHOLD_COLUMN}".encode()) for line in header)
-    return f"comment {MARK}".encode() in header and not column
-
-
-def _read_vertices(path: Path) -> np.ndarray[Any, Any]:
-    from plyfile import PlyData, PlyParseError
-
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise ModelFileError(str(path), found, "a trained splat (.ply)", _REMEDY)
-    if path.suffix == ".pth":
-        raise ModelFileError(
-            str(path),
-            "a training codebase's checkpoint, which only that codebase can draw",
-            "a trained splat (.ply)",
-            "Pass its PLY. Fine-tune and draw a host without PLYs (4D models) through its own "
-            "script, with fragprune run.",
-        )
+        head = file.read(HEADER_MAX)
     try:
-        file = PlyData.read(str(path))
-        return np.asarray(file["vertex"].data)
-    except KeyError as error:
-        found = "a PLY without a vertex element"
-        raise ModelFileError(str(path), found, "a Gaussian splat", _REMEDY) from error
-    except (PlyParseError, ValueError, OSError) as error:
-        raise ModelFileError(
-            str(path),
-            f"not readable as PLY ({error})",
-            "a complete PLY file",
-            "The file is of another kind or was cut off: copy or save it again.",
-        ) from error
+        lines = [line.strip() for line in header_lines(head)[0]]
+    except ValueError:
+        return False
+    column = any(line.endswith(f" {THRESHOLD_COLUMN}".encode()) for line in lines)
+    return f"comment {MARK}".encode() in lines and not column
 
 
 def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, Any]) -> None:
@@ -289,18 +300,47 @@ def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, An
         where = ", ".join(n for n, b in zip(names, bad.any(axis=0), strict=True) if b)
         raise ModelFileError(
             str(path),
-            f"NaN or infinity in {int(bad.any(axis=1).sum())} of {len(data)} rows ({where})",
+            f"NaN or infinity in {_rows(torch.from_numpy(bad.any(axis=1)), where)}",
             "finite numbers",
             "The training that wrote it diverged; use an earlier checkpoint.",
         )
 
 
+def _require_shapes(path: Path, splat: SplatFile) -> None:
+    """Raise ModelFileError if a Gaussian's scales or rotation cannot be drawn as they are."""
+    vast = (splat.scaling > LOG_SCALE_MAX).any(dim=1)
+    if splat.filter_3d is not None:
+        vast |= splat.filter_3d[:, 0].abs() > math.exp(LOG_SCALE_MAX)
+    length = splat.rotation.norm(dim=1)
+    for wrong, found, expected in (
+        (vast, "scales", f"logarithms of world units, at most {LOG_SCALE_MAX:g}"),
+        (~(length >= _QUATERNION_MIN), "quaternions of length 0", "rotations w, x, y, z"),
+        (length.isinf(), "quaternions too long to normalise", "rotations w, x, y, z"),
+    ):
+        if wrong.any():
+            raise ModelFileError(
+                str(path),
+                f"{found} that nothing can be drawn with in {_rows(wrong)}",
+                expected,
+                "Remove these rows, or use an earlier checkpoint.",
+            )
+
+
+def _rows(wrong: Tensor, columns: str = "") -> str:
+    """How many rows are wrong (N,) bool, in which columns, and the first of them, from 0."""
+    rows = wrong.nonzero()[:, 0]
+    listed = ", ".join(map(str, rows[:_SHOWN_ROWS].tolist()))
+    more = ", ..." if len(rows) > _SHOWN_ROWS else ""
+    where = f" ({columns})" if columns else ""
+    return f"{len(rows)} of {len(wrong)} rows{where}: {listed}{more}"
+
+
 def _checked_thresholds(path: Path, values: Tensor) -> Tensor:
-    outside = int(((values <= 0) | (values >= 1)).sum())
-    if outside:
+    outside = (values <= 0) | (values >= 1)
+    if outside.any():
         raise ModelFileError(
             str(path),
-            f"{THRESHOLD_COLUMN} outside (0, 1) in {outside} rows",
+            f"{THRESHOLD_COLUMN} outside (0, 1) in {_rows(outside)}",
             "falloff thresholds in (0, 1)",
             "Export the model again with fragprune export.",
         )

@@ -12,9 +12,13 @@ from typing import Any
 
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.storage.atomic import replacing
+from fragprune_plugins.storage.reading import MEBIBYTE, Door
 
 SUFFIX = ".fragprune.json"
 FORMAT = "fragprune-record-1"
+_DOOR = Door(
+    RecordError, "unreadable", f"a file of format {FORMAT}", "Remove it.", limit=64 * MEBIBYTE
+)
 _SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
 
 
@@ -122,15 +126,14 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
 
 
 def _read(path: Path) -> Record:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["format"] != FORMAT:
-            raise ValueError(f"format {content['format']!r}")
-        return Record(path, content["command"], content["data"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RecordError(
-            str(path), f"unreadable ({error})", f"a file of format {FORMAT}", "Remove it."
-        ) from error
+    with _DOOR.reading(path) as reading:
+        content = reading.json()
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError("another format")
+        command, data = content["command"], content["data"]
+        if not isinstance(command, str) or not isinstance(data, dict):
+            raise ValueError("command and data of other types")
+        return Record(path, command, data)
 
 
 def strict(value: Any) -> Any:

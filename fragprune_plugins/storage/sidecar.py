@@ -8,6 +8,7 @@ wrote it. A PLY that fragprune writes has a mark in its header, so a missing sid
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage.atomic import digest, replacing
 from fragprune_plugins.storage.ply import is_marked
+from fragprune_plugins.storage.reading import Door, parse_json
 
 SUFFIX = ".fragprune.safetensors"
 FORMAT = "fragprune-thresholds-1"
@@ -152,32 +154,33 @@ def _remedy(model: Path) -> str:
 
 def _read(model: Path) -> tuple[dict[str, Any], SidecarInfo]:
     """Read a sidecar's store state and metadata, without a look at the model beside it."""
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
-    path = path_beside(model)
-    if not path.exists():
-        raise SidecarError(str(path), "no such file", "a sidecar beside the model", _remedy(model))
-    try:
-        with safe_open(path, framework="pt") as file:
+    remedy = _remedy(model)
+    door = Door(SidecarError, "unreadable", f"a file of format {FORMAT}", remedy, missing=remedy)
+    with door.reading(path_beside(model)) as reading:
+        reading.place = "its header"
+        with safe_open(reading.path, framework="pt") as file:
+            reading.place = "its metadata"
             metadata = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        if metadata.get("format") != FORMAT:
-            raise KeyError("format")
-        info = SidecarInfo(
-            rows=int(metadata["rows"]),
-            model_sha256=metadata["model_sha256"],
-            adapter=metadata["adapter"],
-            host_commit=metadata["host_commit"],
-            settings=json.loads(metadata["settings"]),
-        )
-        state = tensors | {
-            "adam_step": float(metadata["adam_step"]),
-            "steps": int(metadata["steps"]),
-        }
-        if not {"logits", "exp_avg", "exp_avg_sq"} <= tensors.keys():
-            raise KeyError("logits")
-    except (SafetensorError, KeyError, ValueError, OSError) as error:
-        raise SidecarError(
-            str(path), f"unreadable ({error})", f"a file of format {FORMAT}", _remedy(model)
-        ) from error
-    return state, info
+            if metadata["format"] != FORMAT:
+                raise ValueError(f"format {metadata['format'][:80]!r}")
+            info = SidecarInfo(
+                rows=int(metadata["rows"]),
+                model_sha256=metadata["model_sha256"],
+                adapter=metadata["adapter"],
+                host_commit=metadata["host_commit"],
+                settings=parse_json(metadata["settings"]),
+            )
+            state = {"adam_step": float(metadata["adam_step"]), "steps": int(metadata["steps"])}
+            if not isinstance(info.settings, dict):
+                raise ValueError("settings that are no object")
+            if not (0 <= state["adam_step"] < math.inf and 0 <= state["steps"] < 1 << 63):
+                raise ValueError(f"{state['adam_step']:g} and {state['steps']} steps")
+            tensors: dict[str, torch.Tensor] = {}
+            for name in ("logits", "exp_avg", "exp_avg_sq"):
+                reading.place = f"tensor {name}"
+                tensors[name] = file.get_tensor(name)
+                if tensors[name].dtype != torch.float32:
+                    raise ValueError(f"{tensors[name].dtype}, not torch.float32")
+    return tensors | state, info
