@@ -3,6 +3,16 @@
 from __future__ import annotations
 
 
+def printable(text: str) -> str:
+    """A text with escapes for what would control a terminal, or cannot be encoded.
+
+    Names in files of strangers are part of messages.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
+
+
 class FragpruneError(Exception):
     """Base of all stated failures; the command line prints it without a traceback, exit code 1.
 
@@ -16,8 +26,10 @@ class FragpruneError(Exception):
     code = "error"
 
     def __init__(self, where: str, found: str, expected: str, remedy: str) -> None:
-        self.where, self.found, self.expected, self.remedy = where, found, expected, remedy
-        super().__init__(f"[{self.code}] {where}: {found}; expected {expected}. {remedy}")
+        self.where, self.found = printable(where), printable(found)
+        self.expected, self.remedy = printable(expected), printable(remedy)
+        said = f"{self.where}: {self.found}; expected {self.expected}. {self.remedy}"
+        super().__init__(f"[{self.code}] {said}")
 
     def as_dict(self) -> dict[str, str]:
         """The message's parts, for ``--json``."""
@@ -124,6 +136,12 @@ class RecordError(FragpruneError):
     """There is no record to report, or a record cannot be read."""
 
     code = "record"
+
+
+class MemoryLimitError(FragpruneError):
+    """A command needs more memory than the machine gives it."""
+
+    code = "memory"
 
 
 class NotComparedError(FragpruneError):

@@ -157,7 +157,7 @@ def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
 
 
 def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:
-    """The checkout that contains the folder, or the installed package; else the folder itself."""
+    """The installed package, if that is meant or used; else the folder, and nothing outside it."""
     from fragprune_plugins.errors import UnknownHostError
     from fragprune_plugins.hosts.choosing import locate
     from fragprune_plugins.hosts.source import HostRepo
@@ -166,7 +166,7 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
     if package is not None:
         return package
     try:
-        return locate(host, adapters, name)[0]
+        return locate(host, adapters, name, above=False)[0]
     except UnknownHostError:
         return HostRepo(host)
 

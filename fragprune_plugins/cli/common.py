@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -15,9 +16,11 @@ import click
 from fragprune_plugins.errors import (
     FragpruneError,
     Interrupted,
+    MemoryLimitError,
     OutputError,
     Terminated,
     UsageError,
+    printable,
 )
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
 from fragprune_plugins.storage.records import strict
@@ -123,7 +126,8 @@ class Command(click.Command):
         """Run the command, print its report or error, and exit with its code."""
         as_json = ctx.meta[JSON] = bool(ctx.params.pop("as_json"))
         try:
-            report: Report = super().invoke(ctx)
+            with _memory_stated(ctx.command_path):
+                report: Report = super().invoke(ctx)
         except FragpruneError as error:
             if as_json:
                 click.echo(json.dumps({"error": error.as_dict()}))
@@ -138,7 +142,7 @@ class Command(click.Command):
         except KeyboardInterrupt as error:
             click.echo("Interrupted.", err=True)
             ctx.exit(EXIT_CODE if isinstance(error, Terminate) else 130)
-        click.echo(json.dumps(strict(report.data)) if as_json else report.text)
+        click.echo(json.dumps(strict(report.data)) if as_json else printable(report.text))
         ctx.exit(report.exit_code)
 
 
@@ -154,6 +158,24 @@ class Group(click.Group):
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
             raise usage_error(error, words) from error
+
+
+@contextlib.contextmanager
+def _memory_stated(where: str) -> Iterator[None]:
+    """State a failure to get memory, which each library raises in its own way."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        words = str(error).split("\n", 1)[0][:200]
+        known = "allocate memory" in words or "out of memory" in words  # torch's, of CPU and GPU
+        if not (known or isinstance(error, MemoryError)):
+            raise
+        raise MemoryLimitError(
+            where,
+            f"no memory left ({words or 'MemoryError'})",
+            "a model and pictures that fit",
+            "Close other programs, or lower the pictures' size with --resolution.",
+        ) from error
 
 
 def usage_error(error: click.UsageError, words: list[str]) -> Exception:

@@ -25,6 +25,7 @@ from fragprune_plugins.storage import models
 
 if TYPE_CHECKING:
     from fragprune_plugins.datasets.photographs import Photographs
+    from fragprune_plugins.measure.recorded import Recorded
 
 
 @click.command("compare", cls=Command)
@@ -70,7 +71,7 @@ def command(
     from fragprune_plugins.cli.profile import draw_panels
     from fragprune_plugins.datasets.photographs import Resolution
     from fragprune_plugins.measure import Candidate, measure
-    from fragprune_plugins.measure.wording import describe, gain
+    from fragprune_plugins.measure.wording import describe, gain, nothing_drawn
     from fragprune_plugins.storage import records
     from fragprune_plugins.storage.atomic import writable_folder
 
@@ -84,11 +85,10 @@ def command(
     scene = replace(scene, white_background=scene.white_background or white_background)
     columns = {}
     for label, path in (("A", a), ("B", b)):
-        how = known.get(path, {"filtered": False, "drawing": {}})
-        model = models.load(
-            path, truncation=not no_truncation, filtered=how["filtered"], device=where
-        )
-        columns[label] = Candidate(*model, how["drawing"])
+        how = known.get(path)
+        filtered, drawing = (how.filtered, how.drawing) if how else (False, {})
+        model = models.load(path, truncation=not no_truncation, filtered=filtered, device=where)
+        columns[label] = Candidate(*model, drawing)
     shots = load_shots(
         scene.folder,
         views,
@@ -98,7 +98,7 @@ def command(
         device=where,
     )
     first, second = measure(list(columns.values()), shots, engine=rasterizer)
-    report = {
+    report: dict[str, Any] = {
         "a": {"model": str(a)} | first,
         "b": {"model": str(b)} | second,
         "speedup": first["fragments_per_pixel"] / max(second["fragments_per_pixel"], 1e-9),
@@ -107,12 +107,14 @@ def command(
         "engine": rasterizer.name,
         "device": first["device"],
         "scene": scene.as_dict(),
+        "warnings": nothing_drawn([each["fragments_per_pixel"] for each in (first, second)]),
     }
     size = f"{shots[0].view.width}x{shots[0].view.height} pixels"
     lines = [
         f"A: {a}\nB: {b}\nPhotographs: {scene.folder}, the first of {size}\n",
         describe({"A": first, "B": second}),
         f"\nB against A: {gain(first, second)}.",
+        *(f"Warning: {each}" for each in report["warnings"]),
     ]
     if out is not None:
         files = draw_panels(out, columns, shots, rasterizer)
@@ -122,22 +124,22 @@ def command(
     return Report(report, "\n".join(lines))
 
 
-def _records(*models: Path) -> dict[Path, dict[str, Any]]:
-    """By model, the "photographs" of the record of the command that wrote it, if there is one."""
+def _records(*models: Path) -> dict[Path, Recorded]:
+    """By model, what the record of the command that wrote it says, if there is one."""
+    from fragprune_plugins.measure.recorded import recorded
     from fragprune_plugins.storage import records
 
-    known: dict[Path, dict[str, Any]] = {}
+    known: dict[Path, Recorded] = {}
     for model in models:
         record = records.beside(model)
-        read = record.data.get("photographs") if record else None
+        read = recorded(record) if record else None
         if read:
             known[model] = read
-            before = Path(read["models"][0])
-            known |= {other: read for other in models if other.resolve() == before}
+            known |= {other: read for other in models if other.resolve() == read.models[0]}
     return known
 
 
-def _scene(data: Path | None, known: dict[Path, dict[str, Any]]) -> Photographs:
+def _scene(data: Path | None, known: dict[Path, Recorded]) -> Photographs:
     """The photographs to measure on: those of the records, in the folder ``data`` if given.
 
     Raises:
@@ -145,7 +147,7 @@ def _scene(data: Path | None, known: dict[Path, dict[str, Any]]) -> Photographs:
     """
     from fragprune_plugins.datasets.photographs import Photographs
 
-    read = {Photographs.from_dict(how) for how in known.values()}
+    read = {each.photographs for each in known.values()}
     if len(read) == 1:
         (scene,) = read
         return scene if data is None else replace(scene, folder=data)

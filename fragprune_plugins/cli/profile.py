@@ -60,7 +60,7 @@ def command(
     import torch
 
     from fragprune_plugins.measure import Candidate, measure
-    from fragprune_plugins.measure.wording import describe
+    from fragprune_plugins.measure.wording import describe, nothing_drawn
     from fragprune_plugins.storage import records
     from fragprune_plugins.storage.atomic import writable_folder
 
@@ -80,7 +80,9 @@ def command(
     last = list(measured)[-1]
     report: dict[str, Any] = {"model": str(model), "truncated": store is not None}
     report |= measured[last] | {"columns": measured}
-    lines = [describe(measured)]
+    warnings = nothing_drawn([each["fragments_per_pixel"] for each in measured.values()])
+    report["warnings"] = warnings
+    lines = [describe(measured), *(f"Warning: {each}" for each in warnings)]
     if store is not None:
         points = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
         thresholds = store.values.detach().cpu()
@@ -115,11 +117,12 @@ def draw_panels(
     """
     import torch
 
-    from fragprune_plugins.measure.pictures import save_panel
+    from fragprune_plugins.measure.pictures import save_panel, stems
 
     files = []
     drawn = {name: candidate.model.splats() for name, candidate in columns.items()}
-    for shot in shots[:: -(-len(shots) // PANELS)]:
+    chosen = shots[:: -(-len(shots) // PANELS)]
+    for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
         with torch.no_grad():
             outputs = {
                 name: candidate.draw(engine, shot.view, drawn[name], counts=True)
@@ -130,7 +133,7 @@ def draw_panels(
             for name, output in outputs.items()
             if output.fragments is not None
         }
-        file = out / f"{Path(shot.name.replace('/', '_')).stem}_panel.png"
+        file = out / f"{stem}_panel.png"
         save_panel(
             file,
             [

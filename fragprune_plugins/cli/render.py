@@ -61,7 +61,8 @@ def command(
     import torch
 
     from fragprune_plugins.datasets.cameras import load_cameras
-    from fragprune_plugins.measure.pictures import save_heatmap, save_image
+    from fragprune_plugins.measure.pictures import save_heatmap, save_image, stems
+    from fragprune_plugins.measure.wording import nothing_drawn
     from fragprune_plugins.plugins.hooks import thresholds_for
     from fragprune_plugins.storage.atomic import writable_folder
     from fragprune_plugins.types import RasterInputs
@@ -78,10 +79,10 @@ def command(
     splats = splat.splats()
     files, fragments, maps = [], [], []
     with torch.no_grad():
-        for name, view in named:
+        for stem, (_, view) in zip(stems([name for name, _ in named]), named, strict=True):
             inputs = RasterInputs(view.to(where), splats, counts=heatmap, planes=())
             outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, store))
-            file = out / f"{Path(name.replace('/', '_')).stem}.png"
+            file = out / f"{stem}.png"
             save_image(file, outputs.image)
             files.append(file)
             fragments.append(float(outputs.fragments_per_pixel))
@@ -92,6 +93,7 @@ def command(
         save_heatmap(file, counts, limit)
         files.append(file)
     mean = sum(fragments) / len(fragments)
+    warnings = nothing_drawn(fragments)
     return Report(
         {
             "model": str(model),
@@ -101,7 +103,13 @@ def command(
             "truncated": store is not None,
             "engine": rasterizer.name,
             "device": str(splat.xyz.device),
+            "warnings": warnings,
         },
-        f"Wrote {len(files)} pictures to {out} ({mean:.1f} fragments per pixel, "
-        f"{'truncated' if store is not None else 'not truncated'}).",
+        "\n".join(
+            [
+                f"Wrote {len(files)} pictures to {out} ({mean:.1f} fragments per pixel, "
+                f"{'truncated' if store is not None else 'not truncated'}).",
+                *(f"Warning: {each}" for each in warnings),
+            ]
+        ),
     )

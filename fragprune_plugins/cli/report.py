@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import math
 from collections.abc import Callable
 from functools import partial
@@ -20,7 +21,10 @@ from fragprune_plugins.cli.common import (
     engine_options,
     open_engine,
 )
+from fragprune_plugins.errors import RecordError
 from fragprune_plugins.storage import models
+from fragprune_plugins.storage.reading import MEBIBYTE, Door
+from fragprune_plugins.storage.records import DOOR
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +35,12 @@ if TYPE_CHECKING:
     from fragprune_plugins.storage.records import Record
 
 PAGE = "report.html"
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+_PICTURE = Door(RecordError, "no picture", "a PNG", "Remove it.", limit=64 * MEBIBYTE)
+
+_HOW = "Name the scene with --data: then it is read, and so are the models of the record."
 
 _ONLY_CONTROLS = (
     "This folder holds only controls, and no run or fine-tuning that truncates. "
@@ -44,7 +54,7 @@ after is right of it. The photograph is beside them. The fragments of each pixel
 @click.command("report", cls=Command)
 @click.argument("folder", metavar="DIR", type=FILE)
 @click.option("--out", type=OutFile(".html"), help=f"HTML file to write; default: DIR/{PAGE}.")
-@click.option("--data", type=FILE, help="Scene folder, if the scene has moved since the run.")
+@click.option("--data", type=FILE, help="Scene folder: show some of its held-out views.")
 @engine_options
 def command(
     folder: Path,
@@ -58,18 +68,22 @@ def command(
 
     DIR is the folder where run or finetune wrote models, or where compare or profile wrote pictures
     (--out). The page is a single file without references to other files, so it can be mailed. The
-    newest run or fine-tuning that is no control comes first. If its photographs are still there,
-    the page shows some held-out views.
+    newest run or fine-tuning that is no control comes first.
+
+    Only DIR is read, because its records may be somebody else's. With --data the page shows some
+    held-out views, too: then the photographs there are read, and the models that the record names.
 
     \b
     Example:
-      fragprune report out
+      fragprune report out --data scene
     """
     from fragprune_plugins.measure import report_page
     from fragprune_plugins.storage.atomic import replacing
     from fragprune_plugins.storage.records import find
 
     records = find(folder)
+    for record in records:
+        _check(record)
     results = [record for record in records if record.command in ("run", "finetune")]
     pruned = [record for record in results if record.data.get("settings", {}).get("truncate")]
     main = [*records, *results, *pruned][-1]
@@ -80,9 +94,9 @@ def command(
     with TemporaryDirectory() as name:
         pictures = Path(name)
         views, learning, missing = _draw(
-            main, pictures, data, partial(open_engine, engine, device, threads)
+            main, folder, pictures, data, partial(open_engine, engine, device, threads)
         )
-        more = [*learning, *_files(records, pictures)]
+        more = [*learning, *_files(records, folder, pictures)]
         text = report_page.compose(
             title=f"fragprune report: {folder.resolve().name}",
             quote=line,
@@ -110,8 +124,22 @@ def command(
         "pictures": len(views) * 4 + len(more),
     }
     report |= {key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")}
-    notes = [_ONLY_CONTROLS if control else "", missing]
-    return Report(report, "\n".join([line, *filter(None, notes), f"Wrote {target}."]))
+    report["notes"] = notes = [
+        note for note in (_ONLY_CONTROLS if control else "", missing) if note
+    ]
+    return Report(report, "\n".join([line, *notes, f"Wrote {target}."]))
+
+
+def _check(record: Record) -> None:
+    """Raise RecordError if a record lacks what the page shows, or has it in other types."""
+    with DOOR.stated(record.path):
+        settings = record.data.get("settings", {})
+        settings.get("truncate")
+        _table(record)
+        _sentence(record, [])
+        _facts(record)
+        for name in record.data.get("files", ()):
+            Path(name)
 
 
 def _columns(record: Record) -> dict[str, dict[str, Any]]:
@@ -189,6 +217,7 @@ def _facts(record: Record) -> str:
 
 def _draw(
     record: Record,
+    inside: Path,
     folder: Path,
     data: Path | None,
     opened: Callable[[], tuple[Engine, torch.device]],
@@ -197,8 +226,9 @@ def _draw(
 
     Args:
         record: the record of the models.
+        inside: the folder whose files may be read without ``data``.
         folder: the folder for the pictures.
-        data: the scene folder, if it differs from the record's.
+        data: the scene folder that the user named.
         opened: opens the engine; called only if there is something to draw.
 
     Returns:
@@ -208,47 +238,61 @@ def _draw(
     from dataclasses import replace
 
     from fragprune_plugins.datasets.dataset import load_photographs
-    from fragprune_plugins.datasets.photographs import Photographs
     from fragprune_plugins.errors import DatasetError, ModelFileError, SidecarError
     from fragprune_plugins.measure import Candidate, report_page
+    from fragprune_plugins.measure.recorded import recorded
 
-    drawn, curves = record.data.get("photographs"), record.data.get("curves")
+    drawn, curves = recorded(record), record.data.get("curves")
     if drawn is None:
         return [], [], ""
-    engine, device = opened()
+    scene = drawn.photographs if data is None else replace(drawn.photographs, folder=data)
+    allowed = [each for each in drawn.models if data is not None or _lies_in(each, inside)]
     learning: list[tuple[str, str]] = []
     try:
-        (one, before_store), (other, store) = (
-            models.load(Path(path), filtered=drawn["filtered"], device=device)
-            for path in drawn["models"]
-        )
-        before = Candidate(one, before_store, drawn["drawing"])
-        after = Candidate(other, store, drawn["drawing"])
+        engine, device = opened()
+        loaded = [models.load(path, filtered=drawn.filtered, device=device) for path in allowed]
         if curves:
-            rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
+            store = loaded[-1].thresholds if drawn.models[1] in allowed else None
             values = None if store is None else store.values
-            report_page.save_learning(folder / report_page.LEARNING, rows, values)
+            with DOOR.stated(record.path) as reading:
+                reading.place = "data.curves"
+                rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
+                report_page.save_learning(folder / report_page.LEARNING, rows, values)
             learning = [("How it learned", report_page.LEARNING)]
-        scene = Photographs.from_dict(drawn)
-        dataset = load_photographs(replace(scene, folder=data or scene.folder))
+        if data is None and not (len(allowed) == 2 and _lies_in(scene.folder, inside)):
+            return [], learning, f"No views are shown: they need files outside of {inside}. {_HOW}"
+        dataset = load_photographs(scene)
     except (DatasetError, ModelFileError, SidecarError) as error:
         if data is not None:  # the user asked for the views
             raise
         return [], learning, f"No views are shown: {error}"
+    before, after = (Candidate(*each, drawn.drawing) for each in loaded)
     views = report_page.draw_views(folder, before, after, dataset.test, engine)
     return list(views), learning, ""
 
 
-def _files(records: list[Record], folder: Path) -> list[tuple[str, str]]:
-    """Copy pictures of compare and profile into the folder; returns (heading, file) of each."""
-    found = []
+def _lies_in(path: Path, folder: Path) -> bool:
+    """Whether a path is in a folder once all links are followed."""
+    return path.resolve().is_relative_to(folder.resolve())
+
+
+def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
+    """Copy pictures of compare and profile into the folder; returns (heading, file) of each.
+
+    Only PNGs beside the record, and no link out of ``inside``.
+    """
+    found: list[tuple[str, str]] = []
     for record in records:
-        for number, name in enumerate(record.data.get("files", ())):
+        for name in record.data.get("files", ()):
             file = record.path.parent / Path(name).name
-            if file.is_file():
-                copy = f"{record.path.stem}_{number}.png"
-                (folder / copy).write_bytes(file.read_bytes())
-                found.append((f"{record.command}: {file.stem}", copy))
+            if not _lies_in(file, inside):
+                continue
+            with contextlib.suppress(RecordError), _PICTURE.reading(file) as reading:
+                content = reading.file.read()
+                if content.startswith(_PNG):
+                    copy = f"{len(found)}.png"
+                    (folder / copy).write_bytes(content)
+                    found.append((f"{record.command}: {file.stem}", copy))
     return found
 
 

@@ -6,6 +6,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from fragprune_plugins.constants import SIDE_MAX
+from fragprune_plugins.errors import InputError
+
 
 @dataclass(frozen=True)
 class Resolution:
@@ -21,6 +24,13 @@ class Resolution:
     divide: int = 1
     width: int | None = None
     shrink_only: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value, most in (("divide", self.divide, 1024), ("width", self.width, SIDE_MAX)):
+            number = isinstance(value, int | float) and 1 <= value <= most
+            if not number and not (name == "width" and value is None):
+                remedy = "Check the resolution."
+                raise InputError(f"Resolution.{name}", repr(value)[:80], f"1 to {most}", remedy)
 
     def of(self, width: int, height: int) -> tuple[int, int]:
         """The size at which an image of this size is read, at least one pixel a side.

@@ -18,6 +18,7 @@ from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.flags import Flags
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo, check_seams
+from fragprune_plugins.storage.reading import MEBIBYTE, Door, parse_json
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -153,8 +154,10 @@ class ConfigFile:
     flag: str
 
     def read(self, path: Path) -> dict[str, Any]:
-        """Values by argument name; raises OSError or ValueError if the file cannot be read."""
-        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        """Values by argument name; raises anything if the file cannot be read."""
+        values = parse_json(path.read_text(encoding="utf-8"))
+        if not isinstance(values, dict):
+            raise ValueError("not an object of names and values")
         return values
 
     def overrule(self, text: str, values: dict[str, Any]) -> str:
@@ -168,12 +171,17 @@ def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
     Raises:
         UsageError: the file cannot be read.
     """
-    try:
+    remedy = f"Correct {config.flag} {path}."
+    door = Door(
+        UsageError,
+        "unreadable",
+        "a file the host can read",
+        remedy,
+        limit=MEBIBYTE,
+        missing=remedy,
+    )
+    with door.reading(path):
         return config.read(path)
-    except (OSError, ValueError) as error:
-        raise UsageError(
-            f"{config.flag} {path}", str(error), "a file the host can read", "Correct the command."
-        ) from error
 
 
 @dataclass(frozen=True)

@@ -81,13 +81,16 @@ def locate(
     adapters: Sequence[HostAdapter],
     name: str | None = None,
     select: Callable[..., str | None] | None = None,
+    *,
+    above: bool = True,
 ) -> tuple[HostRepo, HostAdapter]:
     """Find the checkout that contains a script's folder, and its adapter; see ``choose``.
 
     If the folder is no host, but its scripts import an installed host, or ``name`` is the adapter
-    of an installed host, the result is the installed package.
+    of an installed host, the result is the installed package. With ``above`` the folder that
+    contains this one is looked at, too.
     """
-    repo, above = HostRepo(folder), HostRepo(folder.resolve().parent)
+    repo = HostRepo(folder)
     try:
         return repo, choose(repo, adapters, name, select)
     except UnknownHostError:
@@ -98,7 +101,8 @@ def locate(
             if (name.replace("_", "-") == adapter.name if name else repo.imports(package))
         ]
         packages = [package for each in used if (package := HostRepo.installed(each))]
-        for candidate in (above, *packages):
+        outer = [HostRepo(folder.resolve().parent)] if above else []
+        for candidate in (*outer, *packages):
             with contextlib.suppress(UnknownHostError):
                 return candidate, choose(candidate, adapters, name, select)
         raise

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import os
+import re
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,10 +14,20 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
+from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.seams import Seam
+from fragprune_plugins.storage.reading import MEBIBYTE, Door
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+_DOOR = Door(
+    UnknownHostError,
+    "no source",
+    "a file of a host's source",
+    "Look at the file, or at the folder's permissions.",
+    limit=8 * MEBIBYTE,
+)
 
 
 def _definition(scope: ast.AST | None, name: str) -> ast.AST | None:
@@ -25,6 +37,10 @@ def _definition(scope: ast.AST | None, name: str) -> ast.AST | None:
     return next((child for child in body if isinstance(child, kinds) and child.name == name), None)
 
 
+_COMMIT = re.compile(r"[0-9a-f]{4,64}")
+_REFERENCE = re.compile(r"ref: (refs/(?!.*\.\.)[\w./+@-]+)")
+
+
 @lru_cache(maxsize=256)
 def _parsed(text: str) -> ast.Module | None:
     """The syntax tree of a text, cached and never changed; None if it is not Python."""
@@ -32,7 +48,7 @@ def _parsed(text: str) -> ast.Module | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a host's invalid escapes are its own affair
             return ast.parse(text)
-    except SyntaxError:
+    except (SyntaxError, ValueError, RecursionError, MemoryError):  # too deep, or a NUL in it
         return None
 
 
@@ -58,6 +74,8 @@ def _distributions(package: str) -> str:
 class HostRepo:
     """A host's checkout or installed package, read as text.
 
+    Files of a checkout are read only inside of it: a link that leads out counts as no file.
+
     Args:
         root: the folder of its entry scripts, or the folder that contains its package.
         package: import name of the installed package; "" for a checkout.
@@ -78,16 +96,32 @@ class HostRepo:
         """The file a dotted module name would be imported from, or None."""
         base = self.root.joinpath(*module.split("."))
         for candidate in (base / "__init__.py", base.with_suffix(".py")):
-            if candidate.is_file():
+            if self._inside(candidate) and os.path.isfile(candidate):  # also for too long a name
                 return candidate
         return None
+
+    def _inside(self, path: Path) -> bool:
+        """Whether a path of a checkout stays in it once its links are followed.
+
+        Package managers install packages as links, so installed ones may lead anywhere.
+        """
+        return bool(self.package) or path.resolve().is_relative_to(self.root)
+
+    def _read(self, path: Path) -> str:
+        """The text of a file; "" where it is missing, or leads out of the checkout."""
+        try:
+            if self._inside(path):
+                with _DOOR.reading(path) as reading:
+                    return reading.file.read().decode("utf-8", "replace")
+        except UnknownHostError:
+            pass
+        return ""
 
     def tree(self, module: str) -> ast.Module | None:
         """The module's syntax tree, or None when it is absent or not Python."""
         if module not in self._trees:
             path = self.path(module)
-            text = path.read_text(encoding="utf-8", errors="replace") if path else None
-            self._trees[module] = None if text is None else _parsed(text)
+            self._trees[module] = _parsed(self._read(path)) if path else None
         return self._trees[module]
 
     def function(self, module: str, attribute: str) -> Function | None:
@@ -175,20 +209,15 @@ class HostRepo:
         if self.package:
             return _distributions(self.package)
         git = self.root / ".git"
-        try:
-            head = (git / "HEAD").read_text().strip()
-            if not head.startswith("ref: "):
-                return head
-            reference = head.removeprefix("ref: ")
-            loose = git / reference
-            if loose.is_file():
-                return loose.read_text().strip()
-            for line in (git / "packed-refs").read_text().splitlines():
-                if line.endswith(reference):
-                    return line.split()[0]
-        except OSError:
-            pass
-        return ""
+        head = self._read(git / "HEAD").strip()
+        reference = _REFERENCE.fullmatch(head)
+        if reference is None:
+            return head if _COMMIT.fullmatch(head) else ""
+        found = [self._read(git / reference[1]).strip()]
+        for line in self._read(git / "packed-refs").splitlines():
+            commit, _, name = line.partition(" ")
+            found += [commit] if name == reference[1] else []
+        return next((each for each in found if _COMMIT.fullmatch(each)), "")
 
 
 @dataclass(frozen=True)

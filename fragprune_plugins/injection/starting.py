@@ -6,7 +6,6 @@ import contextlib
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
 from fragprune_plugins.errors import ModelFileError, UsageError
@@ -14,8 +13,16 @@ from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, CommandLine, ScriptA
 from fragprune_plugins.injection.command import HostCommand
 from fragprune_plugins.injection.process import host_checkpoints
 from fragprune_plugins.storage import records
+from fragprune_plugins.storage.reading import Door
 
 log = logging.getLogger("fragprune")
+
+_DOOR = Door(
+    ModelFileError,
+    "not readable as a checkpoint",
+    "(capture, iteration), as hosts save it",
+    "The file is cut off, or is no checkpoint. Remove it, or name another file.",
+)
 
 
 class Start(NamedTuple):
@@ -143,16 +150,9 @@ def _read_checkpoint(path: Path) -> tuple[Any, int]:
     """
     import torch
 
-    if not path.is_file():
+    if not path.exists():
         raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
-    try:
-        with host_checkpoints():
-            capture, iteration = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-            return capture, int(iteration)
-    except (UnpicklingError, RuntimeError, OSError, EOFError, ValueError, TypeError) as error:
-        raise ModelFileError(
-            str(path),
-            f"not readable as a checkpoint ({str(error).splitlines()[0]})",
-            "(capture, iteration), as hosts save it",
-            "The file is cut off, or is no checkpoint. Remove it, or name another file.",
-        ) from error
+    with _DOOR.reading(path), host_checkpoints():
+        # The safe loader: whatever the file holds, nothing of it is run.
+        capture, iteration = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        return capture, int(iteration)

@@ -19,6 +19,36 @@ if TYPE_CHECKING:
 COLOURS = "inferno"
 LABEL = "drawn fragments per pixel"
 
+BESIDE = tuple(f"_{kind}" for kind in ("fragments", "panel", "photograph", "before", "after"))
+"""What commands add to a view's name for further pictures of it."""
+
+_STEM = 150  # bytes of a picture's name, of 255 that file systems allow
+
+
+def stems(names: Sequence[str]) -> list[str]:
+    """Names for the pictures of views, without ending: each its own, and one in a folder.
+
+    Views of one name get numbers, such as ``r_0`` and ``r_0-2``. What is no letter, digit, space or
+    one of ``._+-~()`` becomes ``_``.
+
+    Args:
+        names: of the views, as their files have them.
+    """
+    taken: set[str] = set()
+    found = []
+    for name in names:
+        plain = "".join(c if c.isalnum() or c in "._+-~() " else "_" for c in name)
+        stem = Path(plain).stem.lstrip(".").encode()[:_STEM].decode(errors="ignore") or "view"
+        number = 1
+        each = stem
+        # Some file systems take upper for lower case. What stands beside a picture is taken, too.
+        while each.lower() in taken:
+            number += 1
+            each = f"{stem}-{number}"
+        taken |= {each.lower() + beside for beside in ("", *BESIDE)}
+        found.append(each)
+    return found
+
 
 def save_image(path: Path, image: Tensor) -> None:
     """Write an image (3, H, W), clamped to [0, 1], as 8-bit PNG.

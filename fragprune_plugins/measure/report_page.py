@@ -38,13 +38,13 @@ def draw_views(
     """
     import torch
 
-    from fragprune_plugins.measure.pictures import save_image, save_panel
+    from fragprune_plugins.measure.pictures import save_image, save_panel, stems
 
     views = {}
     models = [("before", before, before.model.splats()), ("after", after, after.model.splats())]
     chosen = shots[:: max(1, len(shots) // _SHOWN)][:_SHOWN]
-    for shot in (shot.to(before.model.xyz.device) for shot in chosen):
-        stem = Path(shot.name.replace("/", "_")).stem
+    for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
+        shot = shot.to(before.model.xyz.device)
         with torch.no_grad():
             drawn = {
                 name: each.draw(engine, shot.view, splats, counts=True)

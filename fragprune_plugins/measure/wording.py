@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00
@@ -70,6 +71,21 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
     report = reports[-1]
     lines.append(f"{report['views']} views, {report['engine']} engine on {report['device']}")
     return "\n".join(lines)
+
+
+def nothing_drawn(fragments: Sequence[float]) -> list[str]:
+    """A warning where no Gaussian is seen; [] where each view or measurement has some.
+
+    Args:
+        fragments: per pixel, of each.
+    """
+    empty = sum(each == 0 for each in fragments)
+    if not empty:
+        return []
+    return [
+        f"{empty} of {len(fragments)} show no Gaussian (0.0 fragments per pixel). Are these the "
+        "cameras of this model?"
+    ]
 
 
 def gain(before: dict[str, Any], after: dict[str, Any]) -> str:

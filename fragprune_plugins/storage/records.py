@@ -16,9 +16,11 @@ from fragprune_plugins.storage.reading import MEBIBYTE, Door
 
 SUFFIX = ".fragprune.json"
 FORMAT = "fragprune-record-1"
-_DOOR = Door(
+DOOR = Door(
     RecordError, "unreadable", f"a file of format {FORMAT}", "Remove it.", limit=64 * MEBIBYTE
 )
+"""``DOOR.stated(record.path)`` is around whatever takes values out of a record."""
+
 _SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
 
 
@@ -68,7 +70,7 @@ def beside(result: Path) -> Record | None:
 
 
 def find(folder: Path) -> list[Record]:
-    """Read all records in a folder and below, oldest first.
+    """Read all records in a folder and below, oldest first. Links out of the folder are not read.
 
     Raises:
         RecordError: there is no record, or a record cannot be read.
@@ -87,7 +89,9 @@ def find(folder: Path) -> list[Record]:
 def files(folder: Path, *, below: bool = False) -> list[Path]:
     """The files of records in a folder, optionally also below it, oldest first."""
     find_files = Path(folder).rglob if below else Path(folder).glob
-    return sorted(find_files(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime)
+    root = Path(folder).resolve()
+    inside = (path for path in find_files(f"*{SUFFIX}") if path.resolve().is_relative_to(root))
+    return sorted((each for each in inside if each.exists()), key=lambda each: each.stat().st_mtime)
 
 
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
@@ -101,7 +105,7 @@ def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | 
         among: the files to search; the last match counts.
     """
     for path in reversed(among):
-        with contextlib.suppress(RecordError):
+        with contextlib.suppress(RecordError), DOOR.stated(path):
             other = _read(path).data
             if _is_control(other, data):
                 after: dict[str, Any] = other["after"]
@@ -126,7 +130,7 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
 
 
 def _read(path: Path) -> Record:
-    with _DOOR.reading(path) as reading:
+    with DOOR.reading(path) as reading:
         content = reading.json()
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError("another format")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
+import sys
 
 import pytest
+import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
@@ -29,8 +32,8 @@ def folder(finetuned, tmp_path):
 
 
 def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
-    out, _, figures = folder
-    report = run_json("report", out)
+    out, data, figures = folder
+    report = run_json("report", out, "--data", data)
     page = (out / "report.html").read_text()
     assert report["page"] == str(out / "report.html")
     assert report["before"] == figures["before"]
@@ -79,7 +82,7 @@ def test_without_the_photographs_there_are_curves_and_the_reason(folder, tmp_pat
     records.leave(out / "pruned", "finetune", record.data)
     result = run("report", out)
     assert result.exit_code == 0
-    assert "No views are shown: [dataset]" in result.stdout
+    assert "No views are shown: they need files outside of" in result.stdout
     assert run_json("report", out)["pictures"] == 1
     assert len(run_json("report", out, "--data", data)["views"]) > 0
     refused = run("report", out, "--data", tmp_path / "nowhere", "--json")
@@ -140,3 +143,49 @@ def test_a_folder_without_records_says_what_to_run(tmp_path):
 def test_figures_that_are_not_numbers_are_null(tmp_path):
     path = records.leave(tmp_path / "a.ply", "run", {"loss": float("nan")})
     assert json.loads(path.read_text())["data"] == {"loss": None}
+
+
+def test_without_being_asked_nothing_outside_of_the_folder_is_read(folder, tmp_path):
+    out, _, _ = folder
+    (record,) = records.find(out)
+    secret = tmp_path / "secret.png"
+    tiny.save_png(secret, torch.rand(3, 8, 8))
+    (out / "linked.png").symlink_to(secret)
+    (out / "linked.fragprune.json").symlink_to(tmp_path / "elsewhere.fragprune.json")
+    (out / "text.png").write_text("no picture, but a note")
+    tiny.save_png(out / "own.png", torch.rand(3, 8, 8))
+    names = ["linked.png", "text.png", "own.png", str(secret)]
+    records.leave(out / "pruned", "finetune", record.data | {"files": names})
+    opened, listening = [], True
+    sys.addaudithook(lambda event, given: listening and event == "open" and opened.append(given[0]))
+    report = run_json("report", out)
+    listening = False  # a hook cannot be removed
+    assert report["views"] == []
+    assert report["pictures"] == 2  # the curves, and own.png
+    touched = [str(path) for path in opened if str(path).startswith(str(tmp_path.parent))]
+    assert not [path for path in touched if not path.startswith(str(out))]
+    page = (out / "report.html").read_text()
+    for file in (secret, out / "text.png"):
+        assert base64.b64encode(file.read_bytes()).decode() not in page
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"before": 3},
+        {"after": {"psnr": "high"}},
+        {"settings": []},
+        {"files": 7},
+        {"curves": [{"step": "a"}]},
+        {"photographs": []},
+        {"photographs": {"models": ["a"], "drawing": {}, "filtered": False}},
+        {"iterations": {}, "adapter": "x"},
+    ],
+)
+def test_a_record_of_other_types_is_refused(folder, changed):
+    out, _, _ = folder
+    (record,) = records.find(out)
+    records.leave(out / "pruned", "finetune", record.data | changed)
+    result = run("report", out)
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"[record] {out / 'pruned.fragprune.json'}: ")

@@ -1,0 +1,52 @@
+"""Takes out of a record how its models are drawn, and what they were measured against."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.storage.records import DOOR, Record
+
+_NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}
+"""Fields of ``RasterInputs`` that a record may set to a number."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The "photographs" of a record.
+
+    Attributes:
+        photographs: the scene.
+        models: the model before and the model after.
+        filtered: whether the models have Mip-Splatting's 3D filter.
+        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
+    """
+
+    photographs: Photographs
+    models: tuple[Path, Path]
+    filtered: bool
+    drawing: Mapping[str, Any]
+
+
+def recorded(record: Record) -> Recorded | None:
+    """The photographs and models of a record; None if it names none.
+
+    Raises:
+        RecordError: they are of other types.
+    """
+    with DOOR.stated(record.path) as reading:
+        values = record.data.get("photographs")
+        if values is None:
+            return None
+        reading.place = "data.photographs"
+        before, after = map(Path, values["models"])
+        drawing = dict(values["drawing"])
+        for name, value in drawing.items():
+            number = isinstance(value, int | float) and 0 <= value < 1e6
+            if not (number if name in _NUMBERS else name == "compensation"):
+                raise ValueError(f"{name} is {value!r}")
+        filtered = bool(values["filtered"])
+        return Recorded(Photographs.from_dict(values), (before, after), filtered, drawing)
