@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 PIXELS_MAX = 160_000_000
 """Most pixels of a photograph; cameras reach 151 million. Pillow itself refuses 179 million."""
 
-_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP")
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """All that Pillow may take a file for. Some of its other readers run programs."""
 
 _DOOR = Door(

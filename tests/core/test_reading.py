@@ -1,0 +1,497 @@
+"""The one door for files: what it opens, what it says, and every reader behind it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import struct
+
+import pytest
+import torch
+from finetune import tiny
+from PIL import Image
+from safetensors.torch import load_file, save_file
+
+from fragprune_plugins.datasets import colmap
+from fragprune_plugins.datasets.cameras import load_cameras
+from fragprune_plugins.datasets.dataset import Photograph
+from fragprune_plugins.datasets.pinhole import Camera
+from fragprune_plugins.errors import (
+    DatasetError,
+    InputError,
+    ModelFileError,
+    OutputError,
+    RecordError,
+    SidecarError,
+    UsageError,
+)
+from fragprune_plugins.hosts.adapter import ConfigFile, read_config
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.starting import _read_checkpoint
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import records, sidecar
+from fragprune_plugins.storage.ply import is_marked, read_ply, write_ply
+from fragprune_plugins.storage.reading import NESTING, Door
+from fragprune_plugins.types import View
+
+DOOR = Door(RecordError, "broken", "a file", "Write it again.", limit=100)
+
+
+@pytest.fixture(autouse=True)
+def no_waiting():
+    """A reader that waits for a pipe ends the test, not the suite."""
+
+    def late(*_):
+        raise AssertionError("waited")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def special(path, kind):
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "loop":
+        path.symlink_to(path)
+    elif kind == "dangling":
+        path.symlink_to(path.with_name("nowhere"))
+    return path
+
+
+def read_colmap(path):
+    tiny.write_colmap(path.parent / "scene", [torch.zeros(3, 4, 4)] * 9)
+    target = path.parent / "scene" / "sparse" / "0" / "cameras.txt"
+    target.unlink()
+    path.rename(target)
+    colmap.read(path.parent / "scene")
+
+
+def read_sidecar(path):
+    model = path.with_name("m.ply")
+    model.write_bytes(b"ply\n")
+    path.rename(sidecar.path_beside(model))
+    sidecar.load(model)
+
+
+def use(path, act, door=None):
+    with (door or DOOR).reading(path) as reading:
+        reading.place = "line 3"
+        return act(reading)
+
+
+def raising(error):
+    def act(reading):
+        raise error
+
+    return act
+
+
+READERS = {
+    "ply": (read_ply, ModelFileError),
+    "sidecar": (read_sidecar, SidecarError),
+    "cameras": (load_cameras, DatasetError),
+    "colmap": (read_colmap, DatasetError),
+    "image": (lambda path: Photograph("a", tiny.cameras(1)[0].view(), path).image, DatasetError),
+    "record": (records._read, RecordError),
+    "checkpoint": (_read_checkpoint, (ModelFileError, UsageError)),
+    "config": (lambda path: read_config(ConfigFile("--config"), path), UsageError),
+}
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "loop", "dangling"])
+@pytest.mark.parametrize("reader", READERS)
+def test_what_is_no_regular_file_is_stated_at_once(tmp_path, reader, kind):
+    read, error = READERS[reader]
+    path = special(tmp_path / "file", kind)
+    with pytest.raises(error) as stated:
+        read(path)
+    assert stated.value.remedy
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "a\0b", "\udcff"])
+@pytest.mark.parametrize("reader", ["ply", "cameras", "image", "record", "config"])
+def test_names_that_no_file_has(tmp_path, reader, name):
+    read, error = READERS[reader]
+    with pytest.raises(error) as stated:
+        read(tmp_path / name)
+    assert str(stated.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (KeyError("logits"), "no 'logits'"),
+        (struct.error("unpack requires"), "unpack requires"),
+        (RecursionError("deep"), "nested too deeply"),
+        (MemoryError(), "it takes more memory than there is"),
+        (OverflowError("int too large"), "int too large"),
+        (ValueError("a\n\x1b[2J" + 1000 * "b"), "a"),
+        (AssertionError(), "AssertionError"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_whatever_a_parser_raises_is_one_line_with_path_and_place(tmp_path, error, words):
+    path = tmp_path / "a"
+    path.write_bytes(b"x")
+    with pytest.raises(RecordError) as stated:
+        use(path, raising(error))
+    assert stated.value.where == str(path)
+    assert stated.value.found.startswith(f"broken at line 3 ({words}")
+    assert str(stated.value).isprintable()
+    assert len(str(stated.value)) < 700
+    assert stated.value.__cause__ is error
+
+
+def test_errors_of_ours_pass_but_one_about_a_value_becomes_the_files(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"x")
+    with pytest.raises(OutputError):
+        use(path, raising(OutputError("a", "b", "c", "d")))
+    with pytest.raises(RecordError, match=r"a: line 3: fx: -1; expected positive"):
+        use(path, raising(InputError("fx", "-1", "positive", "Check it.")))
+    with pytest.raises(KeyboardInterrupt):
+        use(path, raising(KeyboardInterrupt()))
+
+
+def test_a_file_is_bounded_and_so_is_what_it_announces(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(bytes(101))
+    with pytest.raises(RecordError, match=r"101 bytes.*at most 100"):
+        use(path, lambda reading: None)
+    path.write_bytes(bytes(100))
+    with DOOR.reading(path) as reading:
+        assert reading.take(60) == bytes(60)
+        reading.skip(30)
+        assert reading.left == 10
+    for name in ("take", "skip"):
+        with pytest.raises(RecordError, match=f"{1 << 62} bytes announced at byte 0, where 100"):
+            use(path, lambda reading, name=name: getattr(reading, name)(1 << 62))
+
+
+@pytest.mark.parametrize("depth", [NESTING - 1, NESTING + 1, 100_000])
+def test_json_is_bounded_in_depth(tmp_path, depth):
+    door = Door(RecordError, "broken", "a file", "Write it again.")
+    path = tmp_path / "a.json"
+    path.write_text("[" * depth + "]" * depth)
+    if depth < NESTING:
+        assert use(path, lambda reading: reading.json(), door)
+    else:
+        with pytest.raises(RecordError, match=r"levels|deeply"):
+            use(path, lambda reading: reading.json(), door)
+
+
+# -- PLY -----------------------------------------------------------------------------------------
+
+
+def header(*lines, start="ply\nformat binary_little_endian 1.0\n"):
+    return (start + "\n".join(lines) + "\nend_header\n").encode()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (header(f"element vertex {2**63}", "property float x"), "cut off|line 3"),
+        (header("element vertex 99999999999999999999", "property float x"), "line 3 of the header"),
+        (header(f"element vertex {2**40}", "property float x"), f"cut off in row 0 of {2**40}"),
+        (header("element vertex -1", "property float x"), "line 3 of the header"),
+        (header("element vertex 1", "property list uchar int x"), "element vertex has lists"),
+        (header("element vertex 1", "property float x", "property float x"), "line 5"),
+        (header("element face 9", "property list int int x", "element vertex 1"), "has lists"),
+        (header("element vertex 1"), "element vertex has no columns"),
+        (header("element vertex 1", "property quad x"), "line 4 of the header"),
+        (header("property float x"), "line 3 of the header"),
+        (header(start="ply\n"), "no format"),
+        (
+            header(f"element vertex {2**31}", "property float x", start="ply\nformat ascii 1.0\n"),
+            f"{2**31} rows announced, in 0 bytes of text",
+        ),
+        (
+            header("element vertex 2", "property float x", start="ply\nformat ascii 1.0\n")
+            + b"1 two",
+            "not readable as PLY",
+        ),
+        (b"ply\n" + b"comment " + b"x" * 30_000_000, "no end_header in the first 1048576 bytes"),
+        (b"ply\n" + b"comment a\n" * 3_000_000, "no end_header in the first 1048576 bytes"),
+    ],
+)
+def test_a_header_is_checked_against_the_file(tmp_path, content, words):
+    path = tmp_path / "a.ply"
+    path.write_bytes(content)
+    with pytest.raises(ModelFileError, match=words):
+        read_ply(path)
+    assert not is_marked(path)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "words"),
+    [
+        ("scaling", 31.0, "scales.* 2 of 8 rows: 1, 6; expected logarithms"),
+        ("rotation", 0.0, "quaternions of length 0.* 2 of 8 rows: 1, 6"),
+        ("rotation", 1e-30, "quaternions of length 0"),
+        ("rotation", 1e25, "quaternions too long"),
+        ("xyz", torch.nan, r"2 of 8 rows \(x, y, z\): 1, 6"),
+    ],
+)
+def test_gaussians_that_cannot_be_drawn_are_refused_with_their_rows(tmp_path, part, value, words):
+    model = tiny.random_model(8)
+    getattr(model, part)[[1, 6]] = value
+    write_ply(tmp_path / "a.ply", model)
+    with pytest.raises(ModelFileError, match=words):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_text_and_elements_before_the_vertices_are_read(tmp_path):
+    write_ply(tmp_path / "a.ply", tiny.random_model(2, degree=0))
+    content = (tmp_path / "a.ply").read_bytes()
+    extra = b"element camera 2\nproperty double x\nproperty uchar y\n"
+    head, body = content.split(b"end_header\n")
+    head = head.replace(b"element vertex", extra + b"element vertex")
+    (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + bytes(18) + body)
+    same = read_ply(tmp_path / "b.ply")
+    assert torch.equal(same.xyz, read_ply(tmp_path / "a.ply").xyz)
+
+
+# -- cameras -------------------------------------------------------------------------------------
+
+
+def write_cameras(path, **changed):
+    camera = tiny.cameras(1)[0]
+    entry = {
+        "id": 0,
+        "img_name": "a",
+        "width": 32,
+        "height": 32,
+        "position": [0.0, 0.0, -3.0],
+        "rotation": camera.rotation.T.tolist(),
+        "fx": 36.0,
+        "fy": 36.0,
+    }
+    path.write_text(json.dumps([entry, entry | changed]))
+    return path
+
+
+def write_transforms(path, matrix, **changed):
+    content = {"camera_angle_x": 0.8, "w": 32, "h": 32}
+    frames = [{"file_path": "a", "transform_matrix": matrix}]
+    path.write_text(json.dumps(content | {"frames": frames} | changed))
+    return path
+
+
+EYE = torch.eye(4).tolist()
+NAN = float("nan")
+
+GEOMETRY = {
+    "focal 0": {"fx": 0.0},
+    "focal negative": {"fy": -36.0},
+    "focal NaN": {"fx": NAN},
+    "focal infinite": {"fx": float("inf")},
+    "focal tiny": {"fx": 1e-9},
+    "focal huge": {"fx": 1e12},
+    "width 0": {"width": 0},
+    "width vast": {"width": 10**9},
+    "width of 400 digits": {"width": 10**400},
+    "width infinite": {"width": float("inf")},
+    "rotation singular": {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 0]]},
+    "rotation NaN": {"rotation": [[1, 0, 0], [0, NAN, 0], [0, 0, 1]]},
+    "rotation scaled": {"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]},
+    "rotation mirrored": {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]},
+    "rotation ragged": {"rotation": [[1, 0, 0], [0, 1], [0, 0, 1]]},
+    "rotation flat": {"rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1]},
+    "position NaN": {"position": [0, NAN, 0]},
+    "position far": {"position": [1e30, 0, 0]},
+    "position short": {"position": [0, 0]},
+}
+
+
+@pytest.mark.parametrize("how", GEOMETRY)
+def test_a_camera_that_is_none_is_refused_with_its_place(tmp_path, how):
+    path = write_cameras(tmp_path / "cameras.json", **GEOMETRY[how])
+    with pytest.raises(DatasetError, match=r"\[1\]") as stated:
+        load_cameras(path)
+    assert stated.value.where == str(path)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "changed"),
+    [
+        (EYE[:2], {}),
+        ([EYE], {}),
+        (torch.full((4, 4), NAN).tolist(), {}),
+        (torch.zeros(4, 4).tolist(), {}),
+        (EYE, {"w": float("inf")}),
+        (EYE, {"camera_angle_x": 0.0}),
+        (EYE, {"fl_x": -5}),
+        (EYE, {"cx": NAN}),
+        (EYE, {"frames": [3]}),
+        (EYE, {"frames": 3}),
+        (EYE, {"k5": 0.1}),
+        (EYE, {"camera_model": "OPENCV_FISHEYE"}),
+    ],
+)
+def test_transforms_that_are_none_are_refused(tmp_path, matrix, changed):
+    with pytest.raises(DatasetError):
+        load_cameras(write_transforms(tmp_path / "transforms_train.json", matrix, **changed))
+
+
+@pytest.mark.parametrize("rounded", [6, 3])
+def test_rounded_matrices_are_accepted(tmp_path, rounded):
+    turn = tiny.cameras(7)[3].rotation.T.numpy().round(rounded).tolist()
+    assert len(load_cameras(write_cameras(tmp_path / "cameras.json", rotation=turn))) == 2
+
+
+def image_record(points=0, count=1, quaternion=(1, 0, 0, 0), name=b"a.png\0"):
+    pose = struct.pack("<i7di", 1, *quaternion, 0, 0, 3, 7)
+    return struct.pack("<Q", count) + pose + name + struct.pack("<Q", points)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (image_record(points=1 << 40), "bytes announced"),
+        (image_record(points=1 << 62), "bytes announced"),
+        (image_record(count=1 << 62), f"{1 << 62} announced, in"),
+        (image_record(quaternion=(0, 0, 0, 0)), "number 1 of 1.*quaternion"),
+        (image_record(quaternion=(NAN, 0, 0, 0)), "quaternion"),
+        (image_record(name=b"x" * 10_000), "a name without end at byte 72"),
+        (image_record(name=b"\xff\xfe\0"), "number 1 of 1, byte 8"),
+    ],
+    ids=range(7),
+)
+def test_colmaps_counts_are_checked_against_the_file(tmp_path, content, words):
+    tiny.write_colmap(tmp_path, [torch.zeros(3, 4, 4)] * 9, binary=True)
+    path = tmp_path / "sparse" / "0" / "images.bin"
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match=words) as stated:
+        colmap.read(tmp_path)
+    assert stated.value.where == str(path)
+
+
+@pytest.mark.parametrize("number", [0.0, -1.0, NAN, float("inf")])
+def test_a_lens_that_is_none_is_refused_in_python_too(number):
+    with pytest.raises(InputError, match="fx"):
+        View.pinhole(torch.eye(3), torch.zeros(3), width=4, height=4, fx=number, fy=4.0)
+    with pytest.raises(InputError, match="fy"):
+        Camera(torch.eye(3), torch.zeros(3), 4, 4, 4.0, number, 2.0, 2.0)
+
+
+# -- the rest ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.bool, torch.float64, torch.float16])
+def test_a_sidecar_of_another_type_is_refused(tmp_path, dtype):
+    model = tmp_path / "m.ply"
+    write_ply(model, tiny.random_model(4))
+    path = sidecar.save(model, ThresholdStore(4))
+    metadata = sidecar_metadata(path)
+    save_file({k: v.to(dtype) for k, v in load_file(path).items()}, path, metadata=metadata)
+    with pytest.raises(SidecarError, match=f"tensor logits .*{dtype}"):
+        sidecar.load(model, 4)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("settings", "[" * 100_000),
+        ("settings", "[]"),
+        ("adam_step", "inf"),
+        ("adam_step", "-1"),
+        ("steps", "9" * 5000),
+        ("steps", str(1 << 80)),
+        ("rows", "four"),
+    ],
+)
+def test_a_sidecar_of_other_metadata_is_refused(tmp_path, key, value):
+    model = tmp_path / "m.ply"
+    write_ply(model, tiny.random_model(4))
+    path = sidecar.save(model, ThresholdStore(4))
+    metadata = sidecar_metadata(path) | {key: value}
+    save_file(load_file(path), path, metadata=metadata)
+    with pytest.raises(SidecarError, match="at its metadata"):
+        sidecar.load(model, 4)
+
+
+def sidecar_metadata(path):
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        return file.metadata()
+
+
+def png(width, height):
+    """A PNG that says that it is so large, of 70 bytes."""
+    import io
+    import zlib
+
+    out = io.BytesIO()
+    Image.new("RGB", (1, 1)).save(out, format="PNG")
+    content = bytearray(out.getvalue())
+    content[16:24] = struct.pack(">II", width, height)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    return bytes(content)
+
+
+@pytest.mark.parametrize("size", [(20_000, 8_001), (60_000, 60_000), (2**31 - 1, 1)])
+def test_an_image_that_unpacks_into_gigabytes_is_refused(tmp_path, size):
+    (tmp_path / "a.png").write_bytes(png(*size))
+    with pytest.raises(DatasetError):
+        READERS["image"][0](tmp_path / "a.png")
+
+
+def test_no_other_program_opens_an_image(tmp_path):
+    """Pillow hands PostScript to Ghostscript."""
+    (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EOF\n")
+    with pytest.raises(DatasetError, match="cannot identify"):
+        READERS["image"][0](tmp_path / "a.png")
+
+
+class Evil:
+    def __reduce__(self):
+        return os.system, ("touch executed",)
+
+
+def test_nothing_in_a_checkpoint_is_executed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save((Evil(), 7), tmp_path / "chkpnt7.pth")
+    with pytest.raises(ModelFileError, match="not readable as a checkpoint"):
+        _read_checkpoint(tmp_path / "chkpnt7.pth")
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("reference", ["../secret", "refs/../../secret", "/etc/passwd", "refs/out"])
+def test_a_reference_out_of_git_is_not_followed(tmp_path, reference):
+    (tmp_path / "secret").write_text("cafe cafe")
+    git = tmp_path / "host" / ".git"
+    (git / "refs").mkdir(parents=True)
+    (git / "refs" / "out").symlink_to(tmp_path / "secret")
+    (git / "HEAD").write_text(f"ref: {reference}\n")
+    assert HostRepo(tmp_path / "host").commit == ""
+    (git / "HEAD").write_bytes(b"\xff\xfe root:x:0:0")
+    assert HostRepo(tmp_path / "host").commit == ""
+
+
+def test_a_checkout_is_read_inside_of_it(tmp_path):
+    (tmp_path / "secret.py").write_text("def train(): ...\n")
+    host = tmp_path / "host"
+    host.mkdir()
+    (host / "train.py").symlink_to(tmp_path / "secret.py")
+    (host / "own.py").symlink_to(host / "real.py")
+    (host / "real.py").write_text("def train(): ...\n")
+    repo = HostRepo(host)
+    assert repo.path("train") is None
+    assert repo.function("own", "train") is not None
+
+
+@pytest.mark.parametrize(
+    "text", ["(" * 5000 + ")" * 5000, "x = " + "-" * 200_000 + "1", "\0", "\\"]
+)
+def test_source_that_python_cannot_parse_is_no_source(tmp_path, text):
+    (tmp_path / "train.py").write_text(text)
+    assert HostRepo(tmp_path).tree("train") is None

@@ -1,0 +1,53 @@
+"""``cd tests && python -m fuzz``: feeds broken files to every reader. The exit code is 1 if any
+reader raises what is not ours, gives nonsense, takes more than a minute or a gibibyte, or dies."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import time
+from pathlib import Path
+
+import torch
+from fuzz.readers import BY_NAME
+from fuzz.running import BAD, Tally, run
+
+
+def main() -> int:
+    """Run, print a table, and keep the inputs that broke something."""
+    parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
+    parser.add_argument("readers", nargs="*", help=f"of {', '.join(BY_NAME)}; default: all")
+    parser.add_argument("--inputs", type=int, default=2000, help="of each reader (2000)")
+    parser.add_argument("--seconds", type=float, default=1e9, help="for each reader")
+    parser.add_argument("--seed", type=int, default=int(time.time()), help="default: the clock")
+    parser.add_argument("--guided", action="store_true", help="keep what reaches new lines; slower")
+    parser.add_argument("--keep", type=Path, default=Path("fuzz-found"), help="folder for findings")
+    words = parser.parse_args()
+    if unknown := set(words.readers) - BY_NAME.keys():
+        parser.error(f"no reader {', '.join(sorted(unknown))}")
+    torch.set_num_threads(1)
+    print(f"seed {words.seed}")
+    print(f"{'reader':<14}{'inputs':>9}{'read':>9}{'stated':>9}" + "".join(f"{b:>9}" for b in BAD))
+    every = Tally()
+    for name in words.readers or BY_NAME:
+        how = {"seed": words.seed, "seconds": words.seconds, "guided": words.guided}
+        tally = run(BY_NAME[name], words.inputs, **how)
+        print(row(name, tally), flush=True)
+        every.outcomes += tally.outcomes
+        for (kind, said), content in tally.found.items():
+            words.keep.mkdir(parents=True, exist_ok=True)
+            file = words.keep / f"found-{name}-{hashlib.sha256(content).hexdigest()[:12]}"
+            file.write_bytes(content)
+            print(f"    {kind}: {said[:150]} ({file})", flush=True)
+    print(row("all", every))
+    return 1 if every.bad else 0
+
+
+def row(name: str, tally: Tally) -> str:
+    """A line of the table."""
+    kinds = ("read", "stated", *BAD)
+    return f"{name:<14}{tally.inputs:>9}" + "".join(f"{tally.outcomes[kind]:>9}" for kind in kinds)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

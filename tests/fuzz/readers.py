@@ -1,0 +1,188 @@
+"""Every reader as a function of bytes: what it gives is looked at, what it raises is judged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import torch
+from finetune import tiny
+from fuzz import seeds
+from miniatures.vanilla_3dgs import HOST
+
+from fragprune_plugins.cli import report
+from fragprune_plugins.datasets import colmap
+from fragprune_plugins.datasets.cameras import load_cameras
+from fragprune_plugins.datasets.dataset import Photograph
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.hosts.adapter import ConfigFile, read_config
+from fragprune_plugins.hosts.preflight import missing_imports
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.starting import resumed_at
+from fragprune_plugins.measure.recorded import recorded
+from fragprune_plugins.storage import models, records, sidecar
+from fragprune_plugins.types import RasterInputs, View
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+
+class Nonsense(Exception):  # noqa: N818 - what was found
+    """A reader gave what nobody can use, and said nothing."""
+
+
+def _sound(name: str, holds: bool) -> None:
+    if not holds:
+        raise Nonsense(name)
+
+
+@cache
+def _engine() -> object:
+    return create_engine("cpu")
+
+
+def _view() -> View:
+    return tiny.cameras(1)[0].view()
+
+
+def _ply(file: Path) -> None:
+    splat, store = models.load(file)
+    with torch.no_grad():
+        thresholds = None if store is None else store.values
+        drawn = _engine().rasterize(RasterInputs(_view(), splat.splats(), planes=()), thresholds)
+    _sound("a picture that is not finite", bool(drawn.image.isfinite().all()))
+
+
+def _sidecar(file: Path) -> None:
+    """The file lies beside a model that it may or may not belong to."""
+    model = file.with_name("m.ply")
+    model.write_bytes(_model())
+    file.replace(sidecar.path_beside(model))
+    store, _ = sidecar.load(model, seeds.GAUSSIANS)
+    _sound("another number of thresholds", len(store) == seeds.GAUSSIANS)
+    inside = (store.values > 0) & (store.values < 1)
+    _sound("thresholds outside (0, 1)", bool(inside.all()))
+    _sound("moments that are not finite", all(map(_finite, store.numbers.values())))
+
+
+def _finite(numbers: torch.Tensor) -> bool:
+    return bool(numbers.isfinite().all())
+
+
+@cache
+def _model() -> bytes:
+    return seeds.model()
+
+
+def _plausible(view: View) -> None:
+    numbers = [view.viewmatrix, view.projmatrix, view.campos]
+    _sound("a camera that is not finite", all(map(_finite, numbers)))
+    turn = view.viewmatrix[:3, :3].double()
+    _sound("a pose that is no rotation", _close(turn @ turn.T, torch.eye(3).double()))
+    sides = 0 < view.tan_fov_x < 1e3 and 0 < view.tan_fov_y < 1e3
+    _sound("a field of view that is none", sides and 0 < view.width * view.height <= 1 << 32)
+
+
+def _close(one: torch.Tensor, other: torch.Tensor) -> bool:
+    return float((one - other).abs().max()) < 0.02
+
+
+def _colmap(name: str) -> Callable[[Path], None]:
+    """One file of a COLMAP model; its partner is good."""
+    kind = name.partition(".")[2]
+    partner = f"images.{kind}" if name.startswith("cameras") else f"cameras.{kind}"
+
+    def read(file: Path) -> None:
+        sparse = file.parent / "sparse"
+        sparse.mkdir(exist_ok=True)
+        good = next((seeds.CORPUS / partner).glob("a.*"))
+        (sparse / partner).write_bytes(good.read_bytes())
+        file.replace(sparse / name)
+        for part in colmap.read(file.parent):
+            for _, camera, _ in part:
+                _plausible(camera.view())
+
+    return read
+
+
+def _views(file: Path) -> None:
+    for _, view in load_cameras(file):
+        _plausible(view)
+
+
+def _record(file: Path) -> None:
+    file.rename(file.with_name("a.fragprune.json"))
+    for each in records.find(file.parent):
+        report._check(each)
+        recorded(each)
+        records.control_of(each.data, [each.path])
+
+
+def _image(file: Path) -> None:
+    picture = Photograph("a", _view(), file).image
+    _sound("a picture of another size", picture.shape == (3, tiny.SIDE, tiny.SIDE))
+
+
+def _checkpoint(file: Path) -> None:
+    resumed_at(Vanilla3DGS().command_line(HostRepo(HOST)), file)
+
+
+def _source(file: Path) -> None:
+    """The bytes are two modules of a host: one that has seams, and its script."""
+    (file.parent / "gaussian_renderer").mkdir(exist_ok=True)
+    (file.parent / "gaussian_renderer" / "__init__.py").write_bytes(file.read_bytes())
+    file.rename(file.with_name("train.py"))
+    repo, adapter = HostRepo(file.parent), Vanilla3DGS()
+    match = adapter.match(repo)
+    failed = [each for each in match.findings if each.code == "adapter-failed"]
+    _sound(f"an adapter that failed: {failed}", not failed)
+    missing_imports(repo, [file.with_name("train.py")], ())
+
+
+def _git(file: Path) -> None:
+    (file.parent / "secret").write_text("f00d f00d f00d\n")
+    folder = file.parent / ".git"
+    (folder / "refs" / "heads").mkdir(parents=True, exist_ok=True)
+    (folder / "refs" / "heads" / "main").write_text("0123456789abcdef0123456789abcdef01234567\n")
+    file.rename(folder / "HEAD")
+    commit = HostRepo(file.parent).commit
+    _sound(f"a commit {commit[:90]!r}", commit == "" or set(commit) <= set("0123456789abcdef"))
+
+
+def _config(file: Path) -> None:
+    values = read_config(ConfigFile("--config"), file)
+    _sound("no names", all(isinstance(name, str) for name in values))
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader.
+
+    Attributes:
+        name: also the folder of its seeds.
+        read: reads a file of the bytes; raises Nonsense where it gives what nobody can use.
+    """
+
+    name: str
+    read: Callable[[Path], None]
+
+    def pool(self) -> list[bytes]:
+        """The kept inputs."""
+        return [path.read_bytes() for path in sorted((seeds.CORPUS / self.name).iterdir())]
+
+
+READERS = [
+    Reader("ply", _ply),
+    Reader("sidecar", _sidecar),
+    *(Reader(name, _colmap(name)) for name in ("cameras.bin", "images.bin")),
+    *(Reader(name, _colmap(name)) for name in ("cameras.txt", "images.txt")),
+    Reader("transforms", _views),
+    Reader("cameras.json", _views),
+    Reader("record", _record),
+    Reader("image", _image),
+    Reader("checkpoint", _checkpoint),
+    Reader("source", _source),
+    Reader("git", _git),
+    Reader("config", _config),
+]
+BY_NAME = {reader.name: reader for reader in READERS}

@@ -1,0 +1,190 @@
+"""Makes the corpus: small good files of every kind that is read. ``python -m fuzz.seeds``.
+
+All of it is our own, made from numbers. Files named ``found-*`` are inputs that once broke a
+reader; nothing here makes or removes them.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from finetune import tiny
+from miniatures.vanilla_3dgs import HOST
+from PIL import Image
+from plyfile import PlyData
+
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import records, sidecar
+from fragprune_plugins.storage.ply import write_ply
+
+CORPUS = Path(__file__).parent / "corpus"
+
+GAUSSIANS = 3
+VIEWS = 3
+
+FIGURES = {
+    "target": "photographs",
+    "psnr": 30.0,
+    "ssim": 0.9,
+    "lpips": None,
+    "fragments_per_pixel": 20.0,
+    "evaluated_per_pixel": 40.0,
+    "gaussians": 3,
+    "frame_ms": 1.5,
+    "frame_ms_se": 0.1,
+    "engine": "cpu",
+    "device": "cpu",
+    "views": 2,
+}
+
+
+def model(degree: int = 0) -> bytes:
+    """A splat of three Gaussians as a binary PLY."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "m.ply"
+        write_ply(path, tiny.random_model(GAUSSIANS, degree), torch.full((GAUSSIANS,), 0.2))
+        return path.read_bytes()
+
+
+def _as(content: bytes, **how: object) -> bytes:
+    """A PLY written in another way."""
+    vertex = PlyData.read(io.BytesIO(content))["vertex"]
+    out = io.BytesIO()
+    PlyData([vertex], **how).write(out)
+    return out.getvalue()
+
+
+def _sidecar(folder: Path) -> bytes:
+    path = folder / "m.ply"
+    path.write_bytes(model())
+    store = ThresholdStore(GAUSSIANS)
+    store.open(torch.full((GAUSSIANS,), 0.5))
+    store.logits.grad = torch.ones(GAUSSIANS)
+    store.step(0.1)
+    return sidecar.save(path, store, settings={"iterations": 3}).read_bytes()
+
+
+def _scene(folder: Path, *, binary: bool) -> dict[str, bytes]:
+    """The files of a COLMAP model with few views, by name."""
+    images = [torch.rand(3, tiny.SIDE, tiny.SIDE) for _ in range(9)]
+    sparse = tiny.write_colmap(folder / str(binary), images, binary=binary) / "sparse" / "0"
+    return {path.name: path.read_bytes() for path in sparse.iterdir()}
+
+
+def _record(folder: Path) -> bytes:
+    curve = {"loss": 0.1, "fragments_per_pixel": 20.0, "threshold_median": 0.1}
+    after = FIGURES | {"fragments_per_pixel": 10.0}
+    data = {
+        "adapter": "a-host",
+        "iterations": 2,
+        "before": FIGURES,
+        "after": after,
+        "settings": {"truncate": True, "train": "all", "opacity_lr": 0.02},
+        "curves": [{"step": step, **curve} for step in range(3)],
+        "photographs": {
+            "folder": "scene",
+            "resolution": {"divide": 1, "width": None, "shrink_only": False},
+            "white_background": False,
+            "images": "images",
+            "models": ["a.ply", "b.ply"],
+            "filtered": False,
+            "drawing": {"dilation": 0.1},
+        },
+        "files": ["a.png"],
+    }
+    return records.leave(folder / "a.ply", "finetune", data).read_bytes()
+
+
+def _image(kind: str, mode: str = "RGB") -> bytes:
+    picture = np.arange(8 * 8 * len(mode), dtype=np.uint8).reshape(8, 8, len(mode))
+    out = io.BytesIO()
+    Image.fromarray(picture, mode=None).save(out, format=kind)
+    return out.getvalue()
+
+
+def _checkpoint(folder: Path) -> bytes:
+    path = folder / "chkpnt7.pth"
+    capture = (1, torch.rand(3, 3), {"state": {}, "param_groups": [{"lr": 0.1, "name": "xyz"}]})
+    torch.save((capture, 7), path)
+    return path.read_bytes()
+
+
+def _cameras() -> bytes:
+    cameras = [
+        {
+            "id": i,
+            "img_name": f"view{i}",
+            "width": camera.width,
+            "height": camera.height,
+            "position": (-camera.rotation.T @ camera.translation).tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "fx": camera.fx,
+            "fy": camera.fy,
+        }
+        for i, camera in enumerate(tiny.cameras(VIEWS))
+    ]
+    return json.dumps(cameras).encode()
+
+
+def _transforms() -> bytes:
+    names = [f"./train/r_{i}" for i in range(VIEWS)]
+    content = tiny.transforms(names, tiny.cameras(VIEWS))
+    return json.dumps(content | {"w": 32, "h": 32, "cx": 16.0, "cy": 16.0}).encode()
+
+
+def make() -> dict[str, dict[str, bytes]]:
+    """Seeds by reader and name."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        binary, text = _scene(folder, binary=True), _scene(folder, binary=False)
+        renderer = (HOST / "gaussian_renderer" / "__init__.py").read_bytes()
+        return {
+            "ply": {
+                "binary.ply": model(),
+                "degree1.ply": model(1),
+                "text.ply": _as(model(), text=True),
+                "big-endian.ply": _as(model(), byte_order=">"),
+            },
+            "sidecar": {"a.safetensors": _sidecar(folder)},
+            "cameras.bin": {"a.bin": binary["cameras.bin"]},
+            "images.bin": {"a.bin": binary["images.bin"]},
+            "cameras.txt": {"a.txt": text["cameras.txt"]},
+            "images.txt": {"a.txt": text["images.txt"]},
+            "transforms": {"a.json": _transforms()},
+            "cameras.json": {"a.json": _cameras()},
+            "record": {"a.json": _record(folder)},
+            "image": {
+                "a.png": _image("PNG"),
+                "alpha.png": _image("PNG", "RGBA"),
+                "a.jpg": _image("JPEG"),
+                "a.webp": _image("WEBP"),
+                "a.tiff": _image("TIFF"),
+            },
+            "checkpoint": {"a.pth": _checkpoint(folder)},
+            "source": {"renderer.py": renderer},
+            "git": {"head": b"ref: refs/heads/main\n", "commit": b"0123456789abcdef" * 2 + b"\n"},
+            "config": {"a.json": b'{"iterations": 30000, "source_path": "scene", "lambda": 0.2}'},
+        }
+
+
+def main() -> None:
+    """Write the corpus anew, and keep what was found."""
+    torch.manual_seed(0)
+    for reader, files in make().items():
+        folder = CORPUS / reader
+        for old in folder.glob("*") if folder.exists() else ():
+            if not old.name.startswith("found-"):
+                old.unlink()
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+    print(f"{sum(1 for _ in CORPUS.rglob('*.*'))} files in {CORPUS}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""Broken files: every reader reads its seeds, states what is wrong with others, and nothing else.
+
+Seconds of it; ``python -m fuzz`` has the hours.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+from fuzz import seeds
+from fuzz.readers import READERS, Reader
+from fuzz.running import BAD, GOOD, Nonsense, inputs, judge, run
+
+from fragprune_plugins.errors import RecordError
+
+INPUTS = 60
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_seeds_are_read_and_what_was_found_is_stated(reader, tmp_path):
+    files = sorted((seeds.CORPUS / reader.name).iterdir())
+    assert files
+    for file in files:
+        outcome = judge(reader, file.read_bytes(), tmp_path / "input")
+        wanted = GOOD if file.name.startswith("found-") else ("read",)
+        assert outcome[0] in wanted, (file.name, *outcome)
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_broken_files_are_stated(reader, tmp_path):
+    for number, content in inputs(reader.pool(), reader.name, 20, 0):
+        if number == INPUTS:
+            break
+        kind, words = judge(reader, content, tmp_path / "input")
+        assert kind in GOOD, (number, words)
+
+
+def test_the_corpus_is_what_its_maker_makes():
+    made = seeds.make()
+    assert made.keys() == {reader.name for reader in READERS}
+    for name, files in made.items():
+        kept = {path.name for path in (seeds.CORPUS / name).iterdir()}
+        assert {each for each in kept if not each.startswith("found-")} == files.keys()
+
+
+def raising(error):
+    def read(file):
+        raise error
+
+    return read
+
+
+def crash(file):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def devour(file):
+    bytearray(1 << 32)
+
+
+@pytest.mark.parametrize(
+    ("read", "kind"),
+    [
+        (raising(ValueError("raw")), "foreign"),
+        (raising(Nonsense("NaN")), "nonsense"),
+        (raising(RecordError("", "", "", "")), "nonsense"),
+        (raising(RecordError("a", "b", "c", "d")), "stated"),
+        (lambda file: None, "read"),
+        (devour, "foreign"),
+        (crash, "crash"),
+    ],
+    ids=["foreign", "nonsense", "empty words", "stated", "read", "memory", "crash"],
+)
+def test_the_runner_sees_each_outcome_and_goes_on(read, kind):
+    tally = run(Reader("git", read), 3)
+    assert tally.outcomes == {kind: 3}
+    assert (tally.bad > 0) == (kind in BAD)
+    assert bool(tally.found) == (kind in BAD)
+
+
+def test_a_reader_that_hangs_is_ended(monkeypatch):
+    def hang(file):
+        while True:
+            pass
+
+    monkeypatch.setattr("fuzz.running.HANG", 0.2)
+    assert run(Reader("git", hang), 2).outcomes == {"hang": 2}
