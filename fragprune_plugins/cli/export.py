@@ -42,6 +42,7 @@ def command(model: Path, out: Path, drop: bool) -> Report:
     """
     from fragprune_plugins.measure.visibility import visible
     from fragprune_plugins.storage import sidecar
+    from fragprune_plugins.storage.atomic import staging
     from fragprune_plugins.storage.ply import THRESHOLD_COLUMN, write_ply
 
     require_place(out, model)
@@ -54,17 +55,20 @@ def command(model: Path, out: Path, drop: bool) -> Report:
             "Run fragprune finetune first.",
         )
     thresholds = splat.thresholds  # a column keeps its bits
-    if thresholds is None or sidecar.path_beside(model).exists():
+    if thresholds is None or sidecar.find(model):
         thresholds = store.values.detach()
-    write_ply(out, splat, thresholds)
-    sidecar.path_beside(out).unlink(missing_ok=True)  # of an earlier model under this name
-    dropped, lines = None, []
+    dropped, lines, count = None, [], len(splat)
+    with staging(out) as folder:
+        new = folder / out.name
+        write_ply(new, splat, thresholds)
+        size = new.stat().st_size
+        if drop:
+            kept = visible(splat, thresholds)
+            splat = splat.keep(kept)
+            write_ply(new, splat, thresholds[kept])
+        sidecar.replace_pair(out, new, None)  # removes that of an earlier model under this name
     if drop:
-        whole, count = out.stat().st_size, len(splat)
-        kept = visible(splat, thresholds)
-        splat = splat.keep(kept)
-        write_ply(out, splat, thresholds[kept])
-        dropped = dropping(out, whole, count, len(splat))
+        dropped = dropping(out, size, count, len(splat))
         lines.append(describe_dropped(dropped, "too faint for any view"))
     lines.append(f"Wrote {out}: {len(splat)} Gaussians with {THRESHOLD_COLUMN}.")
     return Report(

@@ -19,16 +19,27 @@ from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.atomic import staging
 
 log = logging.getLogger("fragprune")
 
 
 def on_save(session: SessionState, call: SeamCall) -> Any:
-    """Write the sidecar of the file that the host wrote. Values that are not finite stop both."""
+    """Have the host write its file aside, then put file and sidecar in place, both at once.
+
+    Values that are not finite stop both.
+    """
     check_learned(session, call.model)
-    result = call.run()
-    if call.model in session.models and call.first is not None:
-        session.save(call.model, Path(call.how(call.first)))
+    if call.model not in session.models or call.first is None:
+        return call.run()
+    path, given = Path(call.how(call.first)), Path(call.first)
+    with staging(path) as folder:
+        aside = type(call.first)(folder / given.name)
+        result = call.run(**{call.seam.needs[0]: aside})
+        for other in folder.iterdir():
+            if other.name != path.name:
+                other.replace(path.with_name(other.name))
+        session.save(call.model, path, folder / path.name)
     return result
 
 
@@ -71,7 +82,7 @@ def on_unpack(session: SessionState, call: SeamCall) -> Any:
     """Keep the thresholds of an unpacked file until its model exists."""
     result = call.run()
     packed = call.how()
-    if packed is not None and sidecar.path_beside(packed[0]).exists():
+    if packed is not None and sidecar.find(packed[0]):
         file, means = packed
         session.unpacked = means, sidecar.load(file, len(means))[0]
     return result

@@ -191,11 +191,17 @@ class SessionState:
         change = PopulationChange(operation, before, len(store))
         self.plugins.tell(hookspecs.fragprune_population_changed, store=store, change=change)
 
-    def save(self, model: Any, path: Path) -> None:
+    def save(self, model: Any, path: Path, whole: Path | None = None) -> None:
         """Write a model's thresholds beside the model's file ``path``.
 
         Neutral thresholds are written in stage 2 only. A sidecar identifies files of stage 2, also
         those of a control.
+
+        Args:
+            model: the model.
+            path: its file.
+            whole: the file's new content, which replaces ``path`` together with the sidecar; see
+                ``sidecar.replace_pair``. None if ``path`` is written already.
 
         Raises:
             SessionError: the session does not know the model.
@@ -210,6 +216,8 @@ class SessionState:
         self.expect_rows(model, state, str(path))
         if state.store.neutral and not self.standing_still(model):
             # Loading would refuse the sidecar of an earlier model with this name as stale.
+            if whole is not None:
+                sidecar.replace_pair(path, whole, None)
             sidecar.path_beside(path).unlink(missing_ok=True)
         else:
             if state.stage is not None and state.stage.warming_up:
@@ -220,22 +228,24 @@ class SessionState:
                     state.stage.steps,
                     self.settings.iterations,
                 )
-            self.write_sidecar(path, state.store)
+            self.write_sidecar(path, state.store, whole)
 
-    def write_sidecar(self, path: Path, store: ThresholdStore) -> None:
-        """Write a store's sidecar beside a file and tell observers.
+    def write_sidecar(self, path: Path, store: ThresholdStore, whole: Path | None = None) -> None:
+        """Write a store's sidecar beside a file and tell observers; see ``save``.
 
         Raises:
             DivergedError: thresholds are not finite.
         """
-        written = sidecar.save(
-            path,
-            store,
-            adapter=self.adapter.name,
-            host_commit=self.repo.commit,
-            settings=self.settings.as_dict(),
-        )
-        self.plugins.tell(hookspecs.fragprune_saved, path=written)
+        about: dict[str, Any] = {
+            "adapter": self.adapter.name,
+            "host_commit": self.repo.commit,
+            "settings": self.settings.as_dict(),
+        }
+        if whole is None:
+            sidecar.save(path, store, **about)
+        else:
+            sidecar.replace_pair(path, whole, store, **about)
+        self.plugins.tell(hookspecs.fragprune_saved, path=sidecar.path_beside(path))
 
     def load(self, model: Any, path: Path) -> None:
         """Load a model's thresholds from the sidecar of ``path``, the file that the host just read.

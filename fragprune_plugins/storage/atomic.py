@@ -1,41 +1,132 @@
-"""Writing files so that an existing one is never left half-written."""
+"""Writing files so that an existing one is never left half-written, whatever ends the process.
+
+Everything on its way to a file NAME is called ``.fragprune-KEY-...`` in the same folder, KEY being
+made from NAME. Whoever writes holds the lock ``.fragprune-KEY-lock``, which the system frees when
+the process dies: what lies there beside a free lock was left by a dead process, and is removed.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
+import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from fragprune_plugins.errors import OutputError
 
+try:
+    import fcntl
+except ImportError:  # no such locks on Windows: two writers are not kept apart there
+    fcntl = None  # type: ignore[assignment]
+
+WAIT = 60.0
+"""Seconds to wait for another process that writes the same file."""
+
+_WITHOUT_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
+
+
+def in_flight(path: Path, what: str) -> Path:
+    """The name, in the same folder, of something that is on its way to a file."""
+    path = Path(path)
+    key = hashlib.sha256(path.name.casefold().encode(errors="surrogatepass")).hexdigest()
+    return path.with_name(f".fragprune-{key[:12]}-{what}")
+
+
+def all_in_flight(path: Path, what: str) -> list[Path]:
+    """What lies in the folder under the names that ``in_flight`` gives for a pattern."""
+    with contextlib.suppress(OSError):  # an unreadable folder holds nothing of ours
+        return sorted(Path(path).parent.glob(in_flight(path, what).name))
+    return []
+
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder. On success it is renamed to ``path``.
+def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
+    """Keep other processes from writing a file inside the block.
 
-    If anything fails inside, ``path`` stays as it was and the temporary file is removed.
+    Args:
+        path: the file, which need not exist; its folder must.
+        wait: seconds to wait for another process; None for ``WAIT``.
+
+    Yields:
+        Whether it is locked; False where the file system has no locks.
 
     Raises:
-        OutputError: the folder or file cannot be written.
+        OutputError: another process holds the lock.
+    """
+    name = in_flight(path, "lock")
+    handle = _taken(name, path, time.monotonic() + (WAIT if wait is None else wait))
+    try:
+        yield handle is not None
+    finally:
+        if handle is not None:
+            name.unlink(missing_ok=True)  # first: whoever waits then finds that it is another file
+            os.close(handle)
+
+
+def _taken(name: Path, path: Path, deadline: float) -> int | None:
+    """An open handle of the lock file, locked; None where there are no locks."""
+    while fcntl is not None:
+        handle, taken = os.open(name, os.O_RDWR | os.O_CREAT, 0o666), False
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            taken = _is_named(handle, name)
+            if taken:
+                return handle
+        except BlockingIOError as error:
+            if time.monotonic() > deadline:
+                raise OutputError(
+                    str(path),
+                    "being written by another process",
+                    "one process at a time",
+                    "Wait for the other process, or choose another output.",
+                ) from error
+            time.sleep(0.02)
+        except OSError as error:
+            if error.errno not in _WITHOUT_LOCKS:
+                raise
+            name.unlink(missing_ok=True)
+            return None
+        finally:
+            if not taken:
+                os.close(handle)
+    return None
+
+
+def _is_named(handle: int, name: Path) -> bool:
+    """Whether an open file is still the one with this name; its last holder removes the name."""
+    try:
+        return os.path.samestat(os.fstat(handle), os.stat(name))
+    except FileNotFoundError:
+        return False
+
+
+@contextlib.contextmanager
+def staging(path: Path) -> Iterator[Path]:
+    """Yield an empty folder beside a file, for what is to replace it; the file is locked meanwhile.
+
+    The folder is removed at the end, and so are folders that dead processes left. Its permissions
+    are private, those of the files in it are a plain ``open``'s.
+
+    Raises:
+        OutputError: the place cannot be written, or another process writes the file.
     """
     path = Path(path)
-    temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix
-        )
-        os.close(handle)
-        temporary = Path(name)
-        yield temporary
-        # mkstemp makes private files; give this one the permissions a plain open() would.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        os.replace(temporary, path)
+        with locked(path) as alone:
+            for left in all_in_flight(path, "new-*") if alone else ():
+                shutil.rmtree(left, ignore_errors=True)
+            prefix = in_flight(path, "new-").name
+            folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=prefix))
+            try:
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
     except OSError as error:
         raise OutputError(
             str(path),
@@ -43,9 +134,50 @@ def replacing(path: Path) -> Iterator[Path]:
             "a writable place",
             "Choose another output, or free space and permissions there.",
         ) from error
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
+    """Yield the path of a file to write. On success it becomes ``path``, in one step.
+
+    If anything fails inside, ``path`` stays as it was.
+
+    Args:
+        path: the file.
+        durable: after the block it also survives a power cut, which takes some milliseconds more.
+
+    Raises:
+        OutputError: the folder or file cannot be written, or another process writes the file.
+    """
+    with staging(path) as folder:
+        new = folder / Path(path).name
+        yield new
+        if durable:
+            put(new, path)
+        else:
+            os.replace(new, path)
+
+
+def put(new: Path, path: Path) -> None:
+    """Rename a finished file so that even a power cut leaves the old one or the new one, whole."""
+    with open(new, "rb") as file:
+        os.fsync(file.fileno())
+    rename(new, path)
+
+
+def rename(old: Path, new: Path) -> None:
+    """Rename a file that is on the disk; when this returns, so is its new name.
+
+    What the system cannot bring onto the disk at once, such as the names in some network folders,
+    it brings there in its own time.
+    """
+    os.replace(old, new)
+    with contextlib.suppress(OSError):
+        handle = os.open(Path(new).parent, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def writable_folder(path: Path) -> Path:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -46,18 +44,41 @@ def load(
         ModelFileError: the model cannot be read.
         SidecarError: the sidecar is lost, broken, another model's, or has another number of rows.
     """
+    from fragprune_plugins.errors import SidecarError
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.storage import sidecar
     from fragprune_plugins.storage.ply import read_ply
 
     path = Path(path)
-    splat = read_ply(path, filtered=filtered).to(device)
-    store = ThresholdStore(len(splat), device)
-    if truncation and sidecar.lies_beside(path):
-        store, _ = sidecar.load(path, len(splat), device)
-    elif truncation and splat.thresholds is not None:
-        store = ThresholdStore.from_falloff(splat.thresholds)
-    return Model(splat, None if store.neutral else store)
+    while True:  # until nobody replaced the pair meanwhile
+        before = _versions(path)
+        try:
+            splat = read_ply(path, filtered=filtered).to(device)
+            store = ThresholdStore(len(splat), device)
+            if truncation and sidecar.lies_beside(path):
+                store, _ = sidecar.load(path, len(splat), device)
+            elif truncation and splat.thresholds is not None:
+                store = ThresholdStore.from_falloff(splat.thresholds)
+        except SidecarError:
+            if _versions(path) == before:
+                raise
+        else:
+            if _versions(path) == before:
+                return Model(splat, None if store.neutral else store)
+
+
+def _versions(path: Path) -> list[tuple[int, ...] | None]:
+    """What changes when another process replaces a model or its sidecar."""
+    from fragprune_plugins.storage import sidecar
+
+    found: list[tuple[int, ...] | None] = []
+    for each in (path, sidecar.path_beside(path)):
+        try:
+            stat = each.stat()
+            found.append((stat.st_ino, stat.st_mtime_ns, stat.st_size))
+        except OSError:
+            found.append(None)
+    return found
 
 
 def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = None) -> Path:
@@ -80,7 +101,7 @@ def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = No
     from fragprune_plugins.errors import AlignmentError, OutputError
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.storage import sidecar
-    from fragprune_plugins.storage.atomic import replacing, writable_folder
+    from fragprune_plugins.storage.atomic import staging
     from fragprune_plugins.storage.ply import write_ply
 
     path, (splat, store) = Path(path), model
@@ -94,13 +115,8 @@ def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = No
             f"{len(splat)}, one per Gaussian",
             "Pass the store of this very model.",
         )
-    folder = writable_folder(path.parent)
-    target = sidecar.path_beside(path)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".fragprune-") as scratch:
-        whole = Path(scratch) / path.name
+    with staging(path) as folder:
+        whole = folder / path.name
         write_ply(whole, splat, marked=not store.neutral)
-        beside = sidecar.save(whole, store, settings=settings)
-        with replacing(target) as new_sidecar, replacing(path) as new_model:
-            os.replace(beside, new_sidecar)
-            os.replace(whole, new_model)
-    return target
+        sidecar.replace_pair(path, whole, store, settings=settings)
+    return sidecar.path_beside(path)

@@ -47,7 +47,7 @@ def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
     """
     target = path_beside(model)
     content = {"format": FORMAT, "command": command, "data": data}
-    with replacing(target) as temporary:
+    with replacing(target, durable=True) as temporary:
         temporary.write_text(json.dumps(strict(content), indent=1) + "\n", encoding="utf-8")
     return target
 

@@ -3,6 +3,11 @@
 ``point_cloud.ply`` gets ``point_cloud.fragprune.safetensors``. Its metadata names the model file's
 digest and row count, so a pair that does not match is refused. The host's file stays as the host
 wrote it. A PLY that fragprune writes has a mark in its header, so a missing sidecar is noticed.
+
+``replace_pair`` renames twice, and the renaming of the model is what counts. Before it, a sidecar
+whose model is not there yet lies under an address that the model's digest gives; after it, the
+sidecar moves to its usual name. A reader looks at the address first. So model and sidecar always
+belong together, whatever ends the process: both are the old ones, or both are the new ones.
 """
 
 from __future__ import annotations
@@ -18,7 +23,14 @@ import torch
 from fragprune_plugins.errors import SidecarError
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage.atomic import digest, replacing
+from fragprune_plugins.storage.atomic import (
+    all_in_flight,
+    digest,
+    in_flight,
+    put,
+    rename,
+    replacing,
+)
 from fragprune_plugins.storage.ply import is_marked
 from fragprune_plugins.storage.reading import Door, parse_json
 
@@ -56,16 +68,16 @@ def lies_beside(model: Path) -> bool:
     Raises:
         SidecarError: it has none, but was saved with one.
     """
-    path = path_beside(model)
-    if not path.exists() and is_marked(model):
+    path = find(model)
+    if path is None and is_marked(model):
         raise SidecarError(
-            str(path),
+            str(path_beside(model)),
             f"no such file, though {Path(model).name} was saved with thresholds beside it",
             "its sidecar, under this name",
             "Copy it here, and always rename both files together. "
             "Or pass --no-truncation to commands that have it.",
         )
-    return path.exists()
+    return path is not None
 
 
 def belongs(model: Path) -> bool:
@@ -74,7 +86,18 @@ def belongs(model: Path) -> bool:
     Raises:
         SidecarError: the sidecar cannot be read.
     """
-    return path_beside(model).exists() and _read(model)[1].model_sha256 == digest(model)
+    path = find(model)
+    return path is not None and _read(model, path)[1].model_sha256 == digest(model)
+
+
+def find(model: Path) -> Path | None:
+    """The sidecar to read with a model file: at the address of its content, else beside it."""
+    model, path = Path(model), path_beside(model)
+    if (waiting := all_in_flight(model, _ADDRESSES)) and model.is_file():
+        addressed = _address(model, digest(model))
+        if addressed in waiting:
+            return addressed
+    return path if path.exists() else None
 
 
 def save(
@@ -85,31 +108,98 @@ def save(
     host_commit: str = "",
     settings: dict[str, Any] | None = None,
 ) -> Path:
-    """Write the store beside an existing model file; returns the sidecar's path.
+    """Write the store beside an existing model file, which stays; returns the sidecar's path.
 
     Raises:
         DivergedError: learned values are not finite.
         OutputError: the file cannot be written.
     """
+    target = path_beside(model)
+    with replacing(target, durable=True) as new:
+        info = SidecarInfo(len(store), digest(model), adapter, host_commit, settings or {})
+        _write(new, store, info)
+    return target
+
+
+def replace_pair(
+    path: Path,
+    whole: Path,
+    store: ThresholdStore | None,
+    *,
+    adapter: str = "",
+    host_commit: str = "",
+    settings: dict[str, Any] | None = None,
+) -> None:
+    """Put a finished model file and its thresholds in the place of a model and its sidecar.
+
+    A process that ends in between, or a power cut, leaves the old pair or the new one.
+
+    Args:
+        path: of the model.
+        whole: the finished file, in a folder that ``atomic.staging`` gave for ``path``.
+        store: its thresholds; None for a model without a sidecar.
+        adapter, host_commit, settings: as ``SidecarInfo`` has them.
+
+    Raises:
+        DivergedError: learned values are not finite; the old pair stays.
+        OSError: a file cannot be written; the old pair stays, or the new one is there.
+    """
+    beside = path_beside(path)
+    _tidy(path)
+    try:
+        if store is not None:
+            sha = digest(whole)
+            info = SidecarInfo(len(store), sha, adapter, host_commit, settings or {})
+            new = whole.with_name(beside.name)
+            _write(new, store, info)
+            put(new, _address(path, sha))
+        elif beside.exists():  # it stays with the old model for as long as that is there
+            rename(beside, _address(path, digest(path) if path.is_file() else "none"))
+        put(whole, path)
+    finally:
+        _tidy(path)
+
+
+def _tidy(model: Path) -> None:
+    """Move a model's sidecar from its address to its usual name, and remove all other addresses."""
+    waiting = all_in_flight(model, _ADDRESSES)
+    addressed = _address(model, digest(model)) if waiting and model.is_file() else None
+    for each in waiting:
+        if each == addressed:
+            rename(each, path_beside(model))
+        else:
+            each.unlink()
+
+
+_ADDRESSES = "for-*"
+
+
+def _address(model: Path, sha: str) -> Path:
+    """Where a sidecar lies whose model has this digest and is not, or no longer, in place."""
+    return in_flight(model, f"for-{sha[:32]}")
+
+
+def _write(path: Path, store: ThresholdStore, info: SidecarInfo) -> None:
+    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
-    expect_finite(store.numbers, str(path_beside(model)))
+    expect_finite(store.numbers, str(path_beside(path)))
     state = store.state_dict()
     tensors = {k: v.cpu().contiguous() for k, v in state.items() if isinstance(v, torch.Tensor)}
     metadata = {
         "format": FORMAT,
-        "rows": str(len(store)),
-        "model_sha256": digest(model),
+        "rows": str(info.rows),
+        "model_sha256": info.model_sha256,
         "adam_step": repr(state["adam_step"]),
         "steps": str(state["steps"]),
-        "adapter": adapter,
-        "host_commit": host_commit,
-        "settings": json.dumps(settings or {}, sort_keys=True),
+        "adapter": info.adapter,
+        "host_commit": info.host_commit,
+        "settings": json.dumps(info.settings, sort_keys=True),
     }
-    target = path_beside(model)
-    with replacing(target) as temporary:
-        save_file(tensors, temporary, metadata=metadata)
-    return target
+    try:
+        save_file(tensors, path, metadata=metadata)
+    except SafetensorError as error:  # that is how it says that the disk is full
+        raise OSError(str(error)) from error
 
 
 def load(
@@ -127,7 +217,7 @@ def load(
         SidecarError: missing, unreadable, not finite, written for another model file, or of other
             rows than the model.
     """
-    state, info = _read(model)
+    state, info = _read(model, find(model) or path_beside(model))
     shape, wanted = tuple(state["logits"].shape), digest(model)
     if wanted != info.model_sha256 or shape != (info.rows,):
         raise SidecarError(
@@ -152,13 +242,13 @@ def _remedy(model: Path) -> str:
     return f"Remove {path_beside(model).name}, or write it again with fragprune finetune."
 
 
-def _read(model: Path) -> tuple[dict[str, Any], SidecarInfo]:
+def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
     """Read a sidecar's store state and metadata, without a look at the model beside it."""
     from safetensors import safe_open
 
     remedy = _remedy(model)
     door = Door(SidecarError, "unreadable", f"a file of format {FORMAT}", remedy, missing=remedy)
-    with door.reading(path_beside(model)) as reading:
+    with door.reading(path) as reading:
         reading.place = "its header"
         with safe_open(reading.path, framework="pt") as file:
             reading.place = "its metadata"

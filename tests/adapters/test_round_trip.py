@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from miniatures.vanilla_3dgs import joint
 
-from fragprune_plugins.errors import SidecarError
+from fragprune_plugins.errors import OutputError, SidecarError
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply, write_ply
 
@@ -43,3 +43,24 @@ def test_a_model_that_lost_its_sidecar_is_not_loaded_without_it(tmp_path):
         sidecar.path_beside(path).unlink()
         with pytest.raises(SidecarError, match="saved with thresholds beside it"):
             host.model(5).load_ply(str(path))
+
+
+def test_a_save_that_is_cut_off_leaves_the_pair_before(tmp_path, monkeypatch):
+    path, written = tmp_path / "point_cloud.ply", []
+
+    def cut_off(whole, *_):
+        written.extend(each.name for each in whole.parent.iterdir())
+        raise OSError(28, "No space left on device")
+
+    with joint() as host:
+        model = trained(host)
+        model.save_ply(str(path))
+        before = path.read_bytes()
+        host.step(model, host.camera(), 4)
+        monkeypatch.setattr(sidecar, "_write", cut_off)
+        with pytest.raises(OutputError, match="No space left"):
+            model.save_ply(str(path))
+    assert written == [path.name]  # the host had written its file
+    assert path.read_bytes() == before
+    assert sidecar.belongs(path)
+    assert len(list(tmp_path.iterdir())) == 2
