@@ -60,6 +60,12 @@ class SidecarError(FragpruneError):
     code = "sidecar"
 
 
+class CheckpointError(FragpruneError):
+    """A fine-tuning's checkpoint that is broken, not finite, or of another fine-tuning."""
+
+    code = "checkpoint"
+
+
 class OutputError(FragpruneError):
     """A place that cannot be written."""
 

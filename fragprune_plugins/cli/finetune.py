@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +22,11 @@ from fragprune_plugins.cli.common import (
     require_place,
 )
 from fragprune_plugins.cli.learning import learning_options
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import RecordError, SidecarError, UsageError
 from fragprune_plugins.learning.interruption import EXIT_CODE, sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import models
+from fragprune_plugins.storage.atomic import locked
 
 if TYPE_CHECKING:
     from fragprune_plugins.datasets.dataset import Dataset
@@ -68,6 +70,19 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Leave out Gaussians that reach no pixel of any training or held-out view.",
 )
+@click.option(
+    "--checkpoint-every",
+    "every",
+    type=click.FloatRange(min=0),
+    default=300.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Keep the unfinished fine-tuning in OUT.fragprune-unfinished; 0 keeps it at Ctrl-C and "
+    "SIGTERM only.",
+)
+@click.option(
+    "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
+)
 @engine_options
 def command(
     model: Path,
@@ -82,6 +97,8 @@ def command(
     no_truncation: bool,
     curves: Path | None,
     drop: bool,
+    every: float,
+    again: bool,
     engine: str,
     device: str,
     threads: int | None,
@@ -93,6 +110,9 @@ def command(
     MODEL, and the thresholds go beside it into OUT.fragprune.safetensors. The table compares both
     models on held-out views. A line below it measures OUT without its thresholds, as other viewers
     draw it. Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
+
+    The same command goes on where it was interrupted or killed. If OUT is finished already, it says
+    so and does nothing; --again begins anew.
 
     With --self no photograph is read: MODEL's own pictures are what it must go on showing, also
     between the cameras. PSNR is against those pictures then. The defaults are 1000 iterations at
@@ -108,11 +128,12 @@ def command(
     """
     _require_target(data, itself, cameras, settings)
     require_place(out, model)
+    click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
     from copy import deepcopy
 
     from fragprune_plugins.datasets.photographs import Photographs, Resolution
-    from fragprune_plugins.finetuning import finetune, load_dataset, save
+    from fragprune_plugins.finetuning import Checkpoints, finetune, load_dataset, resuming, save
     from fragprune_plugins.measure import Candidate, drop_invisible, measure
     from fragprune_plugins.measure.wording import describe, outcome
     from fragprune_plugins.storage import records, sidecar
@@ -135,8 +156,26 @@ def command(
         assert data is not None
         dataset = load_dataset(data, resolution=resolution, white_background=white_background)
 
+    checkpoints = Checkpoints(
+        resuming.path_beside(out), every or None, tell=partial(click.echo, err=True)
+    )
+    asked = resuming.configuration(splat, store, dataset, settings, rasterizer.name)
+    asked["drop_invisible"] = drop
+    if again:
+        checkpoints.clear()
+    elif (finished := _finished(out, asked)) is not None:
+        checkpoints.clear()
+        return finished
     with sigterm_interrupts():
-        result = finetune(splat, dataset, settings, store=store, engine=rasterizer, progress=True)
+        result = finetune(
+            splat,
+            dataset,
+            settings,
+            store=store,
+            engine=rasterizer,
+            progress=True,
+            checkpoints=checkpoints,
+        )
         save(out, result)
     done = result.progress
     if result.terminated:  # after SIGTERM there is no time for measurements
@@ -169,6 +208,8 @@ def command(
         "speedup": done.speedup,
         "target_reached": done.target_reached,
         "interrupted": result.interrupted,
+        "resumed_at": result.resumed_at,
+        "already_finished": False,
         "iterations": done.steps,
         "pressure": done.pressure if settings.truncate else None,
         "train_seconds": result.train_seconds,
@@ -188,13 +229,15 @@ def command(
         f"{result.train_seconds:.0f} s.",
     ]
     if result.interrupted:
-        lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations.")
+        lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations. {_GOES_ON}")
     if dropped:
         lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(views)} views"))
     lines += [_describe_untruncated(before, plain) for plain in without]
     together = " Keep the two together." if without else ""
     lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
     more: dict[str, Any] = {"curves": rows}
+    if not result.interrupted:
+        more["configuration"] = asked
     if data is not None:
         more["photographs"] = Photographs(
             data, Resolution(resolution), white_background
@@ -204,7 +247,37 @@ def command(
             "drawing": {},
         }
     records.leave(out, "finetune", report | more)
+    if not result.interrupted:
+        checkpoints.clear()  # not before: a kill while measuring goes on from it too
     return Report(report, "\n".join(lines), exit_code=130 if result.interrupted else 0)
+
+
+_GOES_ON = "The same command goes on from there."
+
+
+def _finished(out: Path, asked: dict[str, Any]) -> Report | None:
+    """The report of the same command, if it has written ``out`` already; else None."""
+    from fragprune_plugins.measure.wording import outcome
+    from fragprune_plugins.storage import records, sidecar
+
+    if not out.is_file():
+        return None
+    try:
+        record = records.beside(out)
+        done = record is not None and record.command == "finetune" and sidecar.belongs(out)
+    except (RecordError, SidecarError):
+        return None
+    if record is None or not done or record.data.get("configuration") != asked:
+        return None
+    data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
+    text = (
+        f"{out} is finished: this command has written it before, and nothing was done. To fine-tune "
+        f"again, add --again.\n{outcome('finetune', data, data['control'])}"
+    )
+    return Report(data | {"already_finished": True}, text)
+
+
+_OF_RECORDS = {"curves", "photographs", "configuration"}
 
 
 def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:
@@ -221,7 +294,10 @@ def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:
         "engine": result.engine,
         "settings": asked.as_dict(),
     }
-    text = f"SIGTERM at {done.steps} of {asked.iterations} iterations. Wrote {out} and its sidecar."
+    text = (
+        f"SIGTERM at {done.steps} of {asked.iterations} iterations. Wrote {out} and its sidecar. "
+        f"{_GOES_ON}"
+    )
     return Report(data, text, exit_code=EXIT_CODE)
 
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.errors import AlignmentError, CheckpointError, SidecarError
+from fragprune_plugins.finetuning.resuming import Checkpoints, configuration
 from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.learning.interruption import Terminate
+from fragprune_plugins.learning.interruption import Terminate, between_steps
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Progress, Stage2
@@ -33,6 +36,8 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs
 # tenth of these rates for shapes cut fewer fragments at no better PSNR.
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+_UNFIT = (KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError)
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 
 
@@ -50,6 +55,7 @@ class FinetuneResult:
         engine: the engine's name.
         interrupted: Ctrl-C or SIGTERM ended it early; the result is what was learned until then.
         terminated: SIGTERM ended it.
+        resumed_at: steps that came out of a checkpoint; 0 without one.
     """
 
     model: SplatFile
@@ -61,6 +67,7 @@ class FinetuneResult:
     engine: str
     interrupted: bool
     terminated: bool
+    resumed_at: int = 0
 
     __repr__ = one_line
 
@@ -80,6 +87,7 @@ def finetune(
     rule: Callable[[Tensor], Tensor] | None = None,
     engine: str | Engine = "auto",
     progress: bool = False,
+    checkpoints: Checkpoints | None = None,
 ) -> FinetuneResult:
     """Learn the thresholds of a trained splat on its photographs.
 
@@ -98,9 +106,13 @@ def finetune(
             on fragments: the settings' pressure and target have no effect.
         engine: a name or an engine.
         progress: draw a bar on stderr.
+        checkpoints: where the unfinished fine-tuning is kept. If there is one of the same
+            configuration, this goes on from it; on the cpu engine the result is then the same to
+            the bit. Whoever saves the result clears them.
 
     Raises:
         EngineError: no such engine here.
+        CheckpointError: the checkpoint is broken, or another fine-tuning's.
         PluginError: a plugin raised, or gave an answer that cannot be used.
         AlignmentError: store and model differ in length.
         DivergedError: NaN or infinity in what trains.
@@ -126,12 +138,14 @@ def finetune(
         rule,
         engine_for(engine, device) if isinstance(engine, str) else engine,
     )
-    started = time.perf_counter()
-    interrupted = terminated = False
+    run.start_keeping(checkpoints)
+    resumed, interrupted, terminated = run.done, False, False
     try:
         run.learn(progress)
     except KeyboardInterrupt as error:
         interrupted, terminated = True, isinstance(error, Terminate)
+        if run.between:
+            run.keep()
     run.stage.check()
     return FinetuneResult(
         model=run.result_model(),
@@ -139,10 +153,11 @@ def finetune(
         settings=settings,
         curves=run.curves,
         progress=replace(run.stage.progress(), steps=run.done),
-        train_seconds=time.perf_counter() - started,
+        train_seconds=run.seconds,
         engine=run.engine.name,
         interrupted=interrupted,
         terminated=terminated,
+        resumed_at=resumed,
     )
 
 
@@ -182,10 +197,13 @@ class _Run:
         rule: Callable[[Tensor], Tensor] | None,
         engine: Engine,
     ) -> None:
+        self._initial = model
         self.dataset, self.settings, self.engine = dataset, settings, engine
         self.rule = rule
         self.curves: list[StepStats] = []
-        self.done = 0
+        self.done, self.between = 0, True
+        self._started = time.perf_counter()
+        self.checkpoints: Checkpoints | None = None
         again = {shot: partial(self._draw, shot) for shot in dataset.train}
         self.stage = Stage2(
             store,
@@ -216,16 +234,101 @@ class _Run:
             self.model, **{name: getattr(self.model, name).detach() for name in self.rates}
         )
 
+    @property
+    def seconds(self) -> float:
+        """Wall-clock seconds of all steps, also of those before a checkpoint."""
+        return time.perf_counter() - self._started
+
+    def start_keeping(self, checkpoints: Checkpoints | None) -> None:
+        """Go on from a checkpoint, if there is one, and write one from time to time."""
+        if checkpoints is None:
+            return
+        self.checkpoints = checkpoints
+        self.asked = configuration(
+            self._initial, self.stage.store, self.dataset, self.settings, self.engine.name
+        )
+        tensors, values = checkpoints.load(self.asked, self._initial.xyz.device)
+        if not values:
+            return
+        try:
+            self._load(tensors, values)
+        except (*_UNFIT, SidecarError) as error:
+            raise CheckpointError(
+                str(checkpoints.path),
+                f"parts that do not fit together ({error})",
+                "what a fine-tuning wrote",
+                "Begin anew with --again.",
+            ) from error
+        checkpoints.tell(
+            f"resuming at step {self.done} of {self.settings.iterations}, from {checkpoints.path}"
+        )
+        if values["threads"] != torch.get_num_threads():
+            checkpoints.tell(
+                f"it was begun on {values['threads']} threads, and goes on on "
+                f"{torch.get_num_threads()}: the last bits of the result may differ"
+            )
+
+    def keep(self) -> None:
+        """Write a checkpoint, between two steps."""
+        if self.checkpoints is None or self.done == 0:
+            return
+        self.stage.check()
+        tensors, values = self.stage.state_dict()
+        for name in self.rates:
+            parameter = getattr(self.model, name)
+            tensors[f"model.{name}"] = parameter
+            moments = self.optimizer.state[parameter]
+            for moment in _MOMENTS:
+                tensors[f"{moment}.{name}"] = moments[moment]
+        points = [astuple(point) for point in self.curves]
+        tensors["curves"] = torch.tensor(points, dtype=torch.float64).reshape(len(points), -1)
+        values |= {
+            "configuration": self.asked,
+            "done": self.done,
+            "seconds": self.seconds,
+            "threads": torch.get_num_threads(),
+        }
+        self.checkpoints.save(tensors, values)
+
+    def _load(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
+        self.stage.load_state_dict(tensors, values)
+        if len(self.stage.store) != len(self.model):
+            raise ValueError(f"{len(self.stage.store)} thresholds of {len(self.model)} Gaussians")
+        for name in self.rates:
+            parameter = getattr(self.model, name)
+            parameter.data.copy_(tensors[f"model.{name}"])
+            state: dict[str, Tensor] = {"step": torch.tensor(float(values["done"]))}
+            for moment in _MOMENTS:
+                state[moment] = torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
+            self.optimizer.state[parameter] = state
+        for row in tensors["curves"].tolist():
+            self.curves.append(StepStats(int(row[0]), *row[1:]))
+        self.done = int(values["done"])
+        self._started -= values["seconds"]
+
     def learn(self, progress: bool) -> None:
-        """All steps."""
+        """All steps that are not done yet."""
         from tqdm import tqdm
 
         total = self.settings.iterations
-        with tqdm(
-            total=total, disable=not progress, desc="fine-tuning", unit="it", leave=None
-        ) as bar:
-            for shot in self._order():
+        with (
+            tqdm(
+                total=total,
+                initial=self.done,
+                disable=not progress,
+                desc="fine-tuning",
+                unit="it",
+                leave=None,
+            ) as bar,
+            between_steps() as interrupted,
+        ):
+            for shot in islice(self._order(), self.done, None):
+                self.between = False
                 self._learn_from(shot)
+                self.between = True
+                interrupted()
+                if self.checkpoints is not None and self.checkpoints.due(self.done):
+                    self.keep()
                 bar.update()
                 if self.curves and self.done % max(1, total // _POSTFIXES) == 0:
                     last = self.curves[-len(self.dataset.train) :]  # views differ more than steps

@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 EXIT_CODE = 128 + signal.SIGTERM
@@ -41,3 +41,38 @@ def sigterm_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def between_steps() -> Iterator[Callable[[], None]]:
+    """Inside, Ctrl-C and SIGTERM wait until the yielded function is called, between two steps.
+
+    So what is kept then is the state after a whole step. A second signal does not wait. Outside the
+    main thread the block changes nothing.
+    """
+    process, waiting = os.getpid(), list[tuple[int, FrameType | None]]()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    main = threading.current_thread() is threading.main_thread()
+    known = {n: each for n, each in before.items() if main and callable(each)}
+
+    def wait(number: int, frame: FrameType | None) -> None:
+        again = bool(waiting)
+        waiting.append((number, frame))
+        if again or os.getpid() != process:  # a worker that was forked off has no steps
+            now()
+
+    def now() -> None:
+        if waiting:
+            number, frame = waiting.pop()
+            waiting.clear()
+            known[signal.Signals(number)](number, frame)
+
+    for number in known:
+        signal.signal(number, wait)
+    try:
+        yield now
+    finally:
+        for number, handler in known.items():
+            if signal.getsignal(number) is wait:
+                signal.signal(number, handler)
+    now()

@@ -42,6 +42,8 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs
 CURVE_POINTS = 100
 """Thresholds' median, a sort of all rows, is taken this often in a run."""
 
+_COUNTED = ("steps", "taken", "_open", "_held", "_met", "_median")
+
 Truncate = Callable[[RasterInputs, ThresholdStore], Tensor | None]
 """Gives the thresholds (N,) to draw one rasterization with; None draws without."""
 
@@ -267,6 +269,41 @@ class Stage2:
             target_reached=reached,
             pressure=self.pressure.value,
         )
+
+    def state_dict(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Tensors and plain values from which ``load_state_dict`` goes on, between two steps.
+
+        They hold the thresholds, but nothing that the driver owns.
+        """
+        self.close()
+        number = {view: index for index, view in enumerate(self._again)}
+        tensors = self.store.state_dict()
+        plain: dict[str, Any] = {"store": [tensors.pop("adam_step"), tensors.pop("steps")]}
+        for name, figures in (("before", self._before), ("after", self._after)):
+            known = {(number[v], part): each for (v, part), each in figures.items() if v in number}
+            plain[name] = list(known)
+            if known:
+                tensors[name] = torch.stack([figure.reshape(()) for figure in known.values()])
+        pressure = {k: v for k, v in vars(self.pressure).items() if isinstance(v, int | float)}
+        plain |= {name: getattr(self, name) for name in _COUNTED}
+        return tensors, plain | {"expected": self._views.expected, "pressure": pressure}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> None:
+        """Go on where ``state_dict`` was called, with the same settings and views, to the bit.
+
+        Raises:
+            SidecarError: the thresholds' parts do not fit together, or are not finite.
+        """
+        adam_step, steps = plain["store"]
+        self.store.load_state_dict({**tensors, "adam_step": adam_step, "steps": steps})
+        views = list(self._again)
+        for name, figures in (("before", self._before), ("after", self._after)):
+            for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):
+                figures[views[view], part] = figure
+        for name in _COUNTED:
+            setattr(self, name, plain[name])
+        self._views.expected = plain["expected"]
+        vars(self.pressure).update(plain["pressure"])
 
     def _meet_target(self, progress: float) -> None:
         """Late in the run, and again before its last step, shift all thresholds onto the target."""

@@ -45,12 +45,13 @@ def all_in_flight(path: Path, what: str) -> list[Path]:
 
 
 @contextlib.contextmanager
-def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
-    """Keep other processes from writing a file inside the block.
+def locked(path: Path, wait: float | None = None, what: str = "lock") -> Iterator[bool]:
+    """Keep other processes out of the same block for the same file.
 
     Args:
         path: the file, which need not exist; its folder must.
         wait: seconds to wait for another process; None for ``WAIT``.
+        what: tells locks of one file apart; "lock" is for writing it.
 
     Yields:
         Whether it is locked; False where the file system has no locks.
@@ -58,7 +59,7 @@ def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
     Raises:
         OutputError: another process holds the lock.
     """
-    name = in_flight(path, "lock")
+    name = in_flight(path, what)
     handle = _taken(name, path, time.monotonic() + (WAIT if wait is None else wait))
     try:
         yield handle is not None

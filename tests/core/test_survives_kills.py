@@ -148,7 +148,7 @@ def kill_in_a_loop(path: Path, kills: int) -> None:
 
 
 def test_random_kills_break_no_pair(tmp_path, without_waiting_for_the_disk):
-    kill_in_a_loop(tmp_path / "a.ply", 30)
+    kill_in_a_loop(tmp_path / "a.ply", 20)
 
 
 @pytest.mark.slow

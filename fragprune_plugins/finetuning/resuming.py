@@ -1,0 +1,149 @@
+"""An unfinished fine-tuning is kept in a file, from which the same fine-tuning goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from fragprune_plugins.datasets.dataset import Dataset, Photograph, Shot
+from fragprune_plugins.datasets.images import unreadable
+from fragprune_plugins.errors import CheckpointError, OutputError
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import checkpoints
+from fragprune_plugins.storage.atomic import digest
+from fragprune_plugins.storage.ply import SplatFile
+
+SUFFIX = ".fragprune-unfinished"
+EVERY = 300.0
+"""Seconds between two checkpoints."""
+
+
+def path_beside(out: Path) -> Path:
+    """Where the checkpoint of a fine-tuning lies whose result goes into a model file."""
+    return Path(out).with_suffix(SUFFIX)
+
+
+@dataclass
+class Checkpoints:
+    """Keeps an unfinished fine-tuning in a file.
+
+    Attributes:
+        path: the file; see ``path_beside``.
+        seconds: between two checkpoints; None for none but at Ctrl-C and SIGTERM.
+        steps: write one after every so many steps as well.
+        tell: is told in a sentence from which step the fine-tuning goes on.
+    """
+
+    path: Path
+    seconds: float | None = EVERY
+    steps: int | None = None
+    tell: Callable[[str], None] = lambda _: None
+    _last: float = field(default_factory=time.monotonic)
+
+    def due(self, step: int) -> bool:
+        """Whether it is time for a checkpoint after a step."""
+        if self.steps is not None and step % self.steps == 0:
+            return True
+        return self.seconds is not None and time.monotonic() - self._last >= self.seconds
+
+    def save(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
+        """Write a checkpoint. Where it cannot be written, the one before stays, and that is told.
+
+        Raises:
+            DivergedError: a tensor holds NaN or infinity.
+        """
+        try:
+            checkpoints.save(self.path, tensors, values)
+        except OutputError as error:  # the fine-tuning is worth more than its checkpoint
+            self.tell(f"no checkpoint was written. {error}")
+        self._last = time.monotonic()
+
+    def load(self, asked: dict[str, Any], device: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Read the checkpoint; ({}, {}) if there is none.
+
+        Args:
+            asked: the ``configuration`` of the fine-tuning that is to go on.
+            device: of the tensors.
+
+        Raises:
+            CheckpointError: it cannot be read, or is another fine-tuning's.
+        """
+        if not self.path.exists():
+            return {}, {}
+        tensors, values = checkpoints.load(self.path, device)
+        found = values.get("configuration", {})
+        if other := differences(found, asked):
+            raise CheckpointError(
+                str(self.path),
+                f"an unfinished fine-tuning with other {', '.join(other)}",
+                "the fine-tuning that was asked for",
+                "Repeat the command that was interrupted to finish it, or begin anew with --again.",
+            )
+        return tensors, values
+
+    def clear(self) -> None:
+        """Remove the file: the result is saved."""
+        self.path.unlink(missing_ok=True)
+
+
+def configuration(
+    model: SplatFile,
+    store: ThresholdStore | None,
+    dataset: Dataset,
+    settings: Settings,
+    engine: str,
+) -> dict[str, Any]:
+    """What decides the result of a fine-tuning, as plain values.
+
+    Args:
+        model: as it comes in.
+        store: the thresholds that it comes in with; None for neutral ones.
+        dataset: its files are read whole, for their digest.
+        settings: of the fine-tuning.
+        engine: the engine's name.
+    """
+    from fragprune_plugins import __version__
+
+    shots = (*dataset.train, *dataset.test)
+    known = {} if store is None or store.neutral else store.numbers
+    return {
+        "version": __version__,
+        "model": _digest(each for each in vars(model).values() if isinstance(each, Tensor)),
+        "thresholds": _digest(known.values()),
+        "photographs": _digest(each for shot in shots for each in _of(shot)),
+        "engine": engine,
+        "device": model.xyz.device.type,
+        **settings.as_dict(),
+    }
+
+
+def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """Names under which two configurations differ."""
+    return [key for key in sorted(one | other) if one.get(key) != other.get(key)]
+
+
+def _of(shot: Shot) -> Iterable[Tensor | str]:
+    yield f"{shot.name} {shot.view.width} {shot.view.height} {shot.target}"
+    yield from (shot.view.viewmatrix, shot.view.projmatrix, shot.view.background)
+    if isinstance(shot, Photograph):
+        try:
+            yield digest(shot.path)
+        except OSError as error:
+            raise unreadable(shot.path, error) from error
+
+
+def _digest(parts: Iterable[Tensor | str]) -> str:
+    sha = hashlib.sha256()
+    for part in parts:
+        text = part if isinstance(part, str) else f"{part.dtype} {tuple(part.shape)}"
+        sha.update(text.encode(errors="surrogatepass") + b"\0")
+        if isinstance(part, Tensor):
+            sha.update(part.detach().cpu().contiguous().numpy().tobytes())
+    return sha.hexdigest()

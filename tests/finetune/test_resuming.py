@@ -1,0 +1,246 @@
+"""A fine-tuning that was cut off goes on, and ends with the same bits as one that was not."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+import torch
+from finetune import tiny
+
+from fragprune_plugins.errors import CheckpointError, OutputError
+from fragprune_plugins.finetuning import Checkpoints, finetune, loop
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import checkpoints as files
+
+ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return tiny.random_model()
+
+
+@pytest.fixture(scope="module")
+def model(truth):
+    return tiny.perturbed(truth)
+
+
+@pytest.fixture(scope="module")
+def dataset(truth, tmp_path_factory):
+    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth)
+
+
+class Cut(BaseException):
+    """What nothing catches, as nothing catches a kill."""
+
+
+def run(model, dataset, settings, path=None, *, cut=None, monkeypatch=None, tell=None, store=None):
+    """Fine-tune, with a checkpoint every third step; ``cut`` ends it in the midst of that step."""
+    kept = None if path is None else Checkpoints(path, None, 3, tell or (lambda _: None))
+    started = store
+    if started is None and path is not None:
+        started = ThresholdStore(len(model))
+    if cut is None:
+        return finetune(model, dataset, settings, store=started, engine="cpu", checkpoints=kept)
+    calls, loss = 0, loop.photometric_loss
+
+    def cutting(*args):
+        nonlocal calls
+        calls += 1
+        if calls == cut:
+            raise Cut
+        return loss(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "photometric_loss", cutting)
+        with pytest.raises(Cut):
+            finetune(model, dataset, settings, store=started, engine="cpu", checkpoints=kept)
+    return None
+
+
+def require_same(one, other):
+    for name in ALL:
+        assert torch.equal(getattr(one.model, name), getattr(other.model, name)), name
+    for key, value in one.store.state_dict().items():
+        again = other.store.state_dict()[key]
+        assert torch.equal(value, again) if torch.is_tensor(value) else value == again, key
+    assert str(one.curves) == str(other.curves)  # also where a figure is NaN
+    assert one.progress == other.progress
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Settings(iterations=STEPS),
+        Settings(iterations=STEPS, train="opacity", pressure=1e-3),
+        Settings(iterations=STEPS, train="appearance", target_speedup=1.5),
+        Settings(iterations=STEPS, truncate=False, seed=3),
+    ],
+    ids=["all", "opacity", "target", "control"],
+)
+def test_cut_off_again_and_again_it_ends_as_if_never_cut(
+    model, dataset, tmp_path, monkeypatch, single_thread, settings
+):
+    path, told = tmp_path / "out.fragprune-unfinished", []
+    whole = run(model, dataset, settings)
+    for cut in (2, 5, 8):  # before a checkpoint, and after one or two more
+        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch, tell=told.append)
+    result = run(model, dataset, settings, path, tell=told.append)
+    assert [line.split(",")[0] for line in told] == [
+        f"resuming at step {step} of {STEPS}" for step in (3, 9)
+    ]
+    assert result.resumed_at == 9
+    require_same(whole, result)
+
+
+def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatch, single_thread):
+    from fragprune_plugins.learning import schedule
+
+    few = schedule._Recipe(4, 0.2)
+    monkeypatch.setitem(schedule._RECIPES, "all", few)  # thresholds open after 8 of 12 steps
+    whole = run(model, dataset, Settings(iterations=STEPS))
+    path = tmp_path / "out.fragprune-unfinished"
+    for cut in (5, 8):
+        run(model, dataset, Settings(iterations=STEPS), path, cut=cut, monkeypatch=monkeypatch)
+    require_same(whole, run(model, dataset, Settings(iterations=STEPS), path))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits_for_the_end_of_its_step_and_is_resumed_from_there(
+    model, dataset, tmp_path, monkeypatch, single_thread, number
+):
+    from fragprune_plugins.learning.interruption import sigterm_interrupts
+
+    settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
+    whole = run(model, dataset, settings)
+    calls, loss = 0, loop.photometric_loss
+
+    def signalled(*args):
+        nonlocal calls
+        calls += 1
+        if calls == 5:
+            os.kill(os.getpid(), number)
+        return loss(*args)
+
+    with monkeypatch.context() as patch, sigterm_interrupts():
+        patch.setattr(loop, "photometric_loss", signalled)
+        cut = run(model, dataset, settings, path)
+    assert cut.interrupted
+    assert cut.terminated == (number == signal.SIGTERM)
+    assert cut.progress.steps == 5
+    result = run(model, dataset, settings, path)
+    assert result.resumed_at == 5
+    require_same(whole, result)
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [({"pressure": 1e-3}, "pressure"), ({"seed": 1, "train": "opacity"}, "seed, train")],
+)
+def test_another_configuration_is_refused_and_named(
+    model, dataset, tmp_path, monkeypatch, changed, named
+):
+    path = tmp_path / "out.fragprune-unfinished"
+    run(model, dataset, Settings(iterations=STEPS), path, cut=5, monkeypatch=monkeypatch)
+    before = path.read_bytes()
+    with pytest.raises(CheckpointError, match=f"with other {named}; "):
+        run(model, dataset, Settings(iterations=STEPS, **changed), path)
+    assert path.read_bytes() == before
+
+
+def test_another_model_photographs_or_thresholds_are_refused(
+    model, truth, dataset, tmp_path, monkeypatch
+):
+    settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
+    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch)
+    with pytest.raises(CheckpointError, match="other model;"):
+        run(truth, dataset, settings, path)
+    darker = tiny.dataset_in_memory(tmp_path, tiny.random_model(seed=3))
+    with pytest.raises(CheckpointError, match="other photographs;"):
+        run(model, darker, settings, path)
+    learned = ThresholdStore.from_falloff(torch.full((len(model),), 0.1))
+    with pytest.raises(CheckpointError, match="other thresholds;"):
+        run(model, dataset, settings, path, store=learned)
+
+
+def spoil(path, how):
+    tensors, values = files.load(path)
+    if how == "cut off":
+        path.write_bytes(path.read_bytes()[:-9])
+    elif how == "empty":
+        path.write_bytes(b"")
+    elif how == "foreign":
+        from safetensors.torch import save_file
+
+        save_file({"logits": torch.zeros(3)}, path)
+    elif how == "a part is missing":
+        files.save(path, {k: v for k, v in tensors.items() if k != "model.opacity"}, values)
+    elif how == "other rows":
+        files.save(path, tensors | {"model.opacity": torch.zeros(3, 1)}, values)
+    elif how.startswith("negative second moments"):
+        name = "exp_avg_sq" + how.removeprefix("negative second moments")
+        files.save(path, tensors | {name: tensors[name] - 1}, values)
+    elif how == "fewer thresholds":
+        few = {key: tensors[key][:5] for key in ("logits", "exp_avg", "exp_avg_sq")}
+        files.save(path, tensors | few, values)
+    elif how == "not a number":
+        from safetensors.torch import save_file
+
+        tensors["exp_avg.opacity"][3] = torch.nan
+        save_file(tensors, path, metadata={"format": files.FORMAT, "values": "{}"})
+    elif how == "words for numbers":
+        files.save(path, tensors, values | {"done": "many"})
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "cut off",
+        "empty",
+        "foreign",
+        "a part is missing",
+        "other rows",
+        "negative second moments",
+        "negative second moments.opacity",
+        "fewer thresholds",
+        "not a number",
+        "words for numbers",
+    ],
+)
+def test_a_broken_checkpoint_is_stated(model, dataset, tmp_path, monkeypatch, how):
+    settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
+    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch)
+    spoil(path, how)
+    with pytest.raises(CheckpointError) as caught:
+        run(model, dataset, settings, path)
+    assert "--again" in caught.value.remedy
+
+
+def test_a_full_disk_costs_the_checkpoint_and_not_the_fine_tuning(
+    model, dataset, tmp_path, monkeypatch
+):
+    told = []
+
+    def full(*_, **__):
+        raise OutputError("x", "cannot be written (No space left on device)", "a place", "Free it.")
+
+    monkeypatch.setattr(files, "save", full)
+    path = tmp_path / "out.fragprune-unfinished"
+    result = run(model, dataset, Settings(iterations=4), path, tell=told.append)
+    assert result.progress.steps == 4
+    assert "no checkpoint was written" in told[0]
+    assert "No space left" in told[0]
+
+
+def test_time_decides_when_a_checkpoint_is_due(tmp_path):
+    assert Checkpoints(tmp_path / "x", seconds=0.0).due(1)
+    assert not Checkpoints(tmp_path / "x", seconds=3600.0).due(1)
+    assert not Checkpoints(tmp_path / "x", seconds=None).due(1)
+    assert [step for step in range(1, 8) if Checkpoints(tmp_path / "x", None, 3).due(step)] == [
+        3,
+        6,
+    ]
