@@ -163,7 +163,7 @@ def command(
     asked["drop_invisible"] = drop
     if again:
         checkpoints.clear()
-    elif (finished := _finished(out, asked)) is not None:
+    elif (finished := _finished(out, asked, curves)) is not None:
         checkpoints.clear()
         return finished
     with sigterm_interrupts():
@@ -237,7 +237,7 @@ def command(
     lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
     more: dict[str, Any] = {"curves": rows}
     if not result.interrupted:
-        more["configuration"] = asked
+        more |= {"configuration": asked, "text": "\n".join(lines)}
     if data is not None:
         more["photographs"] = Photographs(
             data, Resolution(resolution), white_background
@@ -255,9 +255,8 @@ def command(
 _GOES_ON = "The same command goes on from there."
 
 
-def _finished(out: Path, asked: dict[str, Any]) -> Report | None:
+def _finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
     """The report of the same command, if it has written ``out`` already; else None."""
-    from fragprune_plugins.measure.wording import outcome
     from fragprune_plugins.storage import records, sidecar
 
     if not out.is_file():
@@ -270,14 +269,20 @@ def _finished(out: Path, asked: dict[str, Any]) -> Report | None:
     if record is None or not done or record.data.get("configuration") != asked:
         return None
     data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
+    if curves is not None and record.data["curves"]:
+        from fragprune_plugins.measure.report_page import save_learning
+
+        store = models.load(out).thresholds
+        learned = None if store is None else store.values.detach()
+        save_learning(curves, record.data["curves"], learned)
     text = (
-        f"{out} is finished: this command has written it before, and nothing was done. To fine-tune "
-        f"again, add --again.\n{outcome('finetune', data, data['control'])}"
+        f"{record.data['text']}\n{out} was finished before: nothing was done. "
+        "--again fine-tunes again."
     )
     return Report(data | {"already_finished": True}, text)
 
 
-_OF_RECORDS = {"curves", "photographs", "configuration"}
+_OF_RECORDS = {"curves", "photographs", "configuration", "text"}
 
 
 def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:

@@ -205,8 +205,8 @@ def test_sigterm_saves_at_once_and_leaves_with_143(scene, tmp_path, monkeypatch)
     result = run("finetune", path, "--data", data, "--out", out, "--iters", 50, "--json")
     assert result.exit_code == 143
     report = json.loads(result.stdout)
-    assert (report["interrupted"], report["iterations"], report["after"]) == (True, 3, None)
-    assert sidecar.load(out)[0].steps == 3
+    assert (report["interrupted"], report["iterations"], report["after"]) == (True, 4, None)
+    assert sidecar.load(out)[0].steps == 4  # the step under way is finished first
     assert signal.getsignal(signal.SIGTERM) is before
 
 

@@ -152,6 +152,7 @@ def test_random_kills_break_no_pair(tmp_path, without_waiting_for_the_disk):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_a_thousand_random_kills_break_no_pair(tmp_path, without_waiting_for_the_disk):
     kill_in_a_loop(tmp_path / "a.ply", 1000)
 

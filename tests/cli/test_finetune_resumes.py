@@ -1,0 +1,146 @@
+"""The same ``fragprune finetune`` again, after a kill or after its end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins.finetuning import loop, resuming
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.atomic import locked
+
+
+@pytest.fixture
+def scene(tmp_path, single_thread):
+    data, path, _ = tiny.scene(tmp_path)
+    return data, path
+
+
+def words(scene, out, *more):
+    data, path = scene
+    return ("finetune", path, "--data", data, "--out", out, "--iters", 40, *more)
+
+
+def killed(step, *arguments):
+    """Run the command in a process of its own, and kill it with -9 in the midst of a step."""
+    pid = os.fork()
+    if pid == 0:
+        begin = loop.Stage2.begin
+
+        def dying(stage, opacities):
+            if stage.steps == step:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return begin(stage, opacities)
+
+        loop.Stage2.begin = dying
+        with contextlib.suppress(BaseException):
+            run(*arguments)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
+
+
+def pair(out):
+    store, info = sidecar.load(out)  # safetensors writes its metadata in any order
+    state = {k: v.tolist() if torch.is_tensor(v) else v for k, v in store.state_dict().items()}
+    return out.read_bytes(), state, info
+
+
+def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path):
+    whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
+    assert run(*words(scene, whole)).exit_code == 0
+    arguments = words(scene, out, "--checkpoint-every", 0.001)
+    killed(7, *arguments)
+    killed(19, *arguments)
+    assert not out.exists()
+    result = run(*arguments, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert "resuming at step" in result.stderr
+    report = json.loads(result.stdout)
+    assert report["resumed_at"] == 19
+    assert report["iterations"] == 40
+    assert pair(out) == pair(whole)
+    left = {each.name for each in tmp_path.iterdir() if "out" in each.name or each.name[0] == "."}
+    assert left == {"out.ply", "out.fragprune.safetensors", "out.fragprune.json"}
+
+
+def test_ctrl_c_is_gone_on_from(scene, tmp_path, monkeypatch):
+    whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
+    assert run(*words(scene, whole)).exit_code == 0
+    loss, calls = loop.photometric_loss, []
+
+    def photometric(*args):
+        calls.append(1)
+        if len(calls) == 7:
+            signal.raise_signal(signal.SIGINT)
+        return loss(*args)
+
+    monkeypatch.setattr(loop, "photometric_loss", photometric)
+    result = run(*words(scene, out))
+    assert result.exit_code == 130
+    assert "The same command goes on from there." in result.stdout
+    assert run_json(*words(scene, out))["resumed_at"] == 7
+    assert pair(out) == pair(whole)
+    assert not resuming.path_beside(out).exists()
+
+
+def test_a_finished_command_says_so_and_does_nothing(scene, tmp_path, monkeypatch):
+    out = tmp_path / "out.ply"
+    first = run_json(*words(scene, out))
+    with monkeypatch.context() as patch:
+        patch.setattr("fragprune_plugins.finetuning.finetune", None)  # cannot be called
+        again = run_json(*words(scene, out))
+        assert again == first | {"already_finished": True}
+        text = run(*words(scene, out, "--curves", tmp_path / "curves.png"))
+    assert text.exit_code == 0
+    assert "PSNR, dB" in text.stdout  # the whole report
+    assert "was finished before: nothing was done. --again" in text.stdout
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+    assert run_json(*words(scene, out, "--again"))["already_finished"] is False
+
+
+@pytest.mark.parametrize(
+    "change", ["other options", "another model", "another photograph", "lost sidecar", "no record"]
+)
+def test_what_is_not_the_same_is_not_finished(scene, tmp_path, change):
+    data, path = scene
+    out, more = tmp_path / "out.ply", []
+    run_json(*words(scene, out))
+    if change == "other options":
+        more = ["--pressure", 1e-3]
+    elif change == "another model":
+        path.write_bytes(path.read_bytes()[:-4] + b"\0\0\0\0")
+    elif change == "another photograph":
+        first, second, *_ = sorted((data / "images").iterdir())
+        second.write_bytes(first.read_bytes())
+    elif change == "lost sidecar":
+        sidecar.path_beside(out).unlink()
+    else:
+        out.with_suffix(".fragprune.json").unlink()
+    assert run_json(*words(scene, out, *more))["already_finished"] is False
+
+
+def test_another_command_is_refused_while_one_is_unfinished(scene, tmp_path):
+    out = tmp_path / "out.ply"
+    killed(9, *words(scene, out, "--checkpoint-every", 0.001))
+    other = words(scene, out, "--pressure", 1e-3)
+    refused = run(*other)
+    assert refused.exit_code == 1
+    assert "[checkpoint]" in refused.stderr
+    assert "with other pressure" in refused.stderr
+    assert run_json(*other, "--again")["resumed_at"] == 0
+
+
+def test_two_at_once_are_refused(scene, tmp_path):
+    out = tmp_path / "out.ply"
+    with locked(out, wait=0, what="run"):
+        refused = run(*words(scene, out))
+    assert refused.exit_code == 1
+    assert "another process" in refused.stderr
+    assert run(*words(scene, out)).exit_code == 0
