@@ -29,11 +29,17 @@ if __name__ == "__main__":
     from setuptools.command.build_ext import build_ext
 
     class Libraries(build_ext):
+        """Builds files named as the loader opens them."""
+
         def get_ext_filename(self, fullname: str) -> str:
+            """Where a library goes, without the tag of this Python."""
             return str(Path(*fullname.split("."))) + SUFFIX
 
     class Wheel(bdist_wheel):
+        """Fits every Python 3 of its platform."""
+
         def get_tag(self) -> tuple[str, str, str]:
+            """Python, interface, platform."""
             return "py3", "none", super().get_tag()[2]
 
     modules = [
