@@ -20,7 +20,7 @@ PIXELS_MAX = 160_000_000
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """All that Pillow may take a file for. Some of its other readers run programs."""
 
-_DOOR = Door(
+DOOR = Door(
     DatasetError,
     "not readable",
     "a PNG or JPEG image",
@@ -39,7 +39,7 @@ def opened(path: Path) -> Iterator[Image]:
     """
     from PIL import Image
 
-    with _DOOR.reading(path) as reading, warnings.catch_warnings():
+    with DOOR.reading(path) as reading, warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # PIXELS_MAX decides
         with Image.open(reading.file, formats=_FORMATS) as image:
             width, height = image.size

@@ -12,7 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Dataset, Photograph, Shot
-from fragprune_plugins.datasets.images import unreadable
+from fragprune_plugins.datasets.images import DOOR
 from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -133,10 +133,9 @@ def _of(shot: Shot) -> Iterable[Tensor | str]:
     yield f"{shot.name} {shot.view.width} {shot.view.height} {shot.target}"
     yield from (shot.view.viewmatrix, shot.view.projmatrix, shot.view.background)
     if isinstance(shot, Photograph):
-        try:
-            yield digest(shot.path)
-        except OSError as error:
-            raise unreadable(shot.path, error) from error
+        with DOOR.reading(shot.path):
+            content = digest(shot.path)
+        yield content
 
 
 def _digest(parts: Iterable[Tensor | str]) -> str:

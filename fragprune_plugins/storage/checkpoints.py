@@ -12,8 +12,11 @@ from torch import Tensor
 from fragprune_plugins.errors import CheckpointError
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.storage.atomic import replacing
+from fragprune_plugins.storage.reading import Door, parse_json
 
 FORMAT = "fragprune-checkpoint-1"
+_REMEDY = "Remove it, or begin anew with --again."
+_DOOR = Door(CheckpointError, "unreadable", f"a file of format {FORMAT}", _REMEDY)
 
 
 def save(path: Path, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
@@ -48,20 +51,15 @@ def load(
     Raises:
         CheckpointError: it cannot be read, or holds NaN or infinity.
     """
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise ValueError(f"format {metadata.get('format')!r}")
-            values = json.loads(metadata["values"])
-            # copies: views into the file may lie in memory where other bits are rounded
-            tensors = {key: file.get_tensor(key).clone().to(device) for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, KeyError, RecursionError) as error:
-        raise CheckpointError(
-            str(path), f"unreadable ({error})", f"a file of format {FORMAT}", _REMEDY
-        ) from error
+    with _DOOR.reading(path) as reading, safe_open(reading.path, framework="pt") as file:
+        metadata = file.metadata()
+        if metadata["format"] != FORMAT:
+            raise ValueError(f"format {metadata['format'][:80]!r}")
+        values = parse_json(metadata["values"])
+        # copies: views into the file may lie in memory where other bits are rounded
+        tensors = {key: file.get_tensor(key).clone().to(device) for key in file.keys()}  # noqa: SIM118
     wrong = [name for name, tensor in tensors.items() if _is_broken(name, tensor)]
     if wrong or not isinstance(values, dict):
         found = f"numbers that cannot be in {', '.join(wrong)}" if wrong else "no values"
@@ -75,6 +73,3 @@ def _is_broken(name: str, tensor: Tensor) -> bool:
         return False
     negative = name.startswith("exp_avg_sq") and bool((tensor < 0).any())
     return negative or not bool(tensor.isfinite().all())
-
-
-_REMEDY = "Remove it, or begin anew with --again."
