@@ -14,6 +14,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from fragprune_plugins.constants import VERSION
+
 if TYPE_CHECKING:
     from fragprune_plugins.datasets.cameras import load_cameras
     from fragprune_plugins.datasets.dataset import load_dataset
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
         View,
     )
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 _HOME = {
     "FinetuneResult": "finetuning",

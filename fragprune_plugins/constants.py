@@ -74,3 +74,6 @@ LOGIT_MIN: Final = -80.0
 LOGIT_MAX: Final = 16.0
 """Ends of a threshold's logit: float32 tells sigmoid(-80) from 0 and sigmoid(16) from 1; from 16.7
 on it would round to 1."""
+
+VERSION: Final = "0.1.0"
+"""Of the package; pyproject.toml has the same."""

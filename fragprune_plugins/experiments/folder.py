@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import fragprune_plugins
+from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.storage.atomic import replacing, writable_folder
 from fragprune_plugins.storage.records import strict
@@ -48,7 +48,7 @@ class Folder:
     def __init__(self, out: Path, name: str, asked: dict[str, Any]) -> None:
         self.out, self.name = out, name
         self.asked: dict[str, Any] = json.loads(
-            json.dumps({"experiment": name, "version": fragprune_plugins.__version__} | asked)
+            json.dumps({"experiment": name, "version": VERSION} | asked)
         )
         writable_folder(out / _ARMS)
         _settle(self.file(".json"), self.asked)

@@ -11,6 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
+from fragprune_plugins.constants import VERSION
 from fragprune_plugins.datasets.dataset import Dataset, Photograph, Shot
 from fragprune_plugins.datasets.images import DOOR
 from fragprune_plugins.errors import CheckpointError, OutputError
@@ -109,12 +110,10 @@ def configuration(
         settings: of the fine-tuning.
         engine: the engine's name.
     """
-    from fragprune_plugins import __version__
-
     shots = (*dataset.train, *dataset.test)
     known = {} if store is None or store.neutral else store.numbers
     return {
-        "version": __version__,
+        "version": VERSION,
         "model": _digest(each for each in vars(model).values() if isinstance(each, Tensor)),
         "thresholds": _digest(known.values()),
         "photographs": _digest(each for shot in shots for each in _of(shot)),
