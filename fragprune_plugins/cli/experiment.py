@@ -206,7 +206,7 @@ _views_options = together(
 @command.command("stages", cls=Command, short_help=QUESTIONS["stages"])
 @_views_options
 @click.option(
-    "--repeats", type=click.IntRange(min=2), default=9, show_default=True, help="Timed rounds."
+    "--repeats", type=click.IntRange(min=2), default=15, show_default=True, help="Timed rounds."
 )
 def _time_stages(
     models: tuple[Path, ...],

@@ -29,5 +29,7 @@ def save_figure(path: Path, figure: Figure, dpi: int = 80) -> None:
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=dpi)
     with Image.open(drawn) as picture:
-        small: Any = picture.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+        full = picture.convert("RGB")
+        palette = full.quantize(_COLOURS)
+        small: Any = full.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
         small.save(path, format="PNG", optimize=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.experiments.catalogue import Experiment
+from fragprune_plugins.experiments.figures import new_figure, save_figure
 from fragprune_plugins.experiments.folder import Findings, Folder, markdown
 from fragprune_plugins.experiments.running import ENLARGED, Outcome
 
@@ -134,17 +135,13 @@ equally long, moves the same parameters and truncates nothing.
 
 def _plot(path: Path, experiment: Experiment, table: Sequence[dict[str, Any]]) -> None:
     """Write the plot as PNG: quality over what the experiment names."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(15, 5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(15, 5)
     panels = _PANELS[experiment.over]
     subplots = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, panel in zip(subplots, panels, strict=True):
         for series in dict.fromkeys(row["series"] for row in table):
             line = [row for row in table if row["series"] == series]
-            line.sort(key=lambda row: float(row["fragments_per_pixel"]))
+            line.sort(key=panel.at)
             x, y = [panel.at(row) for row in line], [row[panel.quality] for row in line]
             axes.errorbar(
                 x,
@@ -173,7 +170,7 @@ def _plot(path: Path, experiment: Experiment, table: Sequence[dict[str, Any]]) -
         axes.margins(0.1)
         axes.grid(alpha=0.25)
     subplots[0].legend(fontsize=8)
-    figure.savefig(path, format="png", dpi=110)
+    save_figure(path, figure, dpi=100)
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ class Layout:
         return count * (self.parameters + 1) // self.parameters
 
 
-LINES = Layout("lines", 1, LENGTH, 4, (4, 8, 16, 32), 16)
+LINES = Layout("lines", 1, LENGTH, 4, (4, 8, 16, 32), 8)
 """A Gaussian has place, width, opacity and value."""
 
 PICTURES = Layout("pictures", SIDE, SIDE, 9, (18, 36, 72, 144), 36)
@@ -386,21 +386,22 @@ def _means(key: str, values: Sequence[float]) -> dict[str, float | None]:
 
 def _plot(path: Path, kinds: _Kinds, made: _Made, rows: Sequence[dict[str, Any]]) -> None:
     (_, flat), (_, wide) = kinds
-    figure = new_figure(13, 12.5)
+    figure = new_figure(14, 12.5)
     parts: Any = figure.subfigures(2, 1, height_ratios=[5, 7.5])
     above, below = parts
-    for at, (signal, axes) in enumerate(zip(flat, above.subplots(2, len(flat)).T, strict=True)):
-        top, bottom = axes
+    (one, *tops), (legend, *bottoms) = above.subplots(2, 1 + len(flat))
+    _cut(one)
+    for at, (signal, top, bottom) in enumerate(zip(flat, tops, bottoms, strict=True)):
         top.plot(flat[signal][0, :, 0], color="0.6", linewidth=3, label="signal")
         for truncated, (color, _) in _STYLES.items():
             drawn = _shown(LINES, made, truncated)[at][0, :, 0]
-            label = _label(LINES, truncated)
-            top.plot(drawn, color=color, linewidth=1, label=label)
+            top.plot(drawn, color=color, linewidth=1, label=_label(LINES, truncated))
         top.set(title=signal, ylim=(-0.05, 1.05), xlabel="pixel")
         _curve(bottom, signal, rows)
-        if signal == "step":
-            top.legend(fontsize=7, loc="lower right")
-            bottom.legend(fontsize=7)
+    legend.set_axis_off()
+    legend.legend(*tops[0].get_legend_handles_labels(), fontsize=8, loc="upper left")
+    legend.add_artist(legend.get_legend())
+    legend.legend(*bottoms[0].get_legend_handles_labels(), fontsize=8, loc="lower left")
     grid = below.subplots(len(wide), 4, width_ratios=[1, 1, 1, 1.4])
     for at, (signal, axes) in enumerate(zip(wide, grid, strict=True)):
         shown = [(signal, wide[signal].numpy())]
@@ -411,6 +412,18 @@ def _plot(path: Path, kinds: _Kinds, made: _Made, rows: Sequence[dict[str, Any]]
             axis.set_title(title, fontsize=9)
         _curve(axes[-1], signal, rows)
     save_figure(path, figure)
+
+
+def _cut(axes: Axes) -> None:
+    """One Gaussian, and what is left of it at two thresholds."""
+    x = np.linspace(-40, 40, 801)
+    falloff = np.exp(-((x / 12) ** 2) / 2)
+    axes.plot(x, falloff, color="tab:blue", label="not truncated")
+    for tau, style in ((0.2, "--"), (0.6, "-")):
+        left = np.where(falloff >= tau, falloff, 0)
+        axes.plot(x, left, style, color="tab:red", label=f"threshold {tau}")
+    axes.set(title="one Gaussian", ylim=(-0.05, 1.35), xlabel="pixels from its centre")
+    axes.legend(fontsize=7, loc="upper left")
 
 
 _STYLES = {False: ("tab:blue", "Gaussians"), True: ("tab:red", "truncated Gaussians")}

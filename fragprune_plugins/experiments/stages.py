@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +30,7 @@ NAME = "stages"
 SIZES = (256, 512, 1024, 2048, 3840)
 """Pixels of the longer side."""
 
-REPEATS = 9
+REPEATS = 15
 _VIEWS = 3
 _REST = "rest"  # of a frame, outside of the engine's stages
 _FRAME = "frame"
@@ -87,7 +88,7 @@ def run(
             bar.set_postfix_str(f"{size} pixels")
             work = partial(_time, columns, [_sized(v, size) for v in views], engine, repeats)
             part = folder.part(index, f"{size} pixels", work)
-            rows += _rows(part["size"], part["fragments"], part["rounds"])
+            rows += _rows(part)
     return _findings(folder, rows)
 
 
@@ -126,24 +127,24 @@ def _time(
                     {key: statistics.fmean(each[key] for each in frames) for key in frames[0]}
                 )
     size = f"{views[0].width}x{views[0].height}"
-    return {"size": size, "fragments": fragments, "rounds": rounds}
+    load = os.getloadavg()[0]
+    return {"size": size, "load": load, "fragments": fragments, "rounds": rounds}
 
 
-def _rows(
-    size: str, fragments: dict[str, float], rounds: dict[str, list[dict[str, float]]]
-) -> list[dict[str, Any]]:
+def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
     """One dict for each column and stage: its time, and how much faster it is than the first."""
-    first = next(iter(rounds.values()))
+    first = next(iter(part["rounds"].values()))
     rows = []
-    for label, mine in rounds.items():
+    for label, mine in part["rounds"].items():
         for stage in mine[0]:
             times = [each[stage] for each in mine]
             faster = [b[stage] / m[stage] for b, m in zip(first, mine, strict=True) if m[stage]]
             rows.append(
                 {
-                    "size": size,
+                    "size": part["size"],
+                    "load": part["load"],
                     "model": label,
-                    "fragments_per_pixel": fragments[label],
+                    "fragments_per_pixel": part["fragments"][label],
                     "stage": stage,
                     **_median("ms", times),
                     **_median("faster", faster),
@@ -153,9 +154,16 @@ def _rows(
 
 
 def _median(key: str, values: Sequence[float]) -> dict[str, float | None]:
-    """Median over rounds, and the standard error of a mean over them."""
-    error = statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else None
-    return {key: statistics.median(values) if values else None, f"{key}_se": error}
+    """Median over rounds with its standard error, which follows from the middle half of them.
+
+    Rounds that something else on the machine disturbed therefore do not count. For values of a
+    normal distribution the error of the median is 1.2533 times that of the mean, and the middle
+    half is 1.349 standard deviations wide.
+    """
+    if len(values) < 2:
+        return {key: values[0] if values else None, f"{key}_se": None}
+    low, middle, high = statistics.quantiles(values, n=4, method="inclusive")
+    return {key: middle, f"{key}_se": 1.2533 / 1.349 * (high - low) / len(values) ** 0.5}
 
 
 def _findings(folder: Folder, rows: Sequence[dict[str, Any]]) -> Findings:
@@ -169,10 +177,12 @@ def _findings(folder: Folder, rows: Sequence[dict[str, Any]]) -> Findings:
         times = [_with_error(mine[stage], "ms") for stage in stages]
         drawn = f"{frame['fragments_per_pixel']:.1f}"
         cells.append([size, label, drawn, *times, _with_error(frame, "faster", "x")])
-    text = f"""Medians over {asked["repeats"]} rounds ± standard errors. In a round every model
-draws each of {asked["views"]} held-out views of {asked["photographs"]["folder"]}, in turns.
+    loads = [row["load"] for row in rows]
+    text = f"""Medians over {asked["repeats"]} rounds ± their standard errors. In a round every
+model draws each of {asked["views"]} held-out views of {asked["photographs"]["folder"]}, in turns.
 "Faster" is the first model's time over this one's in the same round. "Rest" is the frame's time
-outside of the engine's stages.
+outside of the engine's stages. The machine's load was {min(loads):.1f} to {max(loads):.1f}, on
+{asked["machine"]["cores"]} cores; where it exceeds them, trust the ratios more than the times.
 
 {folder.measured_with()}"""
     plot = partial(_plot, rows=rows, stages=[each for each in stages if each != _FRAME])
