@@ -31,6 +31,7 @@ SIZES = (256, 512, 1024, 2048, 3840)
 """Pixels of the longer side."""
 
 REPEATS = 15
+_FULL = 2048  # pixels; half as large pictures are drawn in twice as many rounds
 _VIEWS = 3
 _REST = "rest"  # of a frame, outside of the engine's stages
 _FRAME = "frame"
@@ -56,7 +57,8 @@ def run(
         engine: draws; one that keeps no time of its stages shows whole frames alone.
         device: of the models and views.
         sizes: pixels of the pictures' longer side.
-        repeats: rounds; in each, every view is drawn by every model in turns.
+        repeats: rounds for the largest pictures, more for small ones; in each, every view is drawn
+            by every model in turns.
         progress: draw a bar on stderr.
 
     Raises:
@@ -86,7 +88,8 @@ def run(
     with tqdm(sizes, disable=not progress, desc="stages", unit="size") as bar:
         for index, size in enumerate(bar):
             bar.set_postfix_str(f"{size} pixels")
-            work = partial(_time, columns, [_sized(v, size) for v in views], engine, repeats)
+            rounds = repeats * max(1, _FULL // size)
+            work = partial(_time, columns, [_sized(v, size) for v in views], engine, rounds)
             part = folder.part(index, f"{size} pixels", work)
             rows += _rows(part)
     return _findings(folder, rows)
@@ -147,6 +150,7 @@ def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
                     "fragments_per_pixel": part["fragments"][label],
                     "stage": stage,
                     **_median("ms", times),
+                    "ms_least": min(times),
                     **_median("faster", faster),
                 }
             )
@@ -169,20 +173,23 @@ def _median(key: str, values: Sequence[float]) -> dict[str, float | None]:
 def _findings(folder: Folder, rows: Sequence[dict[str, Any]]) -> Findings:
     asked = folder.asked
     stages = list(dict.fromkeys(row["stage"] for row in rows))
-    head = ["pixels", "model", "fragments/px", *(f"{stage}, ms" for stage in stages), "faster"]
+    head = ["pixels", "model", "fragments/px", *(f"{stage}, ms" for stage in stages)]
+    head += ["faster", "least, ms"]
     cells = []
     for size, label in dict.fromkeys((row["size"], row["model"]) for row in rows):
         mine = {r["stage"]: r for r in rows if (r["size"], r["model"]) == (size, label)}
         frame = mine[_FRAME]
         times = [_with_error(mine[stage], "ms") for stage in stages]
         drawn = f"{frame['fragments_per_pixel']:.1f}"
-        cells.append([size, label, drawn, *times, _with_error(frame, "faster", "x")])
+        faster, least = _with_error(frame, "faster", "x"), f"{frame['ms_least']:.2f}"
+        cells.append([size, label, drawn, *times, faster, least])
     loads = [row["load"] for row in rows]
-    text = f"""Medians over {asked["repeats"]} rounds ± their standard errors. In a round every
-model draws each of {asked["views"]} held-out views of {asked["photographs"]["folder"]}, in turns.
+    text = f"""Medians over {asked["repeats"]} rounds or more ± their standard errors. In a round
+every model draws each of {asked["views"]} held-out views of {asked["photographs"]["folder"]}, in turns.
 "Faster" is the first model's time over this one's in the same round. "Rest" is the frame's time
-outside of the engine's stages. The machine's load was {min(loads):.1f} to {max(loads):.1f}, on
-{asked["machine"]["cores"]} cores; where it exceeds them, trust the ratios more than the times.
+outside of the engine's stages. "Least" is the frame of the quickest round. The machine's load was
+{min(loads):.1f} to {max(loads):.1f} on {asked["machine"]["cores"]} cores: where it exceeds them,
+trust ratios and least times more than medians, most of all for small pictures.
 
 {folder.measured_with()}"""
     plot = partial(_plot, rows=rows, stages=[each for each in stages if each != _FRAME])
