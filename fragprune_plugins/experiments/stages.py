@@ -44,7 +44,7 @@ def run(
     *,
     engine: Engine,
     device: torch.device | str = "cpu",
-    sizes: Sequence[int] = SIZES,
+    sizes: Sequence[int] | None = None,
     repeats: int = REPEATS,
     progress: bool = False,
 ) -> Findings:
@@ -56,7 +56,7 @@ def run(
         out: the folder.
         engine: draws; one that keeps no time of its stages shows whole frames alone.
         device: of the models and views.
-        sizes: pixels of the pictures' longer side.
+        sizes: pixels of the pictures' longer side; ``SIZES`` when None.
         repeats: rounds for the largest pictures, more for small ones; in each, every view is drawn
             by every model in turns.
         progress: draw a bar on stderr.
@@ -67,6 +67,7 @@ def run(
     """
     from tqdm import tqdm
 
+    sizes = SIZES if sizes is None else sizes
     columns, said = load_columns(paths, device)
     dataset = load_photographs(photographs).to(device)
     step = -(-len(dataset.test) // _VIEWS)
@@ -139,6 +140,7 @@ def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
     first = next(iter(part["rounds"].values()))
     rows = []
     for label, mine in part["rounds"].items():
+        quickest = min(mine, key=lambda each: float(each[_FRAME]))
         for stage in mine[0]:
             times = [each[stage] for each in mine]
             faster = [b[stage] / m[stage] for b, m in zip(first, mine, strict=True) if m[stage]]
@@ -150,7 +152,7 @@ def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
                     "fragments_per_pixel": part["fragments"][label],
                     "stage": stage,
                     **_median("ms", times),
-                    "ms_least": min(times),
+                    "ms_quickest": quickest[stage],
                     **_median("faster", faster),
                 }
             )
@@ -174,22 +176,24 @@ def _findings(folder: Folder, rows: Sequence[dict[str, Any]]) -> Findings:
     asked = folder.asked
     stages = list(dict.fromkeys(row["stage"] for row in rows))
     head = ["pixels", "model", "fragments/px", *(f"{stage}, ms" for stage in stages)]
-    head += ["faster", "least, ms"]
+    head += ["faster", "quickest, ms"]
     cells = []
     for size, label in dict.fromkeys((row["size"], row["model"]) for row in rows):
         mine = {r["stage"]: r for r in rows if (r["size"], r["model"]) == (size, label)}
         frame = mine[_FRAME]
         times = [_with_error(mine[stage], "ms") for stage in stages]
         drawn = f"{frame['fragments_per_pixel']:.1f}"
-        faster, least = _with_error(frame, "faster", "x"), f"{frame['ms_least']:.2f}"
-        cells.append([size, label, drawn, *times, faster, least])
-    loads = [row["load"] for row in rows]
+        faster, quickest = _with_error(frame, "faster", "x"), f"{frame['ms_quickest']:.2f}"
+        cells.append([size, label, drawn, *times, faster, quickest])
+    loads, scene = [row["load"] for row in rows], asked["photographs"]["folder"]
     text = f"""Medians over {asked["repeats"]} rounds or more ± their standard errors. In a round
-every model draws each of {asked["views"]} held-out views of {asked["photographs"]["folder"]}, in turns.
-"Faster" is the first model's time over this one's in the same round. "Rest" is the frame's time
-outside of the engine's stages. "Least" is the frame of the quickest round. The machine's load was
-{min(loads):.1f} to {max(loads):.1f} on {asked["machine"]["cores"]} cores: where it exceeds them,
-trust ratios and least times more than medians, most of all for small pictures.
+every model draws each of {asked["views"]} held-out views of {scene}, in turns. "Faster" is the
+first model's time over this one's in the same round. "Rest" is the frame's time outside of the
+engine's stages. "Quickest" is the quickest round; the plot's bars are its stages.
+
+The machine's load was {min(loads):.1f} to {max(loads):.1f} on {asked["machine"]["cores"]} cores.
+Where it exceeds them, trust ratios and quickest rounds more than medians, most of all for small
+pictures.
 
 {folder.measured_with()}"""
     plot = partial(_plot, rows=rows, stages=[each for each in stages if each != _FRAME])
@@ -203,7 +207,7 @@ def _with_error(row: dict[str, Any], key: str, unit: str = "") -> str:
 
 
 def _plot(path: Path, rows: Sequence[dict[str, Any]], stages: Sequence[str]) -> None:
-    """Stacked stages for each model, one panel for each size, with the frame's standard error."""
+    """The quickest round's stages for each model and size, with the median frame's error."""
     sizes = list(dict.fromkeys(row["size"] for row in rows))
     labels = list(dict.fromkeys(row["model"] for row in rows))
     figure = new_figure(2.6 * len(sizes) + 0.5, 3.6)
@@ -211,7 +215,7 @@ def _plot(path: Path, rows: Sequence[dict[str, Any]], stages: Sequence[str]) -> 
         mine = {(row["model"], row["stage"]): row for row in rows if row["size"] == size}
         base = [0.0] * len(labels)
         for stage in stages:
-            heights = [mine[label, stage]["ms"] for label in labels]
+            heights = [mine[label, stage]["ms_quickest"] for label in labels]
             axes.bar(range(len(labels)), heights, bottom=base, label=stage)
             base = [low + height for low, height in zip(base, heights, strict=True)]
         frames = [mine[label, _FRAME] for label in labels]
@@ -223,7 +227,7 @@ def _plot(path: Path, rows: Sequence[dict[str, Any]], stages: Sequence[str]) -> 
             linestyle="none",
             marker="_",
             capsize=3,
-            label=_FRAME,
+            label="frame, median",
         )
         axes.set(title=size, ylim=(0, None))
         axes.set_xticks(range(len(labels)), labels=labels, rotation=20, ha="right", fontsize=8)
