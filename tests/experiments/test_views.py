@@ -103,3 +103,14 @@ def test_an_engine_without_a_clock_shows_frames_alone(words, monkeypatch):
 @pytest.mark.parametrize("name", ["fragments", "stages"])
 def test_a_model_is_needed(words, name):
     assert run("experiment", name, *words[2:]).exit_code == 2
+
+
+def test_one_disturbed_round_does_not_widen_the_error():
+    even = [1.0 + 0.01 * step for step in range(15)]
+    quiet = stages._median("ms", even)
+    disturbed = stages._median("ms", [*even[:-1], 1000.0])
+    assert disturbed == quiet
+    # of a median of normal values: 1.2533 standard deviations over the root of their number
+    stream = torch.Generator().manual_seed(0)
+    normal = stages._median("ms", torch.randn(20_001, generator=stream).tolist())
+    assert normal["ms_se"] == pytest.approx(1.2533 / 20_001**0.5, rel=0.03)
