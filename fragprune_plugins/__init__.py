@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.injection.api import activate, deactivate, paused
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
+    from fragprune_plugins.measure.scores import keep_best, keep_needed
     from fragprune_plugins.measure.viewing import overview, render_view
     from fragprune_plugins.plugins.hooks import rasterize
     from fragprune_plugins.storage.models import Model, load, save
@@ -60,6 +61,8 @@ _HOME = {
     "activate": "injection.api",
     "deactivate": "injection.api",
     "finetune": "finetuning",
+    "keep_best": "measure.scores",
+    "keep_needed": "measure.scores",
     "load": "storage.models",
     "load_cameras": "datasets.cameras",
     "load_dataset": "datasets.dataset",
@@ -92,6 +95,8 @@ __all__ = [
     "activate",
     "deactivate",
     "finetune",
+    "keep_best",
+    "keep_needed",
     "load",
     "load_cameras",
     "load_dataset",

@@ -7,21 +7,29 @@ rasterizer, including the derivatives that it leaves out.
     covariance -> project -> (sh) -> fragment -> composite,  all called by ``render``.
 
 ``render_footprints`` starts after the projection, for hosts with their own projection.
-``slice_gaussians`` comes first, for Gaussians in space and time.
+``slice_gaussians`` comes first, for Gaussians in space and time. ``blended`` gives the fragments.
 """
 
 from reference_renderer.project import Footprints
-from reference_renderer.render import fragment_weights, render, render_footprints
+from reference_renderer.render import (
+    Blended,
+    blended,
+    fragment_weights,
+    render,
+    render_footprints,
+)
 from reference_renderer.scene import Camera, Gaussians, Options, Rendering
 from reference_renderer.spacetime import SpacetimeGaussians, slice_gaussians
 
 __all__ = [
+    "Blended",
     "Camera",
     "Footprints",
     "Gaussians",
     "Options",
     "Rendering",
     "SpacetimeGaussians",
+    "blended",
     "fragment_weights",
     "render",
     "render_footprints",

@@ -59,6 +59,25 @@ class Drawing:
     winners: Tensor
 
 
+@dataclass(frozen=True)
+class Blended:
+    """The fragments of one block of P pixels.
+
+    Attributes:
+        rows: (K,) of the Gaussians, front to back.
+        alpha: (K, P), 0 where not drawn.
+        drawn: (K, P) bool.
+        opacity: (K,) after compensation.
+        color: (K, 3) RGB.
+    """
+
+    rows: Tensor
+    alpha: Tensor
+    drawn: Tensor
+    opacity: Tensor
+    color: Tensor
+
+
 def render(
     camera: Camera,
     gaussians: Gaussians,
@@ -84,15 +103,44 @@ def render(
         footprints = hooked(camera, footprints, means2d_hook[front], options)
     tau = None if thresholds is None else thresholds[front]
 
-    rects = tile_rects(camera, footprints)
-    touching = (footprints.radius > 0) & ((rects[:, 2:] - rects[:, :2]) > 0).all(dim=1)
-    drawable = touching if options.tiles else footprints.radius > 0
-    blocks = list(cut(camera, footprints, rects, drawable, options))
+    touching, blocks = cut_world(camera, footprints, options)
     drawings = [draw(footprints, tau, block, options) for block in blocks]
 
     radii = torch.where(touching, footprints.radius, 0).to(torch.int32)
     none = torch.zeros_like(gaussians.opacities, dtype=torch.int32)
     return collect(camera, front, none.index_add(0, front, radii), blocks, drawings)
+
+
+@torch.no_grad()
+def blended(
+    camera: Camera,
+    gaussians: Gaussians,
+    thresholds: Tensor | None = None,
+    *,
+    options: Options | None = None,
+    every: int = 1,
+) -> Iterator[Blended]:
+    """The fragments of each block of the image, one by one, as ``render`` blends them.
+
+    Args:
+        camera: the view.
+        gaussians: N of them.
+        thresholds: as in ``render``.
+        options: as in ``render``.
+        every: only each so-manieth tile is drawn.
+    """
+    options = options or Options()
+    front = rows_in_front(camera, gaussians.means, options.near)
+    footprints = project(camera, gaussians.take(front), options)
+    tau = None if thresholds is None else thresholds[front]
+    for block in cut_world(camera, footprints, options)[1][::every]:
+        here = footprints.take(block.rows)
+        points = sample_points(block, options, here.mean2d)
+        found = fragments(here, points, None if tau is None else tau[block.rows], options)
+        live = alive(found.alpha, options.transmittance_min)
+        yield Blended(
+            front[block.rows], found.alpha * live, found.drawn & live, here.opacity, here.color
+        )
 
 
 def fragment_weights(
@@ -112,20 +160,9 @@ def fragment_weights(
         options: as in ``render``.
         every: only each so-manieth tile is drawn.
     """
-    options = options or Options()
-    front = rows_in_front(camera, gaussians.means, options.near)
-    footprints = project(camera, gaussians.take(front), options)
-    tau = None if thresholds is None else thresholds[front]
-    rects = tile_rects(camera, footprints)
-    blocks = list(cut(camera, footprints, rects, footprints.radius > 0, options))[::every]
-    found = [camera.background.new_empty(0)]
-    for block in blocks:
-        here = footprints.take(block.rows)
-        points = sample_points(block, options, here.mean2d)
-        there = fragments(here, points, None if tau is None else tau[block.rows], options)
-        live = alive(there.alpha, options.transmittance_min)
-        found.append(weights_of(there.alpha * live)[there.drawn & live])
-    return torch.cat(found)
+    blocks = blended(camera, gaussians, thresholds, options=options, every=every)
+    found = [weights_of(block.alpha)[block.drawn] for block in blocks]
+    return torch.cat([camera.background.new_empty(0), *found])
 
 
 def render_footprints(
@@ -195,6 +232,16 @@ def collect(
         winners=winners.to(torch.int32),
         wins_per_gaussian=winners[won].bincount(minlength=len(radii)).to(torch.int32),
     )
+
+
+def cut_world(
+    camera: Camera, footprints: Footprints, options: Options
+) -> tuple[Tensor, list[Block]]:
+    """Which of K projected Gaussians touch the image, (K,) bool, and the blocks of ``cut``."""
+    rects = tile_rects(camera, footprints)
+    touching = (footprints.radius > 0) & ((rects[:, 2:] - rects[:, :2]) > 0).all(dim=1)
+    drawable = touching if options.tiles else footprints.radius > 0
+    return touching, list(cut(camera, footprints, rects, drawable, options))
 
 
 def cut(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -34,6 +34,23 @@ if TYPE_CHECKING:
     from fragprune_plugins.finetuning import FinetuneResult
 
 
+def _share(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> float | Literal["auto"] | None:
+    """A share in (0, 1], or auto."""
+    if value is None:
+        return None
+    if value == "auto":
+        return "auto"
+    try:
+        share = float(value)
+    except ValueError:
+        share = 0.0
+    if not 0 < share <= 1:
+        raise click.BadParameter(f"{value!r} is neither auto nor a number with 0 < X <= 1.")
+    return share
+
+
 @click.command("finetune", cls=Command)
 @click.argument("model", type=FILE)
 @click.option(
@@ -59,6 +76,14 @@ if TYPE_CHECKING:
 )
 @image_options
 @learning_options
+@click.option(
+    "--keep",
+    metavar="SHARE|auto",
+    callback=_share,
+    help="Before learning, remove Gaussians until this share is left, such as 0.8: first those "
+    "whose removal changes the training views least. auto keeps what the photographs need. "
+    "--target-speedup counts from what is left.",
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
 @click.option(
@@ -93,6 +118,7 @@ def command(
     resolution: int,
     white_background: bool,
     settings: Settings,
+    keep: float | Literal["auto"] | None,
     seed: int,
     no_truncation: bool,
     curves: Path | None,
@@ -127,6 +153,13 @@ def command(
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
     _require_target(data, itself, cameras, settings)
+    if itself and keep == "auto":
+        raise UsageError(
+            "options",
+            "--self with --keep auto",
+            "photographs, whose error says what can be spared",
+            "Pass a share, such as --keep 0.9.",
+        )
     require_place(out, model)
     click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
@@ -135,6 +168,7 @@ def command(
     from fragprune_plugins.datasets.photographs import Photographs, Resolution
     from fragprune_plugins.finetuning import Checkpoints, finetune, load_dataset, resuming, save
     from fragprune_plugins.measure import Candidate, drop_invisible, measure
+    from fragprune_plugins.measure.scores import keep_best, keep_needed
     from fragprune_plugins.measure.wording import describe, outcome
     from fragprune_plugins.storage import records, sidecar
 
@@ -160,13 +194,22 @@ def command(
         resuming.path_beside(out), every or None, tell=partial(click.echo, err=True)
     )
     asked = resuming.configuration(splat, store, dataset, settings, rasterizer.name)
-    asked["drop_invisible"] = drop
+    asked |= {"drop_invisible": drop, "keep": keep}
     if again:
         checkpoints.clear()
     elif (finished := _finished(out, asked, curves)) is not None:
         checkpoints.clear()
         return finished
     with sigterm_interrupts():
+        if keep is not None:
+            shots, all_of_it = dataset.to(where).train, models.Model(splat, store)
+            splat, store = (
+                keep_needed(all_of_it, shots, engine=rasterizer, progress=True)
+                if keep == "auto"
+                else keep_best(
+                    all_of_it, keep, [s.view for s in shots], engine=rasterizer, progress=True
+                )
+            )
         result = finetune(
             splat,
             dataset,
@@ -183,8 +226,8 @@ def command(
     dropped = None
     if drop:
         whole = out.stat().st_size
-        views = [shot.view for shot in (*dataset.train, *dataset.test)]
-        smaller, kept = drop_invisible(result.model, result.store, views, engine=rasterizer)
+        seen = [shot.view for shot in (*dataset.train, *dataset.test)]
+        smaller, kept = drop_invisible(result.model, result.store, seen, engine=rasterizer)
         result = replace(result, model=smaller, store=kept)
         save(out, result)
         dropped = dropping(out, whole, len(splat), len(smaller))
@@ -204,6 +247,7 @@ def command(
         "before": before,
         "after": after,
         "untruncated": without[0] if without else None,
+        "keep": keep,
         "dropped": dropped,
         "speedup": done.speedup,
         "target_reached": done.target_reached,
@@ -230,8 +274,14 @@ def command(
     ]
     if result.interrupted:
         lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations. {_GOES_ON}")
+    if keep is not None:
+        gone, of = len(start.model) - len(splat), len(start.model)
+        lines.append(
+            f"Removed {gone:,} of {of:,} Gaussians before learning, those whose removal changed "
+            "the training views least."
+        )
     if dropped:
-        lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(views)} views"))
+        lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(seen)} views"))
     lines += [_describe_untruncated(before, plain) for plain in without]
     together = " Keep the two together." if without else ""
     lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")

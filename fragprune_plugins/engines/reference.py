@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from fragprune_plugins.constants import TILE
@@ -18,11 +19,13 @@ from fragprune_plugins.types import (
     Splats,
 )
 from reference_renderer import (
+    Blended,
     Camera,
     Gaussians,
     Options,
     Rendering,
     SpacetimeGaussians,
+    blended,
     render,
     render_footprints,
     slice_gaussians,
@@ -99,6 +102,20 @@ class Fallback(ReferenceEngine):
                 f"{self._remedy} Or draw on the CPU: --device cpu. --engine reference insists.",
             )
         return super().rasterize(inputs, thresholds)
+
+
+def fragments(inputs: RasterInputs, thresholds: Tensor | None) -> Iterator[Blended]:
+    """The fragments themselves, tile by tile, for what no engine sums up. Slow.
+
+    Args:
+        inputs: Gaussians in the world.
+        thresholds: (N,) falloff in (0, 1), or None for no truncation.
+    """
+    assert isinstance(inputs.splats, Splats)
+    inputs.check_thresholds(thresholds)
+    return blended(
+        camera_of(inputs), gaussians_of(inputs.splats), thresholds, options=options_of(inputs)
+    )
 
 
 def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:

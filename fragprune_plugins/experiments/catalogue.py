@@ -16,6 +16,31 @@ _ALPHA_LEVELS = (4, 8, 12, 16)
 _PRESSURES = tuple(factor * LEAST_PRESSURE for factor in (0.5, 1, 2, 4))
 
 
+_SCORES = (
+    "removal-error",
+    "opacity",
+    "total-weight",
+    "largest-weight",
+    "light-gaussian",
+    "mini-splatting",
+    "falloff-gradient",
+)
+_KEPT = 0.6
+
+
+@dataclass(frozen=True)
+class Pruning:
+    """Whole Gaussians that go before a training.
+
+    Attributes:
+        score: its name in ``measure.scores.SCORES``; taken on the training views.
+        keep: share of the Gaussians that stays, those of the highest score.
+    """
+
+    score: str
+    keep: float
+
+
 @dataclass(frozen=True)
 class Arm:
     """One training of an experiment.
@@ -26,6 +51,7 @@ class Arm:
         settings: of the training; every seed replaces theirs.
         rule: gives the thresholds; None where they are learned, or where nothing is truncated.
         opens: iterations before anything is truncated; None for ``Settings.warmup``.
+        pruning: comes before the training; None where all Gaussians stay.
     """
 
     series: str
@@ -33,6 +59,7 @@ class Arm:
     settings: Settings
     rule: Rule | None = None
     opens: int | None = None
+    pruning: Pruning | None = None
 
     @property
     def label(self) -> str:
@@ -41,8 +68,8 @@ class Arm:
 
     @property
     def is_control(self) -> bool:
-        """Whether the arm trains without truncation."""
-        return not self.settings.truncate
+        """Whether the arm trains all Gaussians without truncation."""
+        return not self.settings.truncate and self.pruning is None
 
 
 @dataclass(frozen=True)
@@ -65,7 +92,8 @@ class Experiment:
         """The control of equal length that moves the same parameters; None for a control."""
         if arm.is_control:
             return None
-        return next((c for c in self.arms if c.settings == _control(arm.settings)), None)
+        wanted = _control(arm.settings)
+        return next((c for c in self.arms if c.is_control and c.settings == wanted), None)
 
 
 def _control(settings: Settings) -> Settings:
@@ -168,11 +196,39 @@ def overfitting(longest: int, train: Train | None = None) -> Experiment:
     )
 
 
+def primitives(iterations: int, train: Train | None = None) -> Experiment:
+    """Pruning of whole Gaussians by a score, then equal training without and with truncation.
+
+    Args:
+        iterations: of every arm.
+        train: what moves in every arm; all parameters when None.
+    """
+    learned = Settings(iterations=iterations, train=train or "all")
+    control = _control(learned)
+    prunings = [Pruning(score, _KEPT) for score in _SCORES]
+    prunings += [Pruning(_SCORES[0], keep) for keep in (0.8, 0.4)]
+    return Experiment(
+        "primitives",
+        "What do learned thresholds add to the pruning of whole Gaussians, if everything trains "
+        "equally long?",
+        (
+            Arm("control", "", control),
+            Arm("learned", "", learned),
+            *(
+                Arm(f"{each.score}{more}", f"{each.keep:.0%}", settings, pruning=each)
+                for each in prunings
+                for more, settings in (("", control), (" + learned", learned))
+            ),
+        ),
+    )
+
+
 EXPERIMENTS: dict[str, Callable[[int, Train | None], Experiment]] = {
     "rules": rules,
     "moves": moves,
     "iterations": iterations,
     "overfitting": overfitting,
+    "primitives": primitives,
 }
 """By name: makes the experiment from the iterations of its longest arms and from what moves."""
 

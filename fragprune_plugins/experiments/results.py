@@ -18,6 +18,7 @@ AS_IT_CAME = "as it came"
 """Label of the row of the untruncated model before any training."""
 
 _FIGURES: dict[str, Callable[[Outcome], float]] = {
+    "gaussians": lambda o: o.after["gaussians"],
     "fragments_per_pixel": lambda o: o.after["fragments_per_pixel"],
     "psnr": lambda o: o.after["psnr"],
     "ssim": lambda o: o.after["ssim"],
@@ -30,6 +31,7 @@ _FIGURES: dict[str, Callable[[Outcome], float]] = {
 }
 
 _COLUMNS = (
+    ("Gaussians", "gaussians", "{:,.0f}"),
     ("fragments/px", "fragments_per_pixel", "{:.2f}"),
     ("PSNR, dB", "psnr", "{:.2f}"),
     ("training views, dB", "psnr_training", "{:.2f}"),
@@ -52,11 +54,11 @@ def rows(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[dict[str, 
 
     Returns:
         label, series, variant, iterations, and means over seeds, each with its standard deviation
-        as ``KEY_spread`` (None for one seed): fragments_per_pixel, psnr (dB), ssim, psnr_training
-        (on the views learned from; all else is on held-out views), frame_ms, speedup (frame time
-        of the model as it came over frame_ms), frame_ms_enlarged and speedup_enlarged (the same
-        with longer sides), train_seconds, against_control (dB, PSNR over that of the control of
-        equal length; None where there is none).
+        as ``KEY_spread`` (None for one seed): gaussians, fragments_per_pixel, psnr (dB), ssim,
+        psnr_training (on the views learned from; all else is on held-out views), frame_ms, speedup
+        (frame time of the model as it came over frame_ms), frame_ms_enlarged and speedup_enlarged
+        (the same with longer sides), train_seconds, against_control (dB, PSNR over that of the
+        control of equal length; None where there is none).
     """
     came = [Outcome(each.arm, each.seed, each.before, each.before, 0.0) for each in outcomes]
     first = _means(came) | _mean("against_control", []) | _mean("train_seconds", [])
@@ -134,12 +136,18 @@ equally long, moves the same parameters and truncates nothing.
 
 
 def _plot(path: Path, experiment: Experiment, table: Sequence[dict[str, Any]]) -> None:
-    """Write the plot as PNG: quality over what the experiment names."""
+    """Write the plot as PNG: quality over what the experiment names.
+
+    A series "A + B" has the colour of "A", and squares.
+    """
     figure = new_figure(15, 5)
     panels = _PANELS[experiment.over]
     subplots = figure.subplots(1, len(panels), squeeze=False)[0]
+    series_of = list(dict.fromkeys(row["series"] for row in table))
+    hues = list(dict.fromkeys(series.split(" + ")[0] for series in series_of))
     for axes, panel in zip(subplots, panels, strict=True):
-        for series in dict.fromkeys(row["series"] for row in table):
+        for series in series_of:
+            hue, *more = series.split(" + ")
             line = [row for row in table if row["series"] == series]
             line.sort(key=panel.at)
             x, y = [panel.at(row) for row in line], [row[panel.quality] for row in line]
@@ -151,7 +159,8 @@ def _plot(path: Path, experiment: Experiment, table: Sequence[dict[str, Any]]) -
                     for row, at in zip(line, x, strict=True)
                 ],
                 yerr=[row[f"{panel.quality}_spread"] or 0 for row in line],
-                marker="*" if series == AS_IT_CAME else "o",
+                color=f"C{hues.index(hue)}",
+                marker="*" if series == AS_IT_CAME else "s" if more else "o",
                 markersize=10 if series == AS_IT_CAME else 5,
                 linewidth=1.2,
                 elinewidth=0.6,
@@ -169,7 +178,7 @@ def _plot(path: Path, experiment: Experiment, table: Sequence[dict[str, Any]]) -
         axes.set(xlabel=panel.label, ylabel=_QUALITIES[panel.quality])
         axes.margins(0.1)
         axes.grid(alpha=0.25)
-    subplots[0].legend(fontsize=8)
+    figure.legend(*subplots[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     save_figure(path, figure, dpi=100)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,13 @@ from fragprune_plugins.datasets.dataset import Dataset, load_photographs
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import Interrupted, Terminated
-from fragprune_plugins.experiments.catalogue import Arm, Experiment
+from fragprune_plugins.experiments.catalogue import Arm, Experiment, Pruning
 from fragprune_plugins.experiments.folder import Folder
 from fragprune_plugins.experiments.scene import describe_photographs
 from fragprune_plugins.finetuning import FinetuneResult, finetune
 from fragprune_plugins.learning.schedule import Schedule
 from fragprune_plugins.measure import Candidate, frame_times, measure
+from fragprune_plugins.measure.scores import SCORES, best
 from fragprune_plugins.storage import models
 from fragprune_plugins.storage.atomic import digest
 from fragprune_plugins.storage.ply import SplatFile
@@ -93,24 +94,60 @@ def run(
     folder = Folder(out, experiment.name, asked)
     jobs = [(index, arm, seed) for index, arm in enumerate(experiment.arms) for seed in seeds]
     outcomes = []
+    scores = Scores(splat, dataset, engine, progress=progress)
     with tqdm(jobs, disable=not progress, desc=experiment.name, unit="training") as bar:
         for index, arm, seed in bar:
             label = f"{arm.label}, seed {seed}"
             bar.set_postfix_str(label)
-            work = partial(_outcome, arm, seed, splat, dataset, engine, progress)
+            work = partial(_outcome, arm, seed, splat, scores, dataset, engine, progress)
             content = folder.part(index, label, work)
             figures = (content[key] for key in ("before", "after", "train_seconds"))
             outcomes.append(Outcome(arm, seed, *figures))
     return folder, outcomes
 
 
+class Scores:
+    """The scores of a model on the training views, each taken once.
+
+    Args:
+        splat: N Gaussians, drawn without thresholds.
+        dataset: its photographs.
+        engine: draws the views.
+        progress: draw a bar on stderr.
+    """
+
+    def __init__(
+        self, splat: SplatFile, dataset: Dataset, engine: Engine, *, progress: bool
+    ) -> None:
+        self._splat, self._engine, self._progress = splat, engine, progress
+        self._views = [shot.view for shot in dataset.train]
+        self._known: dict[str, torch.Tensor] = {}
+
+    def prune(self, pruning: Pruning) -> SplatFile:
+        """The Gaussians that stay."""
+        from tqdm import tqdm
+
+        name = pruning.score
+        if name not in self._known:
+            hidden = not self._progress
+            views = tqdm(self._views, disable=hidden, desc=name, unit="view", leave=None)
+            self._known[name] = SCORES[name](self._splat, None, views, self._engine)
+        return self._splat.keep(best(self._known[name], pruning.keep))
+
+
 def _outcome(
-    arm: Arm, seed: int, splat: SplatFile, dataset: Dataset, engine: Engine, progress: bool
+    arm: Arm,
+    seed: int,
+    splat: SplatFile,
+    scores: Scores,
+    dataset: Dataset,
+    engine: Engine,
+    progress: bool,
 ) -> dict[str, Any]:
     """What ``Outcome`` holds of an arm, as plain values."""
     settings = replace(arm.settings, seed=seed)
     result = finetune(
-        splat,
+        splat if arm.pruning is None else scores.prune(arm.pruning),
         dataset,
         settings,
         schedule=None if arm.opens is None else Schedule(settings, warmup=arm.opens),
@@ -167,6 +204,7 @@ def _configuration(
                 "rule": arm.rule and arm.rule.name,
                 "opens": arm.opens,
             }
+            | ({"pruning": asdict(arm.pruning)} if arm.pruning else {})
             for arm in experiment.arms
         },
         "seeds": list(seeds),

@@ -97,8 +97,8 @@ def files(folder: Path, *, below: bool = False) -> list[Path]:
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
     """Find the measurement of a fine-tuning's control; None if no file records it.
 
-    The control started from the same model, with the same iterations and settings, but without
-    truncation. Files that are not records are ignored.
+    The control started from the same model, with the same iterations and settings, and kept as many
+    Gaussians, but without truncation. Files that are not records are ignored.
 
     Args:
         data: of the fine-tuning, including "before", "iterations" and "settings".
@@ -121,6 +121,7 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
         and theirs.get("truncate") is False
         and all(mine[key] == theirs.get(key) for key in ("train", "opacity_lr"))
         and other["iterations"] == data["iterations"]
+        and other.get("keep") == data.get("keep")
         and begun
         and before
         and all(begun[key] == before[key] for key in ("views", "gaussians"))

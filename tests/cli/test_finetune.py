@@ -122,6 +122,68 @@ def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
     assert f"Dropped {count} of 60 Gaussians, which reach no pixel of the 9 views: " in text
 
 
+def test_removes_gaussians_before_learning(scene, tmp_path):
+    data, path, model = scene
+    out = tmp_path / "kept.ply"
+    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 10)
+    report = run_json(*arguments, "--keep", 0.6, "--train", "opacity")
+    assert report["keep"] == 0.6
+    assert report["before"]["gaussians"] == len(model) == 60
+    assert report["after"]["gaussians"] == len(read_ply(out)) == len(sidecar.load(out)[0]) == 36
+    left = read_ply(out)
+    rows = [(model.xyz == each).all(dim=1).nonzero().item() for each in left.xyz]
+    assert rows == sorted(rows)
+    for name in ("xyz", "f_dc", "f_rest", "scaling", "rotation"):
+        assert torch.equal(getattr(left, name), getattr(model, name)[rows])
+    result = run(*arguments, "--keep", 0.6)
+    assert "scoring Gaussians" in result.stderr  # the bar
+    assert "Removed 24 of 60 Gaussians before learning" in result.stdout
+
+
+def test_removes_what_photographs_can_spare(scene, tmp_path):
+    data, path, model = scene
+    xyz = model.xyz.clone()
+    xyz[:7, 1] += 50  # out of every picture
+    write_ply(path, replace(model, xyz=xyz))
+    out = tmp_path / "kept.ply"
+    report = run_json(
+        "finetune", path, "--data", data, "--out", out, "--iters", 3, "--keep", "auto"
+    )
+    assert report["keep"] == "auto"
+    assert 30 < report["after"]["gaussians"] == len(read_ply(out)) <= 53
+    assert not (read_ply(out).xyz[:, 1] > 40).any()
+
+
+def test_what_a_model_itself_can_spare_is_not_known(scene, tmp_path):
+    data, path, _ = scene
+    arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--self")
+    result = run(*arguments, "--keep", "auto")
+    assert result.exit_code == 2
+    assert "--keep auto" in result.stderr
+    report = run_json(*arguments, "--keep", 0.9, "--iters", 3)
+    assert report["after"]["gaussians"] == 54
+
+
+@pytest.mark.parametrize("share", ["0", "1.5", "x", "nan"])
+def test_a_share_to_keep_that_is_none_is_refused(scene, tmp_path, share):
+    data, path, _ = scene
+    out = tmp_path / "out.ply"
+    result = run("finetune", path, "--data", data, "--out", out, "--keep", share)
+    assert result.exit_code == 2
+    assert "--keep" in result.stderr
+
+
+def test_a_control_of_all_gaussians_is_none_for_fewer(scene, tmp_path):
+    data, path, _ = scene
+    arguments = ("finetune", path, "--data", data, "--iters", 3)
+    run_json(*arguments, "--out", tmp_path / "control.ply", "--control")
+    fewer = run_json(*arguments, "--out", tmp_path / "fewer.ply", "--keep", 0.5)
+    assert fewer["control"] is None
+    run_json(*arguments, "--out", tmp_path / "half.ply", "--control", "--keep", 0.5)
+    fewer = run_json(*arguments, "--out", tmp_path / "fewer.ply", "--keep", 0.5)
+    assert fewer["control"]["gaussians"] == 30
+
+
 def test_target_control_and_curves(scene, tmp_path):
     data, path, _ = scene
     out, curves = tmp_path / "out.ply", tmp_path / "curves.png"

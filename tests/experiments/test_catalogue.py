@@ -7,6 +7,7 @@ from cli.commands import run
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.experiments.catalogue import EXPERIMENTS
+from fragprune_plugins.measure.scores import SCORES
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -39,6 +40,14 @@ def test_moves_compares_what_moves():
     assert {arm.settings.train for arm in arms} == {"opacity", "appearance", "all"}
     with pytest.raises(UsageError, match="--train"):
         EXPERIMENTS["moves"](700, "all")
+
+
+def test_primitives_prunes_by_every_published_score_without_and_with_thresholds():
+    arms = [arm for arm in EXPERIMENTS["primitives"](700, None).arms if arm.pruning]
+    alone = [arm.pruning for arm in arms if not arm.settings.truncate]
+    assert alone == [arm.pruning for arm in arms if arm.settings.truncate]
+    assert {each.score for each in alone} == set(SCORES) - {"removal-error-per-price"}
+    assert {each.keep for each in alone} == {0.4, 0.6, 0.8}
 
 
 def test_iterations_compares_lengths():

@@ -8,12 +8,13 @@ import shutil
 from dataclasses import replace
 
 import pytest
+import torch
 from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins.experiments import catalogue, running
-from fragprune_plugins.experiments.catalogue import Arm, Experiment
+from fragprune_plugins.experiments.catalogue import Arm, Experiment, Pruning
 from fragprune_plugins.experiments.rules import alpha_cutoff
 from fragprune_plugins.learning.schedule import Settings
 
@@ -227,3 +228,29 @@ def test_an_arm_truncates_from_where_it_opens(words, trained, monkeypatch):
     for key in ("fragments_per_pixel", "psnr", "psnr_training"):
         assert never[key] == control[key]
     assert early["fragments_per_pixel"] < control["fragments_per_pixel"]
+
+
+def test_prunes_before_training_and_scores_once(words, trained, monkeypatch):
+    scored = []
+
+    def by_row(model, thresholds, views, engine):
+        scored.append(len(list(views)))
+        return torch.arange(len(model))
+
+    def pruned(iterations, train=None):
+        control = replace(few(iterations).arms[0].settings)
+        prunings = [Pruning("opacity", keep) for keep in (0.5, 0.1)]
+        arms = [Arm("opacity", f"{each.keep:.0%}", control, pruning=each) for each in prunings]
+        return Experiment("rules", "What wins?", (Arm("control", "", control), *arms))
+
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", pruned)
+    monkeypatch.setitem(running.SCORES, "opacity", by_row)
+    report = run_json(*words)
+    _, control, half, tenth = report["rows"]
+    assert [row["gaussians"] for row in (control, half, tenth)] == [60, 30, 6]
+    assert control["against_control"] is None
+    assert tenth["against_control"] == pytest.approx(tenth["psnr"] - control["psnr"])
+    assert scored == [7]  # the training views, once for both arms
+    arms = report["configuration"]["arms"]
+    assert arms["opacity 50%"]["pruning"] == {"score": "opacity", "keep": 0.5}
+    assert "pruning" not in arms["control"]

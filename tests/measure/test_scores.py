@@ -1,0 +1,198 @@
+"""Scores equal what loops over floats give, fragment by fragment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from finetune import tiny
+from oracle import naive
+
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.errors import InputError
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.measure import scores
+from fragprune_plugins.storage.models import Model
+from fragprune_plugins.types import RasterInputs
+
+COUNT = 20
+VIEWS = [
+    replace(camera.view(), background=torch.tensor([0.2, 0.5, 0.9])) for camera in tiny.cameras(3)
+]
+
+
+def scene(truncated):
+    model = tiny.random_model(COUNT, seed=3)
+    model.opacity[:2] = -6.0  # faint: no fragment
+    model.xyz[2] += 40  # in no picture
+    stream = torch.Generator().manual_seed(1)
+    thresholds = 0.02 + 0.6 * torch.rand(COUNT, generator=stream) if truncated else None
+    return model, thresholds
+
+
+def pixels(model, thresholds):
+    """For each pixel of each view: the fragments that are drawn, and the background."""
+    splats = model.splats()
+    splats = replace(
+        splats,
+        **{k: v.double() for k, v in vars(splats).items() if isinstance(v, torch.Tensor)},
+    )
+    for number, view in enumerate(VIEWS):
+        view = replace(
+            view, **{k: v.double() for k, v in vars(view).items() if isinstance(v, torch.Tensor)}
+        )
+        inputs = RasterInputs(view, splats)
+        ordered = naive.splats_of(inputs, thresholds)
+        opacities = {splat.row: splat.opacity for splat in ordered}
+        for y in range(view.height):
+            for x in range(view.width):
+                records = [r for r in naive.records_at(ordered, x, y)[0] if r.drawn]
+                yield number, records, view.background.tolist(), opacities
+
+
+def colour(fragments, background):
+    """RGB of a pixel from (alpha, RGB) front to back."""
+    light, out = 1.0, [0.0] * 3
+    for alpha, rgb in fragments:
+        out = [o + light * alpha * c for o, c in zip(out, rgb, strict=True)]
+        light *= 1 - alpha
+    return [o + light * b for o, b in zip(out, background, strict=True)]
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["whole", "truncated"])
+def expected(request):
+    """Every score by brute force, and the scene."""
+    model, thresholds = scene(request.param)
+    splats = model.splats()
+    keys = ("total-weight", "largest-weight", "falloff-gradient", "removal-error", "hits")
+    found = {key: [0.0] * COUNT for key in keys}
+    mean = [[[0.0, 0, 0] for _ in VIEWS] for _ in range(COUNT)]  # weight, fragments, wins
+    for number, records, background, opacities in pixels(model, thresholds):
+        pairs = [(r.alpha, r.color) for r in records]
+        whole = colour(pairs, background)
+        weights = [r.alpha * r.light for r in records]
+        for k, (record, weight) in enumerate(zip(records, weights, strict=True)):
+            row = record.row
+            found["total-weight"][row] += weight
+            found["largest-weight"][row] = max(found["largest-weight"][row], weight)
+            found["hits"][row] += 1
+            without = colour(pairs[:k] + pairs[k + 1 :], background)
+            found["removal-error"][row] += sum(
+                (a - b) ** 2 for a, b in zip(whole, without, strict=True)
+            )
+            step = 1e-4  # a pixel is linear in one falloff: any step is exact
+            moved = record.alpha + step * opacities[row], record.color
+            more = [*pairs[:k], moved, *pairs[k + 1 :]]
+            slope = (sum(colour(more, background)) - sum(whole)) / step
+            found["falloff-gradient"][row] += slope**2
+            mean[row][number][0] += weight
+            mean[row][number][1] += 1
+        if weights:
+            mean[records[weights.index(max(weights))].row][number][2] += 1
+    found["mini-splatting"] = [
+        sum(weight / hits for weight, hits, wins in views if wins) for views in mean
+    ]
+    volumes = splats.scales.double().prod(dim=1)
+    hits = torch.tensor(found.pop("hits"), dtype=torch.float64)
+    found["light-gaussian"] = (splats.opacities.double() * hits * volumes**0.1).tolist()
+    found["opacity"] = splats.opacities.double().tolist()
+    price = hits / len(VIEWS) + scores.GAUSSIAN_PRICE
+    error = torch.tensor(found["removal-error"], dtype=torch.float64)
+    found["removal-error-per-price"] = (error / price).tolist()
+    return model, thresholds, found
+
+
+EXACT = sorted(set(scores.SCORES) - {"removal-error", "removal-error-per-price"})
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_a_score_equals_that_of_loops_over_floats(expected, name):
+    model, thresholds, found = expected
+    got = scores.SCORES[name](model, thresholds, VIEWS, create_engine("auto"))
+    assert got.shape == (COUNT,)
+    assert got.tolist() == pytest.approx(found[name], rel=1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["removal-error", "removal-error-per-price"])
+def test_the_removal_error_is_estimated_without_bias(expected, name, monkeypatch):
+    """With P probes over many pixels the relative error is about sqrt(2 / (P x views))."""
+    model, thresholds, found = expected
+    monkeypatch.setattr(scores, "PROBES", 400)
+    got = scores.SCORES[name](model, thresholds, VIEWS, create_engine("auto"))
+    truth = torch.tensor(found[name]).float()
+    spread = (2 / (400 * 1)) ** 0.5  # as if only one view counted
+    assert ((got - truth).abs() <= 4 * spread * truth + 1e-9).all()
+    assert (got[:3] == 0).all()
+
+
+def test_the_removal_error_is_the_same_every_time():
+    model, _ = scene(False)
+    torch.manual_seed(1)
+    first = scores.removal_error(model, None, VIEWS, create_engine("auto"))
+    torch.manual_seed(2)
+    assert torch.equal(first, scores.removal_error(model, None, VIEWS, create_engine("auto")))
+
+
+@pytest.mark.parametrize(("share", "count"), [(1.0, 5), (0.6, 3), (0.5, 2), (0.01, 1)])
+def test_the_best_are_as_many_as_asked_for_even_if_scores_are_equal(share, count):
+    kept = scores.best(torch.tensor([0.0, 2.0, 0.0, 0.0, 1.0]), share)
+    assert int(kept.sum()) == count
+    assert kept[1]
+    assert kept.tolist() == [count >= 3, True, count >= 4, count >= 5, count >= 2]
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1, 1.1, float("nan")])
+def test_a_share_that_is_none_is_refused(share):
+    with pytest.raises(InputError, match="share"):
+        scores.best(torch.ones(3), share)
+
+
+def test_thresholds_and_moments_stay_with_their_rows():
+    model, _ = scene(False)
+    store = ThresholdStore(len(model))
+    store.open(model.splats().opacities)
+    store.logits.grad = torch.linspace(-1, 1, len(model))
+    store.step(0.05)
+    state = store.state_dict()
+    engine = create_engine("auto")
+    smaller, kept_store = scores.keep_best(Model(model, store), 0.5, VIEWS, engine=engine)
+    kept = scores.best(scores.removal_error(model, store.values.detach(), VIEWS, engine), 0.5)
+    assert len(smaller) == len(kept_store) == COUNT // 2
+    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
+        assert torch.equal(getattr(smaller, name), getattr(model, name)[kept])
+    for name in ("logits", "exp_avg", "exp_avg_sq"):
+        assert torch.equal(kept_store.state_dict()[name], state[name][kept])
+    assert len(store) == len(model)  # what was given is as it was
+
+
+def test_a_model_without_thresholds_is_pruned_by_the_score_that_is_asked_for():
+    model, _ = scene(False)
+    smaller, none = scores.keep_best(Model(model), 0.3, VIEWS, score=scores.opacity)
+    assert none is None
+    faintest = model.opacity[:, 0].sort(descending=True).values[int(0.3 * COUNT) - 1]
+    assert torch.equal(smaller.opacity, model.opacity[model.opacity[:, 0] >= faintest])
+
+
+def test_what_can_be_spared_costs_no_more_than_its_share_of_the_error(tmp_path):
+    truth = tiny.random_model()
+    model, shots = tiny.perturbed(truth), tiny.dataset_in_memory(tmp_path, truth).train
+    engine = create_engine("auto")
+    left = scores.keep_needed(Model(model), shots, engine=engine).splat
+    splats = model.splats()
+    with torch.no_grad():
+        pictures = [(engine.rasterize(RasterInputs(s.view, splats), None).image, s) for s in shots]
+    error = sum(float((p.clamp(0, 1) - s.image).square().sum()) for p, s in pictures)
+    each = scores.removal_error(model, None, [s.view for s in shots], engine)
+    gone = torch.tensor([not (left.xyz == row).all(dim=1).any() for row in model.xyz])
+    assert 0 < int(gone.sum()) == len(model) - len(left)
+    spent = float(each[gone].sum())
+    assert spent <= scores.SPARE * error < spent + float(each[~gone].min())
+    assert each[gone].max() <= each[~gone].min()
+
+
+def test_one_gaussian_stays_even_if_all_can_be_spared(tmp_path, monkeypatch):
+    truth = tiny.random_model()
+    monkeypatch.setattr(scores, "SPARE", 1e9)
+    shots = tiny.dataset_in_memory(tmp_path, truth).train
+    assert len(scores.keep_needed(Model(truth), shots).splat) == 1
