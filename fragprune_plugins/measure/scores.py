@@ -34,14 +34,14 @@ PROBES = 4
 SPARE = 0.002
 """Share of the squared error up to which ``keep_needed`` removes.
 
-Errors of neighbours add up, so it rises by three to seven times as much: 0.02 to 0.07 dB on three
+Errors of neighbours add up, so it rises by three to eight times as much: 0.02 to 0.07 dB on three
 scenes for 11 % to 17 % of the Gaussians. Learning makes up for that.
 """
 
 GAUSSIAN_PRICE = 30.0
 """Fragments that a Gaussian itself costs in a frame: its projection and its places in lists.
 
-On the cpu engine 21 to 47, by the stages of frames of three scenes at 90x160 to 1024x1024 pixels.
+On the cpu engine 21 to 94, by the stages of six frames of three scenes, 90x160 to 1024x1024 pixels.
 """
 
 
