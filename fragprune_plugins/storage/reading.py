@@ -7,6 +7,7 @@ bounds their size. What a parser raises in there becomes the door's one error, w
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import stat
@@ -23,6 +24,16 @@ NESTING = 64
 """Most levels of a JSON value; what we read has six at most."""
 
 _SAID = 200  # characters of a parser's own words
+
+
+class _Bounded(io.BufferedReader):
+    """A file that allocates no more for a read than it has bytes left; Python's own does."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read up to ``size`` bytes."""
+        if size is not None and size > MEBIBYTE:
+            size = min(size, max(0, os.fstat(self.fileno()).st_size - self.tell()))
+        return super().read(size)
 
 
 @dataclass
@@ -136,7 +147,7 @@ class Door:
             self._expect_regular(path, path.stat().st_mode)  # opening a device may do something
             # Without O_NONBLOCK, a pipe put there meanwhile would wait for a writer.
             flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-            file = os.fdopen(os.open(path, flags), "rb")
+            file = _Bounded(io.FileIO(os.open(path, flags)))
         except FileNotFoundError as error:
             raise self._absent(path, f"no such {self.noun}") from error
         except (OSError, ValueError) as error:  # ValueError: a NUL in the name

@@ -9,8 +9,8 @@ import struct
 
 import pytest
 import torch
+from attack.hostile import EYE, GEOMETRY, NAN, camera_entry, header, image_record, png, special
 from finetune import tiny
-from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from fragprune_plugins.datasets import colmap
@@ -50,20 +50,6 @@ def no_waiting():
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
-
-
-def special(path, kind):
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "device":
-        path.symlink_to("/dev/zero")
-    elif kind == "loop":
-        path.symlink_to(path)
-    elif kind == "dangling":
-        path.symlink_to(path.with_name("nowhere"))
-    return path
 
 
 def read_colmap(path):
@@ -191,10 +177,6 @@ def test_json_is_bounded_in_depth(tmp_path, depth):
 # -- PLY -----------------------------------------------------------------------------------------
 
 
-def header(*lines, start="ply\nformat binary_little_endian 1.0\n"):
-    return (start + "\n".join(lines) + "\nend_header\n").encode()
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -263,18 +245,7 @@ def test_text_and_elements_before_the_vertices_are_read(tmp_path):
 
 
 def write_cameras(path, **changed):
-    camera = tiny.cameras(1)[0]
-    entry = {
-        "id": 0,
-        "img_name": "a",
-        "width": 32,
-        "height": 32,
-        "position": [0.0, 0.0, -3.0],
-        "rotation": camera.rotation.T.tolist(),
-        "fx": 36.0,
-        "fy": 36.0,
-    }
-    path.write_text(json.dumps([entry, entry | changed]))
+    path.write_text(json.dumps([camera_entry(), camera_entry() | changed]))
     return path
 
 
@@ -283,32 +254,6 @@ def write_transforms(path, matrix, **changed):
     frames = [{"file_path": "a", "transform_matrix": matrix}]
     path.write_text(json.dumps(content | {"frames": frames} | changed))
     return path
-
-
-EYE = torch.eye(4).tolist()
-NAN = float("nan")
-
-GEOMETRY = {
-    "focal 0": {"fx": 0.0},
-    "focal negative": {"fy": -36.0},
-    "focal NaN": {"fx": NAN},
-    "focal infinite": {"fx": float("inf")},
-    "focal tiny": {"fx": 1e-9},
-    "focal huge": {"fx": 1e12},
-    "width 0": {"width": 0},
-    "width vast": {"width": 10**9},
-    "width of 400 digits": {"width": 10**400},
-    "width infinite": {"width": float("inf")},
-    "rotation singular": {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 0]]},
-    "rotation NaN": {"rotation": [[1, 0, 0], [0, NAN, 0], [0, 0, 1]]},
-    "rotation scaled": {"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]},
-    "rotation mirrored": {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]},
-    "rotation ragged": {"rotation": [[1, 0, 0], [0, 1], [0, 0, 1]]},
-    "rotation flat": {"rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1]},
-    "position NaN": {"position": [0, NAN, 0]},
-    "position far": {"position": [1e30, 0, 0]},
-    "position short": {"position": [0, 0]},
-}
 
 
 @pytest.mark.parametrize("how", GEOMETRY)
@@ -345,11 +290,6 @@ def test_transforms_that_are_none_are_refused(tmp_path, matrix, changed):
 def test_rounded_matrices_are_accepted(tmp_path, rounded):
     turn = tiny.cameras(7)[3].rotation.T.numpy().round(rounded).tolist()
     assert len(load_cameras(write_cameras(tmp_path / "cameras.json", rotation=turn))) == 2
-
-
-def image_record(points=0, count=1, quaternion=(1, 0, 0, 0), name=b"a.png\0"):
-    pose = struct.pack("<i7di", 1, *quaternion, 0, 0, 3, 7)
-    return struct.pack("<Q", count) + pose + name + struct.pack("<Q", points)
 
 
 @pytest.mark.parametrize(
@@ -423,19 +363,6 @@ def sidecar_metadata(path):
 
     with safe_open(path, framework="pt") as file:
         return file.metadata()
-
-
-def png(width, height):
-    """A PNG that says that it is so large, of 70 bytes."""
-    import io
-    import zlib
-
-    out = io.BytesIO()
-    Image.new("RGB", (1, 1)).save(out, format="PNG")
-    content = bytearray(out.getvalue())
-    content[16:24] = struct.pack(">II", width, height)
-    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
-    return bytes(content)
 
 
 @pytest.mark.parametrize("size", [(20_000, 8_001), (60_000, 60_000), (2**31 - 1, 1)])
