@@ -168,7 +168,8 @@ def hostile_colmap(options: Options) -> Result:
             shutil.rmtree(at.data)
             tiny.write_colmap(at.data, [torch.zeros(3, 32, 32)] * 9)
         for name, content in files.items():
-            (sparse / name).write_bytes(content)
+            binary = name == "images.bin"
+            (sparse / name).write_bytes(hostile.among(content) if binary else content)
 
     cases = hostile.COLMAP | hostile.COLMAP_TEXT
     return _each(options, cases, put, lambda at: commands(at, "render"))
