@@ -6,7 +6,7 @@ drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs, slice_
 its script  CommandLine, ConfigFile, Photographs
 of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
             share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages
-files       SplatFile, read_ply
+files       Door, for those that a host reads; SplatFile, read_ply
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
@@ -45,6 +45,7 @@ from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall, revised
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.storage.reading import Door
 from fragprune_plugins.types import (
     Footprints,
     Moment,
@@ -75,6 +76,7 @@ __all__ = [
     "CommandLine",
     "ConfigFile",
     "Dialect",
+    "Door",
     "EngineError",
     "Finding",
     "Footprints",

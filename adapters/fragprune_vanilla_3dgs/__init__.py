@@ -8,20 +8,28 @@ before mid-July 2023 have no checkpoints, so stage 2 is not possible.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.adapting import (
+    Door,
     Finding,
     GraphdecoAdapter,
     HostAdapter,
     HostInfo,
     HostRepo,
+    ModelFileError,
     RasterizerCall,
     graphdeco,
     hookimpl,
+)
+
+_EXPOSURES = Door(
+    ModelFileError,
+    "not readable as exposures",
+    "the exposure.json that the host wrote",
+    "Remove it to begin with neutral exposures.",
 )
 
 OUTPUTS = 3
@@ -82,10 +90,11 @@ class Vanilla3DGS(GraphdecoAdapter):
         file = output / "exposure.json" if output else None
         if not mapping or file is None or not file.exists():
             return
-        saved = json.loads(file.read_text())
-        with torch.no_grad():
+        with _EXPOSURES.reading(file) as reading, torch.no_grad():
+            saved = reading.json()
             for image, row in mapping.items():
                 if image in saved:
+                    reading.place = image
                     model._exposure[row] = torch.tensor(saved[image]).to(model._exposure)
 
 

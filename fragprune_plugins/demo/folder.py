@@ -9,9 +9,12 @@ from pathlib import Path
 
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.storage.atomic import digest, replacing, writable_folder
+from fragprune_plugins.storage.reading import MEBIBYTE, Door
 
 MARKER = ".fragprune-demo"
 """JSON with "files": SHA-256 of each file that the demo wrote, by path in the folder."""
+
+_DOOR = Door(OutputError, "no list", "a list of files", "Remove it.", limit=MEBIBYTE)
 
 _REMEDY = "Choose another --out, or move your files away and delete the others yourself."
 
@@ -74,9 +77,9 @@ def _files(out: Path) -> dict[str, Path]:
 def _listed(out: Path) -> dict[str, str]:
     """SHA-256 by path, as the marker lists them; {} if the marker is missing or broken."""
     try:
-        files = json.loads((out / MARKER).read_text(encoding="utf-8"))["files"]
-        return {str(name): str(sha) for name, sha in files.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        with _DOOR.reading(out / MARKER) as reading:
+            return {str(name): str(sha) for name, sha in reading.json()["files"].items()}
+    except OutputError:
         return {}
 
 

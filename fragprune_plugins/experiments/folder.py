@@ -19,10 +19,19 @@ from typing import Any
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.storage.atomic import replacing, writable_folder
+from fragprune_plugins.storage.reading import MEBIBYTE, Door
 from fragprune_plugins.storage.records import strict
 
 RESULTS = (".md", ".csv", ".png")
 """Endings of the files that results are written to, after the experiment's name."""
+
+_DOOR = Door(
+    RecordError,
+    "unreadable",
+    "a file that an experiment wrote",
+    "Remove it.",
+    limit=64 * MEBIBYTE,
+)
 
 _ARMS = "arms"
 _SAID = 5  # differences that a refusal lists
@@ -188,15 +197,11 @@ def _csv(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+    with _DOOR.reading(path) as reading:
+        content = reading.json()
         if not isinstance(content, dict):
             raise ValueError("not an object")
         return content
-    except (OSError, ValueError) as error:
-        raise RecordError(
-            str(path), f"unreadable ({error})", "a file that an experiment wrote", "Remove it."
-        ) from error
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:

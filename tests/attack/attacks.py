@@ -179,13 +179,10 @@ def hostile_images(options: Options) -> Result:
     def put(at: Scene, content: bytes) -> None:
         (at.data / "images" / "view01.png").write_bytes(content)
 
-    return _each(
-        options, hostile.images(), put, lambda at: commands(at, "finetune") | _all_views(at)
-    )
+    def words(at: Scene) -> dict[str, tuple[object, ...]]:
+        return {"profile": (*commands(at, "profile")["profile"], "--views", "all")}
 
-
-def _all_views(at: Scene) -> dict[str, tuple[object, ...]]:
-    return {"profile": (*commands(at, "profile")["profile"], "--views", "all")}
+    return _each(options, hostile.images(), put, words)
 
 
 def hostile_cameras(options: Options) -> Result:
@@ -673,7 +670,7 @@ ATTACKS: dict[str, Callable[[Options], Result]] = {
     "hostile PLY through render": hostile_ply,
     "hostile sidecars through render, finetune, profile, export": hostile_sidecars,
     "hostile COLMAP models through render": hostile_colmap,
-    "hostile photographs through finetune and profile": hostile_images,
+    "hostile photographs through profile": hostile_images,
     "hostile transforms and cameras.json through render": hostile_cameras,
     "hostile records through report": hostile_records,
     "hostile sources through check": hostile_sources,
