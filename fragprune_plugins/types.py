@@ -66,6 +66,13 @@ def _check(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = F
         raise InputError(name, found, expected, "Check the call's arguments.")
 
 
+def _require(name: str, tensor: Tensor, *shape: int | None) -> None:
+    """Raise InputError as ``_check`` does, and if there is no tensor."""
+    if tensor is None:
+        raise InputError(name, "None", "a torch.Tensor", "Check the call's arguments.")
+    _check(name, tensor, *shape)
+
+
 def _is_whole(dtype: torch.dtype) -> bool:
     """Whether a dtype is an integer type; torch has no common name for them."""
     import torch
@@ -110,8 +117,8 @@ def check_pose(rotation: Tensor, translation: Tensor) -> None:
     """
     import torch
 
-    _check("rotation", rotation, 3, 3)
-    _check("translation", translation, 3)
+    _require("rotation", rotation, 3, 3)
+    _require("translation", translation, 3)
     exact = rotation.detach().double()
     skew = float((exact @ exact.T - torch.eye(3).to(exact)).abs().max())
     # NaN, too, is not within the tolerance.
@@ -186,10 +193,10 @@ class View:
 
     def __post_init__(self) -> None:
         _check_size(self.width, self.height)
-        _check("View.viewmatrix", self.viewmatrix, 4, 4)
-        _check("View.projmatrix", self.projmatrix, 4, 4)
-        _check("View.campos", self.campos, 3)
-        _check("View.background", self.background, 3)
+        _require("View.viewmatrix", self.viewmatrix, 4, 4)
+        _require("View.projmatrix", self.projmatrix, 4, 4)
+        _require("View.campos", self.campos, 3)
+        _require("View.background", self.background, 3)
 
     def to(self, device: torch.device | str) -> View:
         """The same camera with its tensors on a device."""
@@ -343,9 +350,9 @@ class Splats:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        _check("Splats.means", self.means, None, 3)
+        _require("Splats.means", self.means, None, 3)
         n = len(self.means)
-        _check("Splats.opacities", self.opacities, n)
+        _require("Splats.opacities", self.opacities, n)
         _check("Splats.scales", self.scales, n, 3)
         _check("Splats.rotations", self.rotations, n, 4)
         _check("Splats.cov3d", self.cov3d, n, 6)
@@ -414,7 +421,7 @@ class SpacetimeSplats:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        _check("SpacetimeSplats.means", self.means, None, 3)
+        _require("SpacetimeSplats.means", self.means, None, 3)
         n = len(self.means)
         widths: dict[str, tuple[int | None, ...]] = {
             **dict.fromkeys(("opacities", "times", "scales_t"), ()),
@@ -544,12 +551,12 @@ class Footprints:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        _check("Footprints.means2d", self.means2d, None, 2)
+        _require("Footprints.means2d", self.means2d, None, 2)
         n = len(self.means2d)
-        _check("Footprints.conics", self.conics, n, 3)
-        _check("Footprints.depths", self.depths, n)
-        _check("Footprints.opacities", self.opacities, n)
-        _check("Footprints.colors", self.colors, n, 3)
+        _require("Footprints.conics", self.conics, n, 3)
+        _require("Footprints.depths", self.depths, n)
+        _require("Footprints.opacities", self.opacities, n)
+        _require("Footprints.colors", self.colors, n, 3)
         _check("Footprints.tiles", self.tiles, n, 4, whole=True)
         _check_features("Footprints.features", self.features, n)
 

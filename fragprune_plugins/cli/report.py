@@ -23,7 +23,7 @@ from fragprune_plugins.cli.common import (
 )
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.storage import models
-from fragprune_plugins.storage.reading import MEBIBYTE, Door
+from fragprune_plugins.storage.reading import MEBIBYTE, Door, lies_in
 from fragprune_plugins.storage.records import DOOR
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ def _draw(
     if drawn is None:
         return [], [], ""
     scene = drawn.photographs if data is None else replace(drawn.photographs, folder=data)
-    allowed = [each for each in drawn.models if data is not None or _lies_in(each, inside)]
+    allowed = [each for each in drawn.models if data is not None or lies_in(each, inside)]
     learning: list[tuple[str, str]] = []
     try:
         engine, device = opened()
@@ -259,7 +259,7 @@ def _draw(
                 rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
                 report_page.save_learning(folder / report_page.LEARNING, rows, values)
             learning = [("How it learned", report_page.LEARNING)]
-        if data is None and not (len(allowed) == 2 and _lies_in(scene.folder, inside)):
+        if data is None and not (len(allowed) == 2 and lies_in(scene.folder, inside)):
             return [], learning, f"No views are shown: they need files outside of {inside}. {_HOW}"
         dataset = load_photographs(scene)
     except (DatasetError, ModelFileError, SidecarError) as error:
@@ -271,11 +271,6 @@ def _draw(
     return list(views), learning, ""
 
 
-def _lies_in(path: Path, folder: Path) -> bool:
-    """Whether a path is in a folder once all links are followed."""
-    return path.resolve().is_relative_to(folder.resolve())
-
-
 def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
     """Copy pictures of compare and profile into the folder; returns (heading, file) of each.
 
@@ -285,7 +280,7 @@ def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str,
     for record in records:
         for name in record.data.get("files", ()):
             file = record.path.parent / Path(name).name
-            if not _lies_in(file, inside):
+            if not lies_in(file, inside):
                 continue
             with contextlib.suppress(RecordError), _PICTURE.reading(file) as reading:
                 content = reading.file.read()

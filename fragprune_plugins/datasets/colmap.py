@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -56,7 +57,7 @@ Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
 def find_model(folder: Path) -> Path | None:
     """The folder with the cameras and images files: sparse/0 or sparse; None if neither."""
     for candidate in (folder / "sparse" / "0", folder / "sparse"):
-        if any((candidate / f"images.{kind}").exists() for kind in ("bin", "txt")):
+        if any(os.path.exists(candidate / f"images.{kind}") for kind in ("bin", "txt")):
             return candidate
     return None
 

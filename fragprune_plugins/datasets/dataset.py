@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -171,12 +172,12 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[colmap.Row], 
             unknown, or there are no training or no held-out cameras.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # False for a name that no folder can have, too
         raise DatasetError(
             str(folder), "no such folder", "a folder with photographs", "Check --data."
         )
     is_colmap = colmap.find_model(folder) is not None
-    is_blender = (folder / "transforms_train.json").exists()
+    is_blender = os.path.exists(folder / "transforms_train.json")
     layouts = "sparse/0 with images/ (COLMAP), or transforms_train.json (Blender)"
     if is_colmap == is_blender:
         found = "both a COLMAP and a Blender layout" if is_colmap else "neither layout"

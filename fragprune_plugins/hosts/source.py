@@ -17,7 +17,7 @@ from typing import Literal
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.seams import Seam
-from fragprune_plugins.storage.reading import MEBIBYTE, Door
+from fragprune_plugins.storage.reading import MEBIBYTE, Door, lies_in
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -105,7 +105,7 @@ class HostRepo:
 
         Package managers install packages as links, so installed ones may lead anywhere.
         """
-        return bool(self.package) or path.resolve().is_relative_to(self.root)
+        return bool(self.package) or lies_in(path, self.root)
 
     def _read(self, path: Path) -> str:
         """The text of a file; "" where it is missing, or leads out of the checkout."""

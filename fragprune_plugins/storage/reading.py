@@ -169,6 +169,14 @@ class Door:
         return self.error(str(path), found, self.expected, self.missing)
 
 
+def lies_in(path: Path, folder: Path) -> bool:
+    """Whether a path is in a folder once all links of both are followed."""
+    try:
+        return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+    except (OSError, ValueError):  # a NUL in the name
+        return False
+
+
 def parse_json(text: str) -> Any:
     """The JSON value of a text.
 

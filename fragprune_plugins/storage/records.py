@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.storage.atomic import replacing
-from fragprune_plugins.storage.reading import MEBIBYTE, Door
+from fragprune_plugins.storage.reading import MEBIBYTE, Door, lies_in
 
 SUFFIX = ".fragprune.json"
 FORMAT = "fragprune-record-1"
@@ -89,9 +90,10 @@ def find(folder: Path) -> list[Record]:
 def files(folder: Path, *, below: bool = False) -> list[Path]:
     """The files of records in a folder, optionally also below it, oldest first."""
     find_files = Path(folder).rglob if below else Path(folder).glob
-    root = Path(folder).resolve()
-    inside = (path for path in find_files(f"*{SUFFIX}") if path.resolve().is_relative_to(root))
-    return sorted((each for each in inside if each.exists()), key=lambda each: each.stat().st_mtime)
+    inside = (path for path in find_files(f"*{SUFFIX}") if lies_in(path, folder))
+    return sorted(
+        (each for each in inside if os.path.exists(each)), key=lambda each: each.stat().st_mtime
+    )
 
 
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:

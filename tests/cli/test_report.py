@@ -154,7 +154,9 @@ def test_without_being_asked_nothing_outside_of_the_folder_is_read(folder, tmp_p
     (out / "linked.fragprune.json").symlink_to(tmp_path / "elsewhere.fragprune.json")
     (out / "text.png").write_text("no picture, but a note")
     tiny.save_png(out / "own.png", torch.rand(3, 8, 8))
-    names = ["linked.png", "text.png", "own.png", str(secret)]
+    (out / "round.png").symlink_to(out / "round.png")
+    (out / "round.fragprune.json").symlink_to(out / "round.fragprune.json")
+    names = ["round.png", "\0", "", "..", "linked.png", "text.png", "own.png", str(secret)]
     records.leave(out / "pruned", "finetune", record.data | {"files": names})
     opened, listening = [], True
     sys.addaudithook(lambda event, given: listening and event == "open" and opened.append(given[0]))

@@ -411,8 +411,11 @@ def test_a_checkout_is_read_inside_of_it(tmp_path):
     (host / "train.py").symlink_to(tmp_path / "secret.py")
     (host / "own.py").symlink_to(host / "real.py")
     (host / "real.py").write_text("def train(): ...\n")
+    (host / "round.py").symlink_to(host / "round.py")
     repo = HostRepo(host)
     assert repo.path("train") is None
+    assert repo.path("round") is None
+    assert repo.path("x" * 300) is None
     assert repo.function("own", "train") is not None
 
 
