@@ -144,6 +144,12 @@ class RecordError(FragpruneError):
     code = "record"
 
 
+class PathError(FragpruneError):
+    """A path that the system refuses: too long a name, no permission, no space left."""
+
+    code = "path"
+
+
 class MemoryLimitError(FragpruneError):
     """A command needs more memory than the machine gives it."""
 

@@ -18,6 +18,7 @@ from fragprune_plugins.errors import (
     Interrupted,
     MemoryLimitError,
     OutputError,
+    PathError,
     Terminated,
     UsageError,
     printable,
@@ -126,7 +127,7 @@ class Command(click.Command):
         """Run the command, print its report or error, and exit with its code."""
         as_json = ctx.meta[JSON] = bool(ctx.params.pop("as_json"))
         try:
-            with _memory_stated(ctx.command_path):
+            with _machine_stated(ctx.command_path):
                 report: Report = super().invoke(ctx)
         except FragpruneError as error:
             if as_json:
@@ -161,10 +162,19 @@ class Group(click.Group):
 
 
 @contextlib.contextmanager
-def _memory_stated(where: str) -> Iterator[None]:
-    """State a failure to get memory, which each library raises in its own way."""
+def _machine_stated(where: str) -> Iterator[None]:
+    """State what the machine refuses wherever a command meets it: a path, or memory."""
     try:
         yield
+    except OSError as error:
+        if not error.filename:  # a closed pipe, for one
+            raise
+        raise PathError(
+            str(error.filename),
+            error.strerror or str(error),
+            "a path that the system takes",
+            "Choose another name or place, or free space and permissions there.",
+        ) from error
     except (MemoryError, RuntimeError) as error:
         words = str(error).split("\n", 1)[0][:200]
         known = "allocate memory" in words or "out of memory" in words  # torch's, of CPU and GPU

@@ -65,7 +65,7 @@ def beside(result: Path) -> Record | None:
         RecordError: the record cannot be read.
     """
     path = path_beside(result)
-    if not path.exists() or path.stat().st_mtime_ns < result.stat().st_mtime_ns:
+    if not os.path.exists(path) or path.stat().st_mtime_ns < result.stat().st_mtime_ns:
         return None
     return _read(path)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -97,7 +98,7 @@ def find(model: Path) -> Path | None:
         addressed = _address(model, digest(model))
         if addressed in waiting:
             return addressed
-    return path if path.exists() else None
+    return path if os.path.exists(path) else None  # also for too long a name
 
 
 def save(

@@ -271,20 +271,20 @@ def names(options: Options) -> Result:
             ):
                 outcome = in_child(lambda given=given: command(*given))
                 result.note(f"{given[0]} {name!r}", judged("", outcome))
-            long = at.model.rename(at.model.with_name("m" * 240 + ".ply"))
-            for given in (
-                ("render", long, "--data", at.data, "--out", at.out),
-                ("profile", long, "--data", at.data, "--out", at.folder / ("x" * 300)),
-                ("finetune", long, "--data", at.data, "--iters", 1, "--out", at.out / long.name),
-            ):
-                outcome = in_child(lambda given=given: command(*given))
-                result.note(f"{given[0]} with names of 240 letters", outcome)
-            long.rename(at.model)
             entry = hostile.camera_entry() | {"img_name": name}
             (at.folder / "c.json").write_text(json.dumps([entry, entry]))
             given = ("render", at.model, "--cameras", at.folder / "c.json", "--out", at.out)
             outcome = in_child(lambda given=given: _inside(given, at))
             result.note(f"a view named {name!r}", judged(hostile.GOOD, outcome))
+    with fresh(options) as at:
+        long = at.model.rename(at.model.with_name("m" * 240 + ".ply"))
+        for given in (
+            ("render", long, "--data", at.data, "--out", at.out),
+            ("profile", long, "--data", at.data, "--out", at.folder / ("x" * 300)),
+            ("finetune", long, "--data", at.data, "--iters", 1, "--out", at.out / long.name),
+        ):
+            outcome = in_child(lambda given=given: command(*given))
+            result.note(f"{given[0]} with names of 240 letters", outcome)
     return result
 
 

@@ -218,3 +218,21 @@ def test_bugs_keep_their_traceback(scene, monkeypatch):
     monkeypatch.setattr("fragprune_plugins.measure.measure", bug)
     with pytest.raises(ZeroDivisionError):
         run("profile", path, "--data", data)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (MemoryError(), "memory"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you"), "memory"),
+        (OSError(36, "File name too long", "/a/b"), "path"),
+    ],
+)
+def test_what_the_machine_refuses_is_stated(scene, monkeypatch, error, code):
+    data, path, _ = scene
+
+    def refuse(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr("fragprune_plugins.measure.measure", refuse)
+    refused(("profile", path, "--data", data), code, "")

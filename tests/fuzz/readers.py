@@ -22,7 +22,7 @@ from fragprune_plugins.hosts.preflight import missing_imports
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import resumed_at
 from fragprune_plugins.measure.recorded import recorded
-from fragprune_plugins.storage import models, records, sidecar
+from fragprune_plugins.storage import checkpoints, models, records, sidecar
 from fragprune_plugins.types import RasterInputs, View
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -127,6 +127,12 @@ def _checkpoint(file: Path) -> None:
     resumed_at(Vanilla3DGS().command_line(HostRepo(HOST)), file)
 
 
+def _progress(file: Path) -> None:
+    tensors, values = checkpoints.load(file)
+    _sound("numbers that are not finite", all(map(_finite, tensors.values())))
+    _sound("no values", isinstance(values, dict))
+
+
 def _source(file: Path) -> None:
     """The bytes are two modules of a host: one that has seams, and its script."""
     (file.parent / "gaussian_renderer").mkdir(exist_ok=True)
@@ -181,6 +187,7 @@ READERS = [
     Reader("record", _record),
     Reader("image", _image),
     Reader("checkpoint", _checkpoint),
+    Reader("progress", _progress),
     Reader("source", _source),
     Reader("git", _git),
     Reader("config", _config),

@@ -19,7 +19,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import records, sidecar
+from fragprune_plugins.storage import checkpoints, records, sidecar
 from fragprune_plugins.storage.ply import write_ply
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -114,6 +114,13 @@ def _checkpoint(folder: Path) -> bytes:
     return path.read_bytes()
 
 
+def _progress(folder: Path) -> bytes:
+    path = folder / "progress.safetensors"
+    tensors = {"logits": torch.zeros(3), "exp_avg_sq.logits": torch.ones(3)}
+    checkpoints.save(path, tensors, {"configuration": {"iterations": 3}, "step": 2})
+    return path.read_bytes()
+
+
 def _cameras() -> bytes:
     cameras = [
         {
@@ -166,6 +173,7 @@ def make() -> dict[str, dict[str, bytes]]:
                 "a.tiff": _image("TIFF"),
             },
             "checkpoint": {"a.pth": _checkpoint(folder)},
+            "progress": {"a.safetensors": _progress(folder)},
             "source": {"renderer.py": renderer},
             "git": {"head": b"ref: refs/heads/main\n", "commit": b"0123456789abcdef" * 2 + b"\n"},
             "config": {"a.json": b'{"iterations": 30000, "source_path": "scene", "lambda": 0.2}'},
