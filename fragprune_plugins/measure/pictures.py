@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,13 +40,12 @@ def stems(names: Sequence[str]) -> list[str]:
     for name in names:
         plain = "".join(c if c.isalnum() or c in "._+-~() " else "_" for c in name)
         stem = Path(plain).stem.lstrip(".").encode()[:_STEM].decode(errors="ignore") or "view"
-        number = 1
-        each = stem
-        # Some file systems take upper for lower case. What stands beside a picture is taken, too.
-        while each.lower() in taken:
-            number += 1
-            each = f"{stem}-{number}"
-        taken |= {each.lower() + beside for beside in ("", *BESIDE)}
+        # Some file systems take upper for lower case.
+        for each in chain([stem], (f"{stem}-{number}" for number in count(2))):
+            files = {each.lower() + beside for beside in ("", *BESIDE)}
+            if taken.isdisjoint(files):
+                break
+        taken |= files
         found.append(each)
     return found
 

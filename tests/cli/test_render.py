@@ -52,6 +52,27 @@ def test_cameras_file_and_views(scene, tmp_path):
     assert len(report["files"]) == 9
 
 
+def test_two_views_of_one_name_are_two_pictures(scene, tmp_path):
+    _, path = scene
+    content = tiny.transforms(["train/r_0", "test/r_0"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    out = tmp_path / "pictures"
+    report = run_json("render", path, "--cameras", tmp_path / "path.json", "--out", out)
+    assert sorted(file.name for file in out.iterdir()) == ["r_0-2.png", "r_0.png"]
+    assert len(set(report["files"])) == 2
+    assert report["warnings"] == []
+
+
+def test_a_view_that_shows_nothing_is_warned_of(scene, tmp_path):
+    _, path = scene
+    content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
+    content["frames"][1]["transform_matrix"][2][3] = 1e5
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    words = ("render", path, "--cameras", tmp_path / "path.json", "--out", tmp_path / "pictures")
+    assert "Warning: 1 of 2 show no Gaussian" in run(*words).stdout
+    assert len(run_json(*words)["warnings"]) == 1
+
+
 def test_needs_exactly_one_source_of_cameras(scene, tmp_path):
     data, path = scene
     assert run("render", path, "--out", tmp_path / "x").exit_code == 2
