@@ -140,10 +140,10 @@ def _intrinsics(model: str, width: int, height: int, values: Sequence[float]) ->
 
 def _text_lines(reading: Reading) -> Iterator[str]:
     """The lines of a text file that are no comments; empty ones too."""
-    for number, line in enumerate(reading.text().splitlines(), start=1):
-        if not line.startswith("#"):
-            reading.place = f"line {number}"
-            yield line
+    for number, line in enumerate(reading.file, start=1):
+        reading.place = f"line {number}"
+        if not line.startswith(b"#"):
+            yield line.decode("utf-8")
 
 
 def _cameras_text(reading: Reading) -> Iterator[tuple[int, Intrinsics]]:

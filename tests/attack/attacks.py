@@ -197,23 +197,41 @@ def hostile_cameras(options: Options) -> Result:
 
 
 def hostile_records(options: Options) -> Result:
+    return _with_records(options, lambda at: {"report": ("report", at.out, "--threads", 1)})
+
+
+def hostile_comparisons(options: Options) -> Result:
+    """Records again: compare takes the photographs and the way of drawing out of them."""
+
+    def words(at: Scene) -> dict[str, tuple[object, ...]]:
+        return {"compare": ("compare", at.model, at.out / "o.ply", "--threads", 1)}
+
+    used = (*hostile.TEXTS, "as it is", "data", "command", "photographs", "resolution", "drawing")
+    return _with_records(options, words, used)
+
+
+def _with_records(
+    options: Options,
+    words: Callable[[Scene], dict[str, tuple[object, ...]]],
+    used: tuple[str, ...] = ("",),
+) -> Result:
+    """Hostile records beside a fine-tuned model; only cases whose names begin as ``used`` says."""
+    learned = options.folder / "learned"
     with fresh(options) as at:
         given = commands(at, "finetune")["finetune"]
-        kind, words = in_child(lambda: command(*given))
+        kind, said = in_child(lambda: command(*given))
         if kind != "fine":
-            raise RuntimeError(f"the fine-tuning of a good model: {kind}, {words}")
+            raise RuntimeError(f"the fine-tuning of a good model: {kind}, {said}")
         good = json.loads((at.out / "o.fragprune.json").read_text())
-        learned = options.folder / "learned"
         shutil.copytree(at.out, learned)
 
     def put(at: Scene, content: bytes) -> None:
         shutil.copytree(learned, at.out)
         (at.out / "o.fragprune.json").write_bytes(content)
 
-    def words_of(at: Scene) -> dict[str, tuple[object, ...]]:
-        return {"report": ("report", at.out, "--threads", 1)}
-
-    return _each(options, hostile.records(good), put, words_of)
+    cases = hostile.records(good).items()
+    chosen = {name: c for name, c in cases if name.removeprefix(hostile.GOOD).startswith(used)}
+    return _each(options, chosen, put, words)
 
 
 def hostile_sources(options: Options) -> Result:
@@ -365,9 +383,11 @@ def engine_from_python(options: Options) -> Result:
         def act() -> None:
             changed = {name: _wrong(dice, getattr(good.splats, name)) for name in _some(dice)}
             splats = replace(good.splats, **changed)
-            size = dice.choice((good.view.width, good.view.width, 0, -1, 1 << 20, 33))
+            usual = good.view.width
+            size = dice.choice((*[usual] * 6, 0, -1, 1 << 20, 33))
             view = replace(good.view, width=size, tan_fov_x=dice.choice(_VALUES))
-            thresholds = _wrong(dice, torch.rand(len(good.splats)))
+            thresholds = torch.rand(len(good.splats))
+            thresholds = dice.choice((None, thresholds, _wrong(dice, thresholds)))
             out = fp.rasterize(RasterInputs(view, splats), thresholds, engine=engine)
             assert bool(out.image.isfinite().all()), "a picture that is not finite"
 
@@ -682,6 +702,7 @@ ATTACKS: dict[str, Callable[[Options], Result]] = {
     "hostile photographs through profile": hostile_images,
     "hostile transforms and cameras.json through render": hostile_cameras,
     "hostile records through report": hostile_records,
+    "hostile records through compare": hostile_comparisons,
     "hostile sources through check": hostile_sources,
     "pipes, devices, folders and loops in place of files": no_files,
     "names that are too long, climb, or control a terminal": names,
