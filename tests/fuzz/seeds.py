@@ -43,11 +43,11 @@ FIGURES = {
 }
 
 
-def model(degree: int = 0) -> bytes:
-    """A splat of three Gaussians as a binary PLY."""
+def model(degree: int = 0, count: int = GAUSSIANS) -> bytes:
+    """A splat of a few Gaussians as a binary PLY."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "m.ply"
-        write_ply(path, tiny.random_model(GAUSSIANS, degree), torch.full((GAUSSIANS,), 0.2))
+        write_ply(path, tiny.random_model(count, degree), torch.full((count,), 0.2))
         return path.read_bytes()
 
 
@@ -154,6 +154,7 @@ def make() -> dict[str, dict[str, bytes]]:
             "ply": {
                 "binary.ply": model(),
                 "degree1.ply": model(1),
+                "more-body-than-head.ply": model(count=40),
                 "text.ply": _as(model(), text=True),
                 "big-endian.ply": _as(model(), byte_order=">"),
             },
