@@ -57,6 +57,14 @@ def _binary_number(dice: random.Random, data: bytearray) -> None:
     data[begin : begin + len(packed)] = packed
 
 
+def _body_number(dice: random.Random, data: bytearray) -> None:
+    """Overwrite one float32 of what follows the header, and leave the rest as it is."""
+    whole = len(data) // 4
+    if whole > 2:
+        begin = len(data) - 4 * (1 + dice.randrange(max(1, 2 * whole // 3)))
+        data[begin : begin + 4] = struct.pack(dice.choice("<>") + "f", dice.choice(_REAL))
+
+
 def _text_number(dice: random.Random, data: bytearray) -> None:
     """Replace a number in text by another, or by what is no number."""
     found = list(re.finditer(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?", bytes(data[:20_000])))
@@ -103,6 +111,9 @@ _CHANGES: tuple[Change, ...] = (
 def mutated(dice: random.Random, pool: Sequence[bytes]) -> bytes:
     """An input: a file of the pool with one to four changes, or two files joined."""
     data = bytearray(dice.choice(pool))
+    if dice.random() < 0.15:
+        _body_number(dice, data)
+        return bytes(data)
     if dice.random() < 0.03:
         other = dice.choice(pool)
         data = data[: dice.randrange(len(data) + 1)] + other[dice.randrange(len(other) + 1) :]
