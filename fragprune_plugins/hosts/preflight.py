@@ -177,7 +177,10 @@ def _own(roots: list[HostRepo], name: str) -> list[Module]:
 def _inside(repo: HostRepo, package: str) -> bool:
     """Whether a checkout has a package in any folder, because hosts extend the path."""
     files = (f"{package}.py", f"{package}/__init__.py")
-    return not repo.package and any(True for file in files for _ in repo.root.rglob(file))
+    try:
+        return not repo.package and any(True for file in files for _ in repo.root.rglob(file))
+    except OSError:  # too long a name for a file
+        return False
 
 
 def _present(package: str) -> bool:
