@@ -681,6 +681,9 @@ class RasterOutputs:
         wins_per_gaussian: (N,) int32 pixels in which its weight alpha T is the largest.
         winners: (H, W) int32 row of the Gaussian of largest weight, the first in depth order of
             equal ones; -1 where nothing is drawn.
+        entries_per_pixel: (Gaussian, tile) pairs in the engine's lists, per pixel. The cpu engine
+            counts those that it blends, which leaves out what lies behind a tile that is opaque.
+            NaN from engines that do not count.
     """
 
     image: Tensor
@@ -696,5 +699,6 @@ class RasterOutputs:
     weights_per_gaussian: Tensor | None = None
     wins_per_gaussian: Tensor | None = None
     winners: Tensor | None = None
+    entries_per_pixel: float = math.nan
 
     __repr__ = one_line

@@ -227,6 +227,7 @@ def collect(
         fragments=assemble(blocks, [drawing.fragments for drawing in drawings]),
         fragments_per_gaussian=per_gaussian,
         evaluated=sum(len(b.rows) * len(b.x) * len(b.y) for b in blocks),
+        entries=sum(len(b.rows) for b in blocks),
         features=layers[4:-1] if len(layers) > 5 else None,
         weights_per_gaussian=weights,
         winners=winners.to(torch.int32),

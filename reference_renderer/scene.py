@@ -132,6 +132,7 @@ class Rendering:
         fragments: (H, W) int32 drawn fragments of each pixel.
         fragments_per_gaussian: (N,) int32 drawn fragments of each Gaussian.
         evaluated: (Gaussian, pixel) pairs tested.
+        entries: (Gaussian, tile) pairs.
         features: (F, H, W) sum of alpha T feature; None where none were given.
         weights_per_gaussian: (N,) sum of alpha T over its drawn fragments; a constant.
         winners: (H, W) int32 row of the Gaussian of largest alpha T, the first in depth order of
@@ -147,6 +148,7 @@ class Rendering:
     fragments: Tensor
     fragments_per_gaussian: Tensor
     evaluated: int
+    entries: int
     features: Tensor | None
     weights_per_gaussian: Tensor
     winners: Tensor

@@ -47,14 +47,15 @@ class ReferenceEngine:
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
         inputs.check_thresholds(thresholds)
-        drawn = _draw(inputs, thresholds)
+        drawn, pixels = _draw(inputs, thresholds), inputs.view.width * inputs.view.height
         return RasterOutputs(
             image=drawn.image,
             radii=drawn.radii,
             invdepth=drawn.invdepth,
             alpha=drawn.alpha,
             fragments_per_pixel=drawn.fragments_per_pixel,
-            evaluated_per_pixel=drawn.evaluated / (inputs.view.width * inputs.view.height),
+            evaluated_per_pixel=drawn.evaluated / pixels,
+            entries_per_pixel=drawn.entries / pixels,
             fragments=drawn.fragments if inputs.counts else None,
             fragments_per_gaussian=drawn.fragments_per_gaussian if inputs.counts else None,
             features=drawn.features,

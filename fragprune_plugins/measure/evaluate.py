@@ -88,8 +88,9 @@ def measure(
     Returns:
         One dict a candidate: target ("photographs", or "itself" for a model's own pictures), psnr
         (dB; infinite against itself), ssim, lpips (None), fragments_per_pixel,
-        evaluated_per_pixel, gaussians, frame_ms (median over views and repeats), frame_ms_se
-        (standard error over repeats of the median over views), engine, device, views.
+        evaluated_per_pixel, entries_per_pixel (NaN from an engine that does not count them),
+        gaussians, frame_ms (median over views and repeats), frame_ms_se (standard error over
+        repeats of the median over views), engine, device, views.
     """
     device = candidates[0].model.xyz.device
     if isinstance(engine, str):
@@ -107,9 +108,11 @@ def measure(
                     ssim(outputs.image, shot.image),
                     float(outputs.fragments_per_pixel),
                     float(outputs.evaluated_per_pixel),
+                    float(outputs.entries_per_pixel),
                 )
             )
-        quality, likeness, fragments, evaluated = map(statistics.fmean, zip(*rows, strict=True))
+        means = map(statistics.fmean, zip(*rows, strict=True))
+        quality, likeness, fragments, evaluated, entries = means
         reports.append(
             {
                 "target": shots[0].target,
@@ -118,6 +121,7 @@ def measure(
                 "lpips": None,
                 "fragments_per_pixel": fragments,
                 "evaluated_per_pixel": evaluated,
+                "entries_per_pixel": entries,
                 "gaussians": len(splats),
             }
         )

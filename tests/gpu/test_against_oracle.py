@@ -134,6 +134,7 @@ def test_images_counts_and_scores_do_not_depend_on_the_order(
     for name in ("image", "winners", "weights_per_gaussian", "fragments_per_gaussian"):
         assert torch.equal(getattr(found[0], name), getattr(found[1], name)), name
     assert found[0].evaluated_per_pixel == found[1].evaluated_per_pixel
+    assert found[0].entries_per_pixel == found[1].entries_per_pixel
 
 
 @pytest.mark.parametrize(

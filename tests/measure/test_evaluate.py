@@ -18,6 +18,7 @@ NAMES = {
     "lpips",
     "fragments_per_pixel",
     "evaluated_per_pixel",
+    "entries_per_pixel",
     "gaussians",
     "frame_ms",
     "frame_ms_se",

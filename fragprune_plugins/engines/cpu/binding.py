@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from fragprune_plugins import native
 
-API_VERSION: Final = 5
+API_VERSION: Final = 6
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -112,6 +112,7 @@ class Outputs(_Sized):
         *_pointers("weights_per_gaussian wins_per_gaussian winners"),
         ("drawn", ctypes.c_int64),
         ("evaluated", ctypes.c_int64),
+        ("entries", ctypes.c_int64),
         ("projection_ms", ctypes.c_float),
         ("binning_ms", ctypes.c_float),
         ("blend_ms", ctypes.c_float),

@@ -78,6 +78,7 @@ class _Drawing:
         arrays: the tensors that C code reads; they live as long as its state.
         state: the data that backward needs; None if no gradients are needed.
         evaluated: (Gaussian, pixel) lanes that were computed.
+        entries: (Gaussian, tile) pairs that were blended.
         stages: milliseconds by stage.
         found: the requested counts and scores, by their names in ``RasterOutputs``.
     """
@@ -88,6 +89,7 @@ class _Drawing:
     arrays: dict[str, Tensor]
     state: binding.State | None = None
     evaluated: int = 0
+    entries: int = 0
     stages: dict[str, float] = field(default_factory=dict)
     found: dict[str, Tensor] = field(default_factory=dict)
 
@@ -138,7 +140,7 @@ class _Drawing:
             self.state.handle = handle.value
         else:
             self.arrays = {}
-        self.evaluated = outputs.evaluated
+        self.evaluated, self.entries = outputs.evaluated, outputs.entries
         self.stages = {name: getattr(outputs, f"{name}_ms") for name in _STAGES}
         drawn = torch.tensor(outputs.drawn / (view.width * view.height), dtype=torch.float32)
         return image, invdepth, alpha, features, radii, drawn
@@ -259,14 +261,15 @@ class CpuEngine:
             drawing, *(tensors[name] for name in _NAMES)
         )
         image, invdepth, alpha, features, radii, per_pixel = outputs
-        device = splats.device
+        device, pixels = splats.device, view.width * view.height
         return RasterOutputs(
             image=image.to(device),
             radii=radii.to(device),
             invdepth=invdepth.to(device),
             alpha=alpha.to(device),
             fragments_per_pixel=per_pixel.to(device),
-            evaluated_per_pixel=drawing.evaluated / (view.width * view.height),
+            evaluated_per_pixel=drawing.evaluated / pixels,
+            entries_per_pixel=drawing.entries / pixels,
             features=None if splats.features is None else features.to(device),
             stages=drawing.stages,
             **{name: tensor.to(device) for name, tensor in drawing.found.items()},

@@ -118,8 +118,10 @@ class CudaEngine:
         drawn = _Rasterize.apply(  # type: ignore[no-untyped-call]
             self, drawing, tuple(tensors), *tensors.values()
         )
+        pixels = inputs.view.width * inputs.view.height
         return RasterOutputs(
-            evaluated_per_pixel=drawing.evaluated / (inputs.view.width * inputs.view.height),
+            evaluated_per_pixel=drawing.evaluated / pixels,
+            entries_per_pixel=drawing.entries / pixels,
             **Drawn(*drawn)._asdict(),
         )
 

@@ -321,9 +321,11 @@ class Drawing:
     Attributes:
         where: the device that it runs on.
         evaluated: (Gaussian, pixel) lanes that were computed; NaN until read.
+        entries: (Gaussian, tile) pairs in the lists; NaN until read.
     """
 
     evaluated: float = math.nan
+    entries: float = math.nan
 
     def __init__(self, device: Device, inputs: RasterInputs, thresholds: Tensor | None) -> None:
         self._device, self._inputs, self._n = device, inputs, len(inputs.splats)
@@ -467,6 +469,7 @@ class Drawing:
             EngineError: the kernels could not draw this many entries or such offsets.
         """
         _, entries, _, self.evaluated = map(int, self._found.tolist())
+        self.entries = entries
         refuse(entries, 0.0 if self._spread is None else float(self._spread))
         return entries
 

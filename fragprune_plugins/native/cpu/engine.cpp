@@ -127,8 +127,13 @@ class Cell {
     }
   }
 
-  // Blends all of them; returns lanes spent.
-  int64_t blend() {
+  struct Spent {
+    int64_t evaluated = 0;  // lanes
+    int64_t entries = 0;    // of the tiles' lists
+  };
+
+  // Blends all of them.
+  Spent blend() {
     const CellEntry* entries = p_.lists.entries.data();
     FrontToBack order(p_.memory, entries + p_.lists.first[cell_],
                       entries + p_.lists.first[cell_ + 1]);
@@ -136,7 +141,7 @@ class Cell {
     while (open_ && order.next(begin, end)) hand_out(begin, end);
     for (int x = 0; x < wide_; x++)
       if (tiles_[x].waiting) blend_waiting(x);
-    return evaluated_;
+    return spent_;
   }
 
   // Paints all of them and keeps what is to be kept; returns how many fragments were drawn.
@@ -205,9 +210,10 @@ class Cell {
         fp::blend_waiting<false, true, true>,   fp::blend_waiting<true, true, true>};
     const bool keep = p_.keep != nullptr, depth = p_.canvas.invdepth != nullptr;
     const auto blend = kinds[p_.extras.any() ? 4 + keep : 2 * keep + depth];
-    evaluated_ += blend(splats_, p_.colours, p_.canvas, tiles_[x],
-                        lists_.empty() ? nullptr : &lists_[x],
-                        extra_.empty() ? nullptr : extra_[x].get());
+    spent_.entries += tiles_[x].waiting;
+    spent_.evaluated += blend(splats_, p_.colours, p_.canvas, tiles_[x],
+                              lists_.empty() ? nullptr : &lists_[x],
+                              extra_.empty() ? nullptr : extra_[x].get());
     if (!tiles_[x].alive) open_ &= ~(1u << x);
   }
 
@@ -231,7 +237,7 @@ class Cell {
   const size_t cell_;
   const int row_, left_, wide_;  // tiles
   uint32_t open_ = 0;            // one bit for each tile where something shows through
-  int64_t evaluated_ = 0;
+  Spent spent_;
   Buffer<OpenTile> tiles_;
   std::vector<TileList> lists_;
   std::vector<std::unique_ptr<ExtraTile>> extra_;
@@ -253,15 +259,18 @@ FP_STAGE void draw(Team& team, const Memory& memory, const Camera<float>& c, con
   const Colours colours(c, in, scene.splats.data());
   const Picture picture{memory,  c,      extras, scene,                        lists,
                         colours, canvas, out,    weights ? &*weights : nullptr, keep};
-  std::atomic<int64_t> drawn{0}, evaluated{0};
+  std::atomic<int64_t> drawn{0}, evaluated{0}, entries{0};
   team.each(scene.cells.size(), 1, [&](size_t k, size_t) {
     Cell cell(picture, k);
-    evaluated.fetch_add(cell.blend(), std::memory_order_relaxed);
+    const Cell::Spent spent = cell.blend();
+    evaluated.fetch_add(spent.evaluated, std::memory_order_relaxed);
+    entries.fetch_add(spent.entries, std::memory_order_relaxed);
     drawn.fetch_add(cell.close(), std::memory_order_relaxed);
   });
   if (weights) weights->write(out.weights_per_gaussian);
   out.drawn = drawn;
   out.evaluated = evaluated;
+  out.entries = entries;
 }
 
 // Milliseconds since the last call.

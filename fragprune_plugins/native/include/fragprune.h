@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 5
+#define FRAGPRUNE_API_VERSION 6
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
@@ -152,6 +152,7 @@ typedef struct fragprune_outputs {
   int32_t *winners;                /* (H, W) row of the largest, the first of equals; -1 for none */
   int64_t drawn;                   /* filled in: fragments drawn */
   int64_t evaluated;               /* filled in: lanes spent on (Gaussian, pixel) pairs */
+  int64_t entries;                 /* filled in: (Gaussian, tile) pairs that were blended */
   float projection_ms;             /* filled in: time of each stage */
   float binning_ms;
   float blend_ms;
