@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.constants import VERSION
 
 if TYPE_CHECKING:
+    from fragprune_plugins.bench.calibration import prices_of
     from fragprune_plugins.datasets.cameras import load_cameras
     from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.engines import slice_at
+    from fragprune_plugins.engines.cost import Cost
     from fragprune_plugins.finetuning import FinetuneResult, finetune, own_pictures
     from fragprune_plugins.injection.api import activate, deactivate, paused
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
 __version__ = VERSION
 
 _HOME = {
+    "Cost": "engines.cost",
     "FinetuneResult": "finetuning",
     "Footprints": "types",
     "Model": "storage.models",
@@ -68,6 +71,7 @@ _HOME = {
     "load_dataset": "datasets.dataset",
     "overview": "measure.viewing",
     "own_pictures": "finetuning",
+    "prices_of": "bench.calibration",
     "paused": "injection.api",
     "rasterize": "plugins.hooks",
     "render_view": "measure.viewing",
@@ -76,6 +80,7 @@ _HOME = {
 }
 
 __all__ = [
+    "Cost",
     "FinetuneResult",
     "Footprints",
     "Model",
@@ -103,6 +108,7 @@ __all__ = [
     "overview",
     "own_pictures",
     "paused",
+    "prices_of",
     "rasterize",
     "render_view",
     "save",

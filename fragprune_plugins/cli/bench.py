@@ -8,7 +8,14 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.cli.common import FILE, Command, Report, engine_options, open_engine
+from fragprune_plugins.cli.common import (
+    FILE,
+    Command,
+    OutFile,
+    Report,
+    engine_options,
+    open_engine,
+)
 from fragprune_plugins.errors import UsageError
 
 TRUNCATION = 16 / 255
@@ -52,8 +59,21 @@ def _size(text: str) -> tuple[int, int]:
 @click.option(
     "--peers", is_flag=True, help="Also time other installed rasterizers, at SH degree 0."
 )
+@click.option(
+    "--calibrate",
+    is_flag=True,
+    help="Instead, measure what a pixel, a Gaussian, a list entry, an evaluated and a drawn "
+    "fragment cost here, and keep the prices for finetune --target-time.",
+)
+@click.option(
+    "--out",
+    type=OutFile(".json"),
+    help="With --calibrate: file for the prices, instead of the cache folder.",
+)
 @engine_options
+@click.pass_context
 def command(
+    ctx: click.Context,
     sizes: tuple[str, ...],
     gaussians: tuple[int, ...],
     model: Path | None,
@@ -61,6 +81,8 @@ def command(
     repeats: int,
     forward_only: bool,
     peers: bool,
+    calibrate: bool,
+    out: Path | None,
     engine: str,
     device: str,
     threads: int | None,
@@ -75,7 +97,13 @@ def command(
       fragprune bench
       fragprune bench --size 320x240 --size 3840x2160 --gaussians 10000 --gaussians 3000000
       fragprune bench --model point_cloud.ply --cameras cameras.json --size 1280x720
+      fragprune bench --calibrate
     """
+    if calibrate:
+        _require_alone(ctx)
+        return _calibrate(out, engine, device, threads)
+    if out is not None:
+        raise UsageError("options", "--out without --calibrate", "prices to write", "Remove --out.")
     if (model is None) != (cameras is None):
         raise UsageError(
             "options", "one of --model and --cameras", "both or none", "Add the other."
@@ -121,6 +149,62 @@ def command(
         "machine": machine,
     }
     return Report(data, _table(data))
+
+
+_OF_BENCH = ("sizes", "gaussians", "model", "cameras", "repeats", "forward_only", "peers")
+
+
+def _require_alone(ctx: click.Context) -> None:
+    """Refuse options that --calibrate has no use for."""
+    for parameter in ctx.command.params:
+        given = parameter.name and ctx.get_parameter_source(parameter.name)
+        if parameter.name in _OF_BENCH and given is click.core.ParameterSource.COMMANDLINE:
+            raise UsageError(
+                "options",
+                f"--calibrate with {parameter.opts[0]}",
+                "its own scenes, sizes and rounds",
+                f"Remove {parameter.opts[0]}.",
+            )
+
+
+def _calibrate(out: Path | None, engine: str, device: str, threads: int | None) -> Report:
+    """Measure the prices of this machine and keep them."""
+    from fragprune_plugins.bench.calibration import calibrate, kept_at
+
+    rasterizer, where = open_engine(engine, device, threads)
+    before = os.getloadavg()[0]
+    found = calibrate(rasterizer, where, say=lambda text: click.echo(text, err=True))
+    cost, path = found.cost, out or kept_at(rasterizer, where)
+    cost.save(path)
+    left_out = sum(frame["left_out"] for frame in found.frames)
+    load = {"load_before": before, "load_after": os.getloadavg()[0]}
+    data: dict[str, Any] = {
+        "prices": dict(cost.prices),
+        "error": cost.error,
+        "machine": dict(cost.machine) | load,
+        "frames": list(found.frames),
+        "kept": str(path),
+    }
+    lines = [f"{'':<30}{'ns':>12}"]
+    lines += [f"{_UNITS[unit]:<30}{price:>12,.2f}" for unit, price in cost.prices.items()]
+    lines += [
+        f"Predicted times of {left_out} frames left out of the fit are off by "
+        f"{100 * cost.error:.0f} % (median; {len(found.frames) - left_out} frames in the fit).",
+        f"{rasterizer.name} engine on {cost.machine['processor']}, {cost.machine['threads']} "
+        f"threads; load {before:.1f} to {load['load_after']:.1f}",
+        f"Kept in {path}.",
+    ]
+    return Report(data, "\n".join(lines))
+
+
+_UNITS = {
+    "frame": "a frame, besides",
+    "pixel": "a pixel",
+    "gaussian": "a Gaussian",
+    "entry": "a list entry",
+    "evaluated": "an evaluated fragment",
+    "fragment": "a drawn fragment, on top",
+}
 
 
 def _scenes(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -17,6 +18,7 @@ from fragprune_plugins.datasets import colmap
 from fragprune_plugins.datasets.cameras import load_cameras
 from fragprune_plugins.datasets.dataset import Photograph
 from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.cost import UNITS, Cost
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.preflight import missing_imports
 from fragprune_plugins.hosts.source import HostRepo
@@ -155,6 +157,12 @@ def _git(file: Path) -> None:
     _sound(f"a commit {commit[:90]!r}", commit == "" or set(commit) <= set("0123456789abcdef"))
 
 
+def _prices(file: Path) -> None:
+    cost = Cost.load(file)
+    known = cost.prices.keys() == set(UNITS)
+    _sound("prices", known and all(0 <= each < math.inf for each in cost.prices.values()))
+
+
 def _config(file: Path) -> None:
     values = read_config(ConfigFile("--config"), file)
     _sound("no names", all(isinstance(name, str) for name in values))
@@ -191,5 +199,6 @@ READERS = [
     Reader("source", _source),
     Reader("git", _git),
     Reader("config", _config),
+    Reader("prices", _prices),
 ]
 BY_NAME = {reader.name: reader for reader in READERS}

@@ -18,6 +18,7 @@ from miniatures.vanilla_3dgs import HOST
 from PIL import Image
 from plyfile import PlyData
 
+from fragprune_plugins.engines.cost import UNITS, Cost
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import checkpoints, records, sidecar
 from fragprune_plugins.storage.ply import write_ply
@@ -144,6 +145,12 @@ def _transforms() -> bytes:
     return json.dumps(content | {"w": 32, "h": 32, "cx": 16.0, "cy": 16.0}).encode()
 
 
+def _prices(folder: Path) -> bytes:
+    machine = {"engine": "cpu", "processor": "one", "threads": 2}
+    cost = Cost(dict.fromkeys(UNITS, 1.5), 0.07, machine)
+    return cost.save(folder / "prices.json").read_bytes()
+
+
 def make() -> dict[str, dict[str, bytes]]:
     """Seeds by reader and name."""
     with tempfile.TemporaryDirectory() as name:
@@ -178,6 +185,7 @@ def make() -> dict[str, dict[str, bytes]]:
             "source": {"renderer.py": renderer},
             "git": {"head": b"ref: refs/heads/main\n", "commit": b"0123456789abcdef" * 2 + b"\n"},
             "config": {"a.json": b'{"iterations": 30000, "source_path": "scene", "lambda": 0.2}'},
+            "prices": {"a.json": _prices(folder)},
         }
 
 
