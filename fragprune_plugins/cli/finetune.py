@@ -119,6 +119,7 @@ def command(
     white_background: bool,
     settings: Settings,
     keep: float | Literal["auto"] | None,
+    max_drop: float | None,
     seed: int,
     no_truncation: bool,
     curves: Path | None,
@@ -148,11 +149,13 @@ def command(
     Examples:
       fragprune finetune point_cloud.ply --data scene --out pruned.ply --quick
       fragprune finetune point_cloud.ply --data scene --out half.ply --target-speedup 2
+      fragprune finetune point_cloud.ply --data scene --out fast.ply --target-time 1.4
+      fragprune finetune point_cloud.ply --data scene --out good.ply --max-drop 0.05
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
       fragprune finetune statue.ply --self --out pruned.ply
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
-    _require_target(data, itself, cameras, settings)
+    _require_target(data, itself, cameras, settings, max_drop)
     if itself and keep == "auto":
         raise UsageError(
             "options",
@@ -169,8 +172,12 @@ def command(
     from fragprune_plugins.finetuning import Checkpoints, finetune, load_dataset, resuming, save
     from fragprune_plugins.measure import Candidate, drop_invisible, measure
     from fragprune_plugins.measure.scores import keep_best, keep_needed
+    from fragprune_plugins.measure.searching import strongest
     from fragprune_plugins.measure.wording import describe, outcome
     from fragprune_plugins.storage import records, sidecar
+
+    def say(text: str) -> None:
+        click.echo(text, err=True)
 
     rasterizer, where = open_engine(engine, device, threads)
     truncation = settings.truncate and not no_truncation
@@ -194,12 +201,17 @@ def command(
         resuming.path_beside(out), every or None, tell=partial(click.echo, err=True)
     )
     asked = resuming.configuration(splat, store, dataset, settings, rasterizer.name)
-    asked |= {"drop_invisible": drop, "keep": keep}
+    asked |= {"drop_invisible": drop, "keep": keep, "max_drop": max_drop}
     if again:
         checkpoints.clear()
     elif (finished := _finished(out, asked, curves)) is not None:
         checkpoints.clear()
         return finished
+    cost = found = None
+    if settings.target_time is not None:
+        from fragprune_plugins.bench.calibration import prices_of
+
+        cost = prices_of(rasterizer, where, say=say)
     with sigterm_interrupts():
         if keep is not None:
             shots, all_of_it = dataset.to(where).train, models.Model(splat, store)
@@ -210,19 +222,33 @@ def command(
                     all_of_it, keep, [s.view for s in shots], engine=rasterizer, progress=True
                 )
             )
-        result = finetune(
-            splat,
-            dataset,
-            settings,
-            store=store,
-            engine=rasterizer,
-            progress=True,
-            checkpoints=checkpoints,
-        )
+        if max_drop is None:
+            result = finetune(
+                splat,
+                dataset,
+                settings,
+                store=store,
+                cost=cost,
+                engine=rasterizer,
+                progress=True,
+                checkpoints=checkpoints,
+            )
+        else:
+            found = strongest(
+                splat,
+                dataset,
+                settings,
+                max_drop,
+                store=store,
+                engine=rasterizer,
+                progress=True,
+                say=say,
+            )
+            result, settings = found.result, found.result.settings
         save(out, result)
     done = result.progress
     if result.terminated:  # after SIGTERM there is no time for measurements
-        return _terminated(model, out, result)
+        return _terminated(model, out, result, _GOES_ON if found is None else _BEGINS_ANEW)
     dropped = None
     if drop:
         whole = out.stat().st_size
@@ -239,7 +265,10 @@ def command(
     candidates = [start, Candidate(result.model, result.store)]
     if result.thresholds is not None:
         candidates.append(Candidate(result.model))
+    if found is not None:
+        candidates.append(Candidate(found.control.model))
     before, after, *without = measure(candidates, dataset.test, engine=rasterizer)
+    control = without.pop() if found is not None else None
     report = {
         "model": str(model),
         "out": str(out),
@@ -250,6 +279,7 @@ def command(
         "keep": keep,
         "dropped": dropped,
         "speedup": done.speedup,
+        "faster": done.faster,
         "target_reached": done.target_reached,
         "interrupted": result.interrupted,
         "resumed_at": result.resumed_at,
@@ -262,8 +292,11 @@ def command(
         "adapter": None,
         "seed": seed,
         "settings": settings.as_dict(),
+        "max_drop": None if found is None else found.as_dict(max_drop or 0.0),
     }
-    control = report["control"] = records.control_of(report, records.files(out.parent))
+    if control is None:
+        control = records.control_of(report, records.files(out.parent))
+    report["control"] = control
     pressure = f" at pressure {done.pressure:.2g}" if settings.truncate else ""
     lines = [
         describe({"before": before, "after": after}),
@@ -272,8 +305,11 @@ def command(
         f"{result.engine} engine, {done.steps} iterations{pressure} in "
         f"{result.train_seconds:.0f} s.",
     ]
+    if found is not None:
+        lines.append(_describe_bound(report["max_drop"], len(dataset.test)))
     if result.interrupted:
-        lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations. {_GOES_ON}")
+        goes_on = _GOES_ON if found is None else _BEGINS_ANEW
+        lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations. {goes_on}")
     if keep is not None:
         gone, of = len(start.model) - len(splat), len(start.model)
         lines.append(
@@ -303,6 +339,7 @@ def command(
 
 
 _GOES_ON = "The same command goes on from there."
+_BEGINS_ANEW = "With --max-drop the same command begins anew."
 
 
 def _finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
@@ -335,7 +372,7 @@ def _finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report |
 _OF_RECORDS = {"curves", "photographs", "configuration", "text"}
 
 
-def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:
+def _terminated(model: Path, out: Path, result: FinetuneResult, then: str) -> Report:
     """The report after SIGTERM: the model is saved, and nothing is measured."""
     done, asked = result.progress, result.settings
     data = {
@@ -351,13 +388,17 @@ def _terminated(model: Path, out: Path, result: FinetuneResult) -> Report:
     }
     text = (
         f"SIGTERM at {done.steps} of {asked.iterations} iterations. Wrote {out} and its sidecar. "
-        f"{_GOES_ON}"
+        f"{then}"
     )
     return Report(data, text, exit_code=EXIT_CODE)
 
 
 def _require_target(
-    data: Path | None, itself: bool, cameras: Path | None, settings: Settings
+    data: Path | None,
+    itself: bool,
+    cameras: Path | None,
+    settings: Settings,
+    max_drop: float | None,
 ) -> None:
     """Prove, before any work, that it is clear what MODEL must look like.
 
@@ -381,6 +422,13 @@ def _require_target(
     if data is not None and cameras is not None:
         raise UsageError(
             "options", "--data with --cameras", "one source of cameras", "Drop one of the two."
+        )
+    if itself and max_drop is not None:
+        raise UsageError(
+            "options",
+            "--self with --max-drop",
+            "photographs, and with them a control to lose against",
+            "Drop --max-drop; --pressure steers what --self may lose.",
         )
     if itself and not settings.truncate:
         raise UsageError(
@@ -416,6 +464,20 @@ def _own_pictures(
     else:
         views = around(model.splat, background=torch.full((3,), float(white_background)), seed=seed)
     return own_pictures(model, divided(views, resolution), held_out, engine=engine, seed=seed)
+
+
+def _describe_bound(found: dict[str, Any], views: int) -> str:
+    """A line on what --max-drop found."""
+    if "loss" not in found:
+        return "No training was compared with the control."
+    tried = f"of {len(found['trials'])} trained"
+    chosen = f"the strongest truncation {tried}" if found["met"] else f"the least loss {tried}"
+    missed = "" if found["met"] else f" The bound of {found['bound']:g} dB was missed."
+    return (
+        f"Loss against the control: {found['loss']:.3f} dB at pressure {found['pressure']:.2g}, "
+        f"{chosen}. The pressure was chosen on these {views} views; others of their kind may "
+        f"differ by some {found['loss_se']:.2f} dB.{missed}"
+    )
 
 
 def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:

@@ -42,6 +42,21 @@ _OPTIONS = (
         "divided by those drawn now, on the training views that calibration measures.",
     ),
     click.option(
+        "--target-time",
+        type=float,
+        help="Target for the ratio of frame times: the untruncated model's at the start, divided "
+        "by those now, on this machine, at the size of the training views. 1.5 means frames 1.5 "
+        "times as fast. finetune only.",
+    ),
+    click.option(
+        "--max-drop",
+        type=click.FloatRange(0, 10),
+        metavar="DB",
+        help="Find the strongest truncation that loses at most so much PSNR, in dB, against the "
+        "control. Trains the control and up to 7 times more, and chooses the pressure on the "
+        "held-out views. finetune only.",
+    ),
+    click.option(
         "--control",
         is_flag=True,
         help="Run the same iterations without truncation, to compare with.",
@@ -51,8 +66,15 @@ _OPTIONS = (
 _EXCLUDE = (
     ("--quick", "--iters"),
     ("--pressure", "--target-speedup"),
+    ("--pressure", "--target-time"),
+    ("--target-speedup", "--target-time"),
+    ("--max-drop", "--pressure"),
+    ("--max-drop", "--target-speedup"),
+    ("--max-drop", "--target-time"),
+    ("--max-drop", "--control"),
     ("--control", "--pressure"),
     ("--control", "--target-speedup"),
+    ("--control", "--target-time"),
 )
 
 
@@ -60,7 +82,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of learning to a command.
 
     The command gets their values, and its own ``seed`` and ``itself`` if it has them, as
-    ``settings``.
+    ``settings``; ``max_drop`` apart, because it is a bound for several trainings.
 
     Raises:
         UsageError: options contradict each other, or a value is out of range.
@@ -74,6 +96,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
         train: Any,
         pressure: float | None,
         target_speedup: float | None,
+        target_time: float | None,
         control: bool,
         **kwargs: Any,
     ) -> Any:
@@ -82,6 +105,8 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
             "--iters": iters is not None,
             "--pressure": pressure is not None,
             "--target-speedup": target_speedup is not None,
+            "--target-time": target_time is not None,
+            "--max-drop": kwargs["max_drop"] is not None,
             "--control": control,
         }
         for one, other in _EXCLUDE:
@@ -94,6 +119,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
             train=train,
             pressure=pressure,
             target_speedup=target_speedup,
+            target_time=target_time,
             itself=itself,
             truncate=not control,
             seed=kwargs.get("seed", 0),

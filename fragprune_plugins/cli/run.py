@@ -69,6 +69,7 @@ def command(
     from_iter: int | None,
     alternate: int | None,
     settings: Settings,
+    max_drop: float | None,
     engine: str,
     device: str,
     threads: int | None,
@@ -91,6 +92,20 @@ def command(
     """
     if alternate is not None and stage != "joint":
         raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Change one of them.")
+    if settings.target_time is not None:
+        raise UsageError(
+            "--target-time",
+            "fragprune run: a host keeps no model as it came in to time frames against",
+            "--target-speedup, a ratio of fragments",
+            "Use --target-speedup, or --target-time with fragprune finetune on the trained PLY.",
+        )
+    if max_drop is not None:
+        raise UsageError(
+            "--max-drop",
+            "fragprune run: it would repeat the host's stage 2 many times",
+            "a bound for fragprune finetune",
+            "Use fragprune finetune with --max-drop on the trained PLY.",
+        )
 
     from fragprune_plugins.injection.launch import RunOptions, run
     from fragprune_plugins.injection.process import current_gpu

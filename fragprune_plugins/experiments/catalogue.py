@@ -97,7 +97,7 @@ class Experiment:
 
 
 def _control(settings: Settings) -> Settings:
-    return replace(settings, truncate=False, pressure=None, target_speedup=None)
+    return replace(settings, truncate=False, pressure=None, target_speedup=None, target_time=None)
 
 
 def rules(iterations: int, train: Train | None = None) -> Experiment:

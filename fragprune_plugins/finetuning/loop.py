@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import random
+import statistics
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
@@ -16,13 +19,16 @@ from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import AlignmentError, CheckpointError, SidecarError
+from fragprune_plugins.engines.clock import timed
+from fragprune_plugins.engines.cost import Cost, work_of
+from fragprune_plugins.errors import AlignmentError, CheckpointError, SidecarError, UsageError
 from fragprune_plugins.finetuning.resuming import Checkpoints, configuration
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, between_steps
 from fragprune_plugins.learning.losses import photometric_loss
+from fragprune_plugins.learning.pressure import FEWEST
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.stage2 import Progress, Stage2
+from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2, evenly
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
 from fragprune_plugins.reprs import one_line
@@ -39,6 +45,7 @@ _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _UNFIT = (KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError)
 _POSTFIXES = 100  # times in a run that the bar says how it goes
+_ROUNDS, _SECONDS = 7, 1.5  # at least, of timing frames for a target; a view's least time counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +92,7 @@ def finetune(
     store: ThresholdStore | None = None,
     schedule: Schedule | None = None,
     rule: Callable[[Tensor], Tensor] | None = None,
+    cost: Cost | None = None,
     engine: str | Engine = "auto",
     progress: bool = False,
     checkpoints: Checkpoints | None = None,
@@ -104,6 +112,7 @@ def finetune(
         rule: gives thresholds (N,) from activated opacities (N,), instead of learning: in the steps
             that would learn, views are drawn with them. They get no gradient, and nothing presses
             on fragments: the settings' pressure and target have no effect.
+        cost: prices of the engine on this machine; a target time needs them.
         engine: a name or an engine.
         progress: draw a bar on stderr.
         checkpoints: where the unfinished fine-tuning is kept. If there is one of the same
@@ -115,11 +124,14 @@ def finetune(
         CheckpointError: the checkpoint is broken, or another fine-tuning's.
         PluginError: a plugin raised, or gave an answer that cannot be used.
         AlignmentError: store and model differ in length.
+        UsageError: a target time without prices, or one that no thresholds reach.
         DivergedError: NaN or infinity in what trains.
     """
     settings, device = settings or Settings(), model.xyz.device
     if rule is not None:
-        settings = replace(settings, pressure=0.0, target_speedup=None, truncate=True)
+        settings = replace(
+            settings, pressure=0.0, target_speedup=None, target_time=None, truncate=True
+        )
     dataset = dataset.to(device)
     store = ThresholdStore(len(model), device) if store is None else store  # empty ones are false
     if len(store) != len(model):
@@ -136,6 +148,7 @@ def finetune(
         store,
         schedule or schedule_for(settings),
         rule,
+        cost,
         engine_for(engine, device) if isinstance(engine, str) else engine,
     )
     run.start_keeping(checkpoints)
@@ -195,11 +208,15 @@ class _Run:
         store: ThresholdStore,
         schedule: Schedule,
         rule: Callable[[Tensor], Tensor] | None,
+        cost: Cost | None,
         engine: Engine,
     ) -> None:
-        self._initial = model
         self.dataset, self.settings, self.engine = dataset, settings, engine
-        self.rule = rule
+        self.start, self.rule = model, rule
+        clock = None
+        if settings.target_time is not None and cost is not None:
+            self._require_reach(settings.target_time, cost)
+            clock = FrameClock(lambda outputs: cost.ms(work_of(outputs)), self._faster)
         self.curves: list[StepStats] = []
         self.done, self.between = 0, True
         self._started = time.perf_counter()
@@ -213,6 +230,7 @@ class _Run:
             views=again,
             watch=self.curves.append,
             parameters=lambda: {name: getattr(self.model, name) for name in self.rates},
+            clock=clock,
         )
         rates = {"opacity": settings.opacity_lr}
         if settings.train in ("appearance", "all"):
@@ -234,6 +252,47 @@ class _Run:
             self.model, **{name: getattr(self.model, name).detach() for name in self.rates}
         )
 
+    @torch.no_grad()
+    def _require_reach(self, target: float, cost: Cost) -> None:
+        """Refuse a target time that thresholds cannot reach: pixels and Gaussians stay."""
+        splats, total = self.start.splats(), Counter[str]()
+        for shot in evenly(self.dataset.train):
+            inputs = RasterInputs(shot.view, splats, planes=())
+            total.update(work_of(self.engine.rasterize(inputs, None)))
+        limit = cost.limit(total, FEWEST)
+        if target >= limit:
+            size = f"{self.dataset.train[0].view.width}x{self.dataset.train[0].view.height}"
+            raise UsageError(
+                "target time",
+                f"{target:g}x as fast",
+                f"less than {limit:.2f}x: pixels and Gaussians take the rest of a frame at {size}",
+                "Lower --target-time, or remove Gaussians first.",
+            )
+
+    @torch.no_grad()
+    def _faster(self, shots: Sequence[Shot]) -> float:
+        """Frame time of the model as it came in, untruncated, over that of the present one.
+
+        The median over views of the ratio of their least times: a view that another program
+        disturbed in all rounds moves it little.
+        """
+        # the free ones: an engine keeps states for a leaf that requires gradients, which takes time
+        before, now = self.start.splats(), self.result_model().splats()
+        least = {True: [math.inf] * len(shots), False: [math.inf] * len(shots)}
+        started, turn = time.perf_counter(), 0
+        while turn < _ROUNDS or time.perf_counter() - started < _SECONDS:
+            turn += 1
+            for index, shot in enumerate(shots):
+                for old in (True, False) if turn % 2 else (False, True):
+                    inputs = RasterInputs(shot.view, before if old else now, planes=())
+                    cut = None if old else self.stage.thresholds(inputs)
+                    frame = partial(self.engine.rasterize, inputs, cut)
+                    spent = timed(frame, self.start.xyz.device)[1]
+                    least[old][index] = min(least[old][index], spent)
+        return statistics.median(
+            was / now for was, now in zip(least[True], least[False], strict=True)
+        )
+
     @property
     def seconds(self) -> float:
         """Wall-clock seconds of all steps, also of those before a checkpoint."""
@@ -245,9 +304,9 @@ class _Run:
             return
         self.checkpoints = checkpoints
         self.asked = configuration(
-            self._initial, self.stage.store, self.dataset, self.settings, self.engine.name
+            self.start, self.stage.store, self.dataset, self.settings, self.engine.name
         )
-        tensors, values = checkpoints.load(self.asked, self._initial.xyz.device)
+        tensors, values = checkpoints.load(self.asked, self.start.xyz.device)
         if not values:
             return
         try:

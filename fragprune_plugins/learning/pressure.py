@@ -34,14 +34,24 @@ ELASTICITY = 0.1
 """Per cent of the loss that one per cent of the fragments is worth by default."""
 
 TARGET_TOLERANCE = 0.05
-"""A target counts as reached within this relative distance, in fragments per pixel."""
+"""A target counts as reached within this relative distance."""
+
+FEWEST = 20
+"""No target makes fragments fewer than this many times."""
+
+TIME_FOLLOWS = 0.4
+"""d ln(frame time) / d ln(fragments), roughly: 0.3 in small pictures, 0.5 in large ones."""
 
 CALIBRATE_AT = 0.85
 """Share of the learning after which one shift of all thresholds meets the target, and they stay."""
 
+CLOCKED_AT = (0.25, 0.45, 0.65)
+"""Shares of the learning at which frames are timed for a target time, to steer by."""
+
 CALIBRATION_VIEWS = 24
 """Number of training views that a calibration measures at most."""
 
+_NEAR = 0.02  # a share by which frame times are noisy
 _CURVE_SPEEDUP = 1.62  # fragments before / after that LEAST_PRESSURE gives
 _CURVE_SLOPE = 0.22  # d ln(speedup) / d ln(lambda), measured between 1.45x and 2.6x
 
@@ -54,6 +64,8 @@ class Observation:
         progress: share of the learning that was over, 0 to 1.
         fragments: drawn per pixel, mean over the step's views.
         untruncated: the same views' before learning began.
+        ratio: before over after of what a target counts; None for that of fragments, NaN where it
+            was not looked at.
         loss: the photometric loss, without the pressure; NaN when not known.
     """
 
@@ -61,6 +73,7 @@ class Observation:
     fragments: float
     untruncated: float
     loss: float
+    ratio: float | None = None
 
 
 class Pressure(Protocol):
@@ -184,10 +197,11 @@ def _mean(figures: list[Figure]) -> float:
 
 
 class PressureController:
-    """Steers lambda towards ``target`` times fewer fragments.
+    """Steers lambda towards a ratio of before to after: of fragments, or of what follows them.
 
     Args:
-        target: fragments before over fragments after, > 1.
+        target: before over after, > 1.
+        follows: per cents that it falls by if fragments fall by one.
         warmup: share of the run before the first correction: thresholds have not settled.
         period: share of the run between corrections.
         gain: share of the error, mapped through the known curve, that one correction removes.
@@ -198,6 +212,7 @@ class PressureController:
         self,
         target: float,
         *,
+        follows: float = 1.0,
         warmup: float = 0.2,
         period: float = 0.04,
         gain: float = 0.35,
@@ -205,7 +220,8 @@ class PressureController:
     ) -> None:
         self.target = target
         self.warmup, self.period, self.gain = warmup, period, gain
-        start = LEAST_PRESSURE * (target / _CURVE_SPEEDUP) ** (1 / _CURVE_SLOPE)
+        self._slope = follows * _CURVE_SLOPE
+        start = LEAST_PRESSURE * (target ** (1 / follows) / _CURVE_SPEEDUP) ** (1 / _CURVE_SLOPE)
         self._log_range = (math.log(start / reach), math.log(start * reach))
         self.value = start
         self._next = warmup
@@ -214,12 +230,14 @@ class PressureController:
 
     def observe(self, step: Observation) -> None:
         """Average the logarithms of the ratios over a period, then correct lambda once."""
-        self._sum += math.log(max(step.fragments / max(step.untruncated, 1e-9), 1e-6))
-        self._count += 1
-        if step.progress < self._next:
+        ratio = step.ratio or max(step.untruncated, 1e-9) / max(step.fragments, 1e-9)
+        if not math.isnan(ratio):
+            self._sum -= math.log(min(ratio, 1e6))
+            self._count += 1
+        if step.progress < self._next or not self._count:
             return
         error = math.log(self.target) + self._sum / self._count  # > 0: not enough truncated yet
-        change = max(-math.log(2), min(math.log(2), self.gain * error / _CURVE_SLOPE))
+        change = max(-math.log(2), min(math.log(2), self.gain * error / self._slope))
         low, high = self._log_range
         self.value = math.exp(max(low, min(high, math.log(self.value) + change)))
         self._next = step.progress + self.period
@@ -228,32 +246,32 @@ class PressureController:
 
 def calibrate(
     store: ThresholdStore,
-    speedup: Callable[[], float],
+    ratio: Callable[[], float],
     target: float,
     *,
     tolerance: float = 0.01,
     reach: float = 8.0,
     rounds: int = 16,
 ) -> float:
-    """Shift all threshold logits by one number so that ``speedup()`` meets ``target``.
+    """Shift all threshold logits by one number so that ``ratio()`` meets ``target``.
 
-    Speed-up grows with the shift, so bisection finds it. Where the target lies out of reach the
+    The ratio grows with the shift, so bisection finds it. Where the target lies out of reach the
     nearest end is kept. Call it late in the run and let opacities adapt afterwards.
 
     Args:
         store: the thresholds; changed in place.
-        speedup: measures fragments before over after with the store as it stands.
-        target: fragments before over after.
+        ratio: before over after, with the store as it stands.
+        target: of the ratio.
         tolerance: relative distance at which to stop.
         reach: largest shift either way, in logits.
         rounds: most measurements.
 
     Returns:
-        The speed-up measured last.
+        The ratio measured last.
     """
     start = store.logits.detach().clone()
     low, high = -reach, reach
-    shift, reached = 0.0, speedup()
+    shift, reached = 0.0, ratio()
     for _ in range(rounds):
         if abs(reached / target - 1) <= tolerance:
             break
@@ -263,5 +281,65 @@ def calibrate(
             high = shift
         shift = (low + high) / 2
         store.place(start + shift)
-        reached = speedup()
+        reached = ratio()
+    return reached
+
+
+class Ratios(list[tuple[float, float]]):
+    """Logarithms of ratios that were predicted, and measured.
+
+    Both ratios are 1 without truncation, so that their logarithms are taken as proportional. The
+    slope is fitted to all of them, in which noise cancels; those near the target weigh most.
+    """
+
+    def add(self, predicted: float, measured: float) -> None:
+        """Take a pair of ratios in, unless it is too near 1 to tell a slope from noise."""
+        if 1 + _NEAR < predicted < math.inf and measured > 1 + _NEAR:
+            self.append((math.log(predicted), math.log(measured)))
+
+    def slope(self, target: float) -> float:
+        """ln(measured) / ln(predicted) near a target, 0.5 to 2; 1 before anything was measured."""
+        weights = [1 / (_NEAR**2 + (m - math.log(target)) ** 2) for _, m in self]
+        squares = sum(w * p * p for w, (p, _) in zip(weights, self, strict=True))
+        if squares == 0:
+            return 1.0
+        products = sum(w * p * m for w, (p, m) in zip(weights, self, strict=True))
+        return min(max(products / squares, 0.5), 2.0)
+
+
+def calibrate_measured(
+    store: ThresholdStore,
+    predicted: Callable[[], float],
+    measured: Callable[[], float],
+    target: float,
+    *,
+    seen: Ratios | None = None,
+    tolerance: float = 0.02,
+    rounds: int = 4,
+) -> float:
+    """Like ``calibrate``, for a ratio that is measured with noise and predicted without.
+
+    Bisection would go astray in noise: so it meets a prediction, and measurements correct what to
+    predict (``Ratios``).
+
+    Args:
+        store: the thresholds; changed in place.
+        predicted: before over after, with the store as it stands; need not be unbiased.
+        measured: the same, measured.
+        target: of the measured ratio.
+        seen: what was measured before, to begin with; added to.
+        tolerance: relative distance at which to stop.
+        rounds: most measurements.
+
+    Returns:
+        The ratio measured last.
+    """
+    seen, reached = Ratios() if seen is None else seen, math.nan
+    for _ in range(rounds):
+        aim = target ** (1 / seen.slope(target))
+        foreseen = calibrate(store, predicted, aim, tolerance=tolerance / 4)
+        reached = measured()
+        seen.add(foreseen, reached)
+        if abs(reached / target - 1) <= tolerance:
+            break
     return reached

@@ -9,6 +9,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import (
     ELASTICITY,
     OWN_PRESSURE,
+    TIME_FOLLOWS,
     ElasticPressure,
     FixedPressure,
     Pressure,
@@ -55,6 +56,8 @@ class Settings:
             follows the loss per fragment.
         target_speedup: fragments of the untruncated model as it came in over fragments drawn now,
             on the training views that calibration measures, to steer for; overrides pressure.
+        target_time: frame time of the untruncated model as it came in over frame time now, on the
+            same views at their own size, to steer for; overrides pressure and target_speedup.
         threshold_lr: initial learning rate of threshold logits.
         opacity_lr: initial learning rate of opacity logits in stage 2.
         itself: True where the model's own pictures are the target. The default pressure is
@@ -67,6 +70,7 @@ class Settings:
     train: Train = "all"
     pressure: float | None = None
     target_speedup: float | None = None
+    target_time: float | None = None
     threshold_lr: float = 0.05
     opacity_lr: float = 0.01
     itself: bool = False
@@ -87,10 +91,22 @@ class Settings:
                 "1 < X <= 20, fragments before over after",
                 "Change --target-speedup.",
             )
+        if self.target_time is not None and not 1 < self.target_time <= 20:
+            raise UsageError(
+                "target time",
+                f"{self.target_time:g}",
+                "1 < X <= 20, frame time before over after",
+                "Change --target-time.",
+            )
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for the sidecar and ``--json``."""
         return asdict(self)
+
+    @property
+    def target(self) -> float | None:
+        """The ratio to meet, before over after: of frame times or of fragments; None for none."""
+        return self.target_speedup if self.target_time is None else self.target_time
 
     def make_pressure(self, elasticity: float | None = None) -> Pressure:
         """The pressure these settings ask for.
@@ -100,6 +116,8 @@ class Settings:
         """
         if not self.truncate:
             return FixedPressure(0.0)
+        if self.target_time is not None:
+            return PressureController(self.target_time, follows=TIME_FOLLOWS)
         if self.target_speedup is not None:
             return PressureController(self.target_speedup)
         if self.pressure is not None:

@@ -9,6 +9,9 @@ optimizer of everything but the thresholds, tells it what happens, in this order
     lost        the loss of the view drawn last went backward
     end         the driver's optimizer stepped; the thresholds step too
 
+A target is a ratio of fragments or of frame times. Prices of a driver predict frame times, and its
+clock has the last word.
+
 Fragments "before" are those of a view drawn without thresholds at its first visit, fragments
 "after" those it was last drawn with. A speed-up is the one over the other, summed over views that
 were learned from. Results on held-out views are for the driver to measure.
@@ -17,7 +20,7 @@ were learned from. Results on held-out views are for the driver to measure.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -25,32 +28,62 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.finite import CHECK_EVERY, expect_finite
 from fragprune_plugins.learning.pressure import (
     CALIBRATE_AT,
     CALIBRATION_VIEWS,
+    CLOCKED_AT,
+    FEWEST,
     TARGET_TOLERANCE,
     Observation,
+    Ratios,
     StepViews,
     calibrate,
+    calibrate_measured,
 )
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
+LOOK_EVERY = 10
+"""Steps from one look at predicted frame times to the next."""
+
 CURVE_POINTS = 100
 """Thresholds' median, a sort of all rows, is taken this often in a run."""
 
-_COUNTED = ("steps", "taken", "_open", "_held", "_met", "_median")
+_COUNTED = ("steps", "taken", "_open", "_held", "_met", "_seen", "_timed", "_median")
 
 Truncate = Callable[[RasterInputs, ThresholdStore], Tensor | None]
 """Gives the thresholds (N,) to draw one rasterization with; None draws without."""
+
+_Picture = tuple[Hashable, int]
+"""A view, and the part of it."""
 
 
 def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
     """The store's own, none while it is neutral."""
     return None if store.neutral else store.values
+
+
+def evenly(views: Sequence[Any]) -> Sequence[Any]:
+    """Those of the views that a calibration measures, at even distances."""
+    return views[:: max(1, -(-len(views) // CALIBRATION_VIEWS))]
+
+
+@dataclass(frozen=True)
+class FrameClock:
+    """What a driver knows about frame times; a target time needs one.
+
+    Attributes:
+        predict: the time of a frame that was drawn, in any unit.
+        measure: draws views as the model came in and as it is now, without gradients, and returns
+            the ratio of their times.
+    """
+
+    predict: Callable[[RasterOutputs], float]
+    measure: Callable[[Sequence[Any]], float]
 
 
 @dataclass(frozen=True)
@@ -63,7 +96,8 @@ class Progress:
         fragments_before: per pixel, mean over views; None where no view was drawn.
         fragments_after: likewise.
         speedup: before over after; where a target was met, as measured when it was met.
-        target_reached: ``speedup`` is within 5 % of the target; None without a target.
+        faster: frame times before over after, as measured when a target time was met; else None.
+        target_reached: the ratio is within 5 % of the target; None without a target.
         pressure: lambda.
     """
 
@@ -72,6 +106,7 @@ class Progress:
     fragments_before: float | None
     fragments_after: float | None
     speedup: float | None
+    faster: float | None
     target_reached: bool | None
     pressure: float
 
@@ -87,6 +122,10 @@ class Stage2:
         views: by view, a call that draws it again and ends in ``drew``; a target is met on these.
         watch: called after every step.
         parameters: gives by name the tensors that the driver trains; they are checked to be finite.
+        clock: of frames, for a target time.
+
+    Raises:
+        UsageError: a target time without a clock.
     """
 
     def __init__(
@@ -99,7 +138,16 @@ class Stage2:
         views: Mapping[Any, Callable[[], object]] = MappingProxyType({}),
         watch: Callable[[StepStats], None] | None = None,
         parameters: Callable[[], Mapping[str, Tensor]] = dict,
+        clock: FrameClock | None = None,
     ) -> None:
+        if settings.target_time is not None and clock is None:
+            raise UsageError(
+                "target time",
+                "a training that cannot time single frames",
+                "a target in fragments",
+                "Use --target-speedup here; --target-time works with fragprune finetune.",
+            )
+        self._clock = clock if settings.target_time is not None else None
         self.store, self.settings = store, settings
         self.schedule = schedule or Schedule(settings)
         self.pressure = self.schedule.make_pressure()
@@ -110,9 +158,13 @@ class Stage2:
         self._parameters, self._suspect = parameters, False
         self._open = False  # the warm-up is over
         self._held = False  # thresholds have met their target and stay
-        self._met: float | None = None  # the speed-up they met it with
-        self._before: dict[tuple[Hashable, int], Tensor] = {}
-        self._after: dict[tuple[Hashable, int], Tensor] = {}
+        self._met: float | None = None  # the ratio they met it with
+        self._seen = Ratios()  # by the clock, so far
+        self._timed = 0  # of CLOCKED_AT
+        # by picture: fragments per pixel, and last what a target counts: these, or a predicted time
+        self._before: dict[_Picture, Tensor] = {}
+        self._after: dict[_Picture, Tensor] = {}
+        self._pictures: list[_Picture] = []  # of this step
         self._views = StepViews()
         self._median = math.nan
 
@@ -148,6 +200,7 @@ class Stage2:
         self.steps += 1
         self.plan = self.schedule.at(self.steps)
         self._views.begin()
+        self._pictures = []
         self._open |= self.plan.learn
         if self.plan.learn and self.settings.truncate:
             if not self.store.opened:
@@ -186,13 +239,14 @@ class Stage2:
         counted = torch.is_grad_enabled() and self.plan is not None and self.plan.counted
         if counted and picture not in self._before:
             with torch.no_grad():
-                self._before[picture] = untruncated().fragments_per_pixel.detach()
-        drawn = outputs.fragments_per_pixel.detach()
+                self._before[picture] = self._count(untruncated())
+        drawn = self._count(outputs)
         if picture in self._before and self._open:
             self._after[picture] = drawn
         if not counted:
             return None
-        self._views.draw(drawn, self._before[picture])
+        self._pictures.append(picture)
+        self._views.draw(drawn[0], self._before[picture][0])
         if not self.learning or self.pressure.value == 0:
             return None
         return outputs.fragments_per_pixel * (self.pressure.value / self._views.expected)
@@ -238,8 +292,9 @@ class Stage2:
             loss=views.loss,
         )
         if self.learning:
+            ratio = self._predicted() if self._clock else None
             self.pressure.observe(
-                Observation(plan.progress, views.fragments, views.untruncated, views.loss)
+                Observation(plan.progress, views.fragments, views.untruncated, views.loss, ratio)
             )
         views.begin()  # first, so that whoever watches may raise
         if self._watch is not None:
@@ -254,18 +309,20 @@ class Stage2:
     def progress(self) -> Progress:
         """The state so far."""
         before, after = _mean(self._before), _mean(self._after)
-        speedup, target = self._met, self.settings.target_speedup
+        faster, speedup = (self._met, None) if self._clock else (None, self._met)
         if speedup is None and before is not None and after:
             speedup = before / after
-        reached = None
+        reached, target = None, self.settings.target
         if target is not None:
-            reached = speedup is not None and abs(target / speedup - 1) <= TARGET_TOLERANCE
+            ratio = faster if self._clock else speedup
+            reached = ratio is not None and abs(target / ratio - 1) <= TARGET_TOLERANCE
         return Progress(
             steps=self.taken,
             gaussians=len(self.store),
             fragments_before=before,
             fragments_after=after,
             speedup=speedup,
+            faster=faster,
             target_reached=reached,
             pressure=self.pressure.value,
         )
@@ -283,7 +340,7 @@ class Stage2:
             known = {(number[v], part): each for (v, part), each in figures.items() if v in number}
             plain[name] = list(known)
             if known:
-                tensors[name] = torch.stack([figure.reshape(()) for figure in known.values()])
+                tensors[name] = torch.stack(list(known.values()))
         pressure = {k: v for k, v in vars(self.pressure).items() if isinstance(v, int | float)}
         plain |= {name: getattr(self, name) for name in _COUNTED}
         return tensors, plain | {"expected": self._views.expected, "pressure": pressure}
@@ -302,30 +359,77 @@ class Stage2:
                 figures[views[view], part] = figure
         for name in _COUNTED:
             setattr(self, name, plain[name])
+        self._seen = Ratios(self._seen)
         self._views.expected = plain["expected"]
         vars(self.pressure).update(plain["pressure"])
 
+    def _count(self, outputs: RasterOutputs) -> Tensor:
+        fragments = outputs.fragments_per_pixel.detach().reshape(1)
+        if self._clock is None:
+            return fragments
+        return torch.cat([fragments, fragments.new_tensor([self._clock.predict(outputs)])])
+
+    @torch.no_grad()
+    def _predicted(self) -> float:
+        """The ratio of the step's frames by prices and what was timed so far; NaN in most steps.
+
+        They are drawn once more: a draw with gradients of thresholds evaluates rims as well.
+        """
+        if self.steps % LOOK_EVERY:
+            return math.nan
+        for view in dict.fromkeys(view for view, _ in self._pictures):
+            self._again[view]()
+        slope = self._seen.slope(self.settings.target_time or 1.0)
+        return math.exp(slope * math.log(max(self._ratio(self._pictures), 1e-9)))
+
+    def _ratio(self, pictures: Iterable[_Picture]) -> float:
+        """Before over after of what a target counts, summed over pictures."""
+        pictures = list(pictures)
+        before, after = (
+            sum(float(drawn[each][-1]) for each in pictures)
+            for drawn in (self._before, self._after)
+        )
+        return before / max(after, 1e-9)
+
     def _meet_target(self, progress: float) -> None:
-        """Late in the run, and again before its last step, shift all thresholds onto the target."""
-        target = self.settings.target_speedup
+        """Late in the run, and again before its last step, shift all thresholds onto the target.
+
+        Before that the clock is asked from time to time, to steer by.
+        """
+        target = self.settings.target
         visited = dict.fromkeys(view for view, _ in self._before)
         views = [view for view in visited if view in self._again]
         due = progress >= 1.0 or (progress >= CALIBRATE_AT and not self._held)
-        if target is None or not due or not views:
+        passed = sum(progress >= share for share in CLOCKED_AT)
+        timed = self._clock is not None and not self._held and self._timed < passed
+        if target is None or not (due or timed) or not views:
             return
-        views = views[:: -(-len(views) // CALIBRATION_VIEWS)]
+        views = list(evenly(views))
         pictures = [picture for picture in self._before if picture[0] in set(views)]
-        before = sum(float(self._before[picture]) for picture in pictures)
 
         @torch.no_grad()
-        def speedup() -> float:
+        def ratio() -> float:
             for view in views:
                 self._again[view]()
-            return before / max(sum(float(self._after[each]) for each in pictures), 1e-9)
+            before, after = (
+                sum(float(drawn[each][0]) for each in pictures)
+                for drawn in (self._before, self._after)
+            )
+            return self._ratio(pictures) if before < FEWEST * after else math.inf
 
-        self._met = calibrate(self.store, speedup, target)
+        if self._clock is not None and not due:
+            self._timed = passed
+            self._seen.add(ratio(), self._clock.measure(views))
+            return
+        if self._clock is None:
+            self._met = calibrate(self.store, ratio, target)
+        else:
+            measure = self._clock.measure
+            self._met = calibrate_measured(
+                self.store, ratio, lambda: measure(views), target, seen=self._seen
+            )
         self._held = True
 
 
-def _mean(figures: dict[tuple[Hashable, int], Tensor]) -> float | None:
-    return float(torch.stack(list(figures.values())).mean()) if figures else None
+def _mean(figures: Mapping[_Picture, Tensor]) -> float | None:
+    return float(torch.stack(list(figures.values()))[:, 0].mean()) if figures else None

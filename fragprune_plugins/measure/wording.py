@@ -34,6 +34,7 @@ _ROWS = (
     ("SSIM", "ssim", 4),
     ("fragments/pixel", "fragments_per_pixel", 2),
     ("evaluated/pixel", "evaluated_per_pixel", 2),
+    ("list entries/pixel", "entries_per_pixel", 3),
     ("frame, ms", "frame_ms", 2),
     ("Gaussians", "gaussians", 0),
 )
@@ -46,6 +47,8 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
     lines = [head + f"{'change':>12}" if len(columns) > 1 else head]
     itself = reports[-1].get("target") == ITSELF
     for label, key, digits in _ROWS:
+        if key == "entries_per_pixel" and not all(_known(each.get(key)) for each in reports):
+            continue  # an engine that does not count them, or a record from before they were
         if key == "psnr" and itself:  # before, it is infinite: null in a record
             cells = [
                 "equal" if report is reports[0] else f"{report[key]:.2f}" for report in reports
@@ -86,6 +89,10 @@ def nothing_drawn(fragments: Sequence[float]) -> list[str]:
         f"{empty} of {len(fragments)} show no Gaussian (0.0 fragments per pixel). Are these the "
         "cameras of this model?"
     ]
+
+
+def _known(figure: float | None) -> bool:
+    return figure is not None and not math.isnan(figure)
 
 
 def gain(before: dict[str, Any], after: dict[str, Any]) -> str:
@@ -136,10 +143,15 @@ def missed(data: dict[str, Any]) -> str:
     """That a fine-tuning missed its target, a sentence with a space before it; else nothing."""
     if data.get("target_reached") is not False:
         return ""
-    speedup = data.get("speedup")
-    got = f": {speedup:.2f}x there" if speedup else ""
+    target_time = data["settings"].get("target_time")
+    if target_time:
+        target, met = f"frames {target_time:g}x as fast", data.get("faster")
+    else:
+        target = f"{data['settings']['target_speedup']:g}x fewer fragments"
+        met = data.get("speedup")
+    got = f": {met:.2f}x there" if met else ""
     return (
-        f" The target of {data['settings']['target_speedup']:g}x fewer fragments was missed by "
+        f" The target of {target} was missed by "
         f"more than 5 % on the training views{got}; more --iters or another target may help."
     )
 

@@ -13,11 +13,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from bench.test_calibration import few_frames
 from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
+from fragprune_plugins.bench import calibration
 from fragprune_plugins.cli.finetune import _describe_untruncated
+from fragprune_plugins.engines.cost import UNITS, Cost, work_of
 from fragprune_plugins.finetuning import loop
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.storage import sidecar
@@ -217,6 +220,54 @@ def test_target_control_and_curves(scene, tmp_path):
     report = run_json(*arguments, "--control")
     assert report["speedup"] == pytest.approx(1, abs=0.05)  # nothing is truncated
     assert sidecar.load(out)[0].neutral
+
+
+def test_a_target_time_measures_prices_once_and_says_what_was_reached(scene, tmp_path, monkeypatch):
+    cost = Cost(dict(zip(UNITS, (2e4, 1.0, 50.0, 20.0, 0.2, 0.5), strict=True)))
+
+    def timed(work, device):
+        outputs = work()
+        return outputs, cost.ms(work_of(outputs))
+
+    for module in (calibration, loop):
+        monkeypatch.setattr(module, "timed", timed)
+    monkeypatch.setattr(loop, "_SECONDS", 0.0)
+    monkeypatch.setattr(calibration, "frames", lambda device: few_frames())
+    monkeypatch.setenv("FRAGPRUNE_CACHE", str(tmp_path / "cache"))
+    data, path, _ = scene
+    arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--iters", 20)
+    first = run(*arguments, "--target-time", 1.2, "--json")
+    assert first.exit_code == 0, first.stdout
+    assert "Measuring what a frame costs" in first.stderr
+    report = json.loads(first.stdout)
+    assert report["target_reached"]
+    assert report["faster"] == pytest.approx(1.2, rel=0.02)
+    assert report["settings"]["target_time"] == 1.2
+    (kept,) = (tmp_path / "cache").glob("prices-cpu-*.json")
+    kept.write_text("{}")
+    again = run(*arguments, "--target-time", 1.2, "--again")
+    assert again.exit_code == 1
+    assert "[cost]" in again.stderr
+    assert "Measuring" not in again.stderr
+
+
+def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(scene, tmp_path):
+    data, path, _ = scene
+    out = tmp_path / "out.ply"
+    words = ("--data", data, "--out", out, "--iters", 6, "--train", "opacity", "--max-drop", 5)
+    report = run_json("finetune", path, *words)
+    found = report["max_drop"]
+    assert found["bound"] == 5
+    assert found["met"]
+    assert found["loss"] <= 5
+    assert found["loss"] == pytest.approx(
+        report["control"]["psnr"] - report["after"]["psnr"], abs=1e-3
+    )
+    assert report["settings"]["pressure"] in (None, pytest.approx(found["pressure"]))
+    assert not sidecar.load(out)[0].neutral
+    text = run("finetune", path, *words).stdout
+    assert "Loss against the control" in text
+    assert "chosen on these 2 views" in text
 
 
 def test_curves_of_a_control_are_drawn_without_thresholds(scene, tmp_path):

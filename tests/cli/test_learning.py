@@ -15,6 +15,13 @@ COMMANDS = {"run": HOST, "finetune": ("model.ply", "--data", "scene", "--out", "
         ("--pressure", 1e-4, "--target-speedup", 2),
         ("--control", "--pressure", 1e-4),
         ("--control", "--target-speedup", 2),
+        ("--pressure", 1e-4, "--target-time", 2),
+        ("--target-speedup", 2, "--target-time", 2),
+        ("--control", "--target-time", 2),
+        ("--max-drop", 0.1, "--pressure", 1e-4),
+        ("--max-drop", 0.1, "--target-speedup", 2),
+        ("--max-drop", 0.1, "--target-time", 2),
+        ("--max-drop", 0.1, "--control"),
     ],
 )
 def test_contradictions_are_usage(command, options):
@@ -24,9 +31,36 @@ def test_contradictions_are_usage(command, options):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("options", [("--iters", 0), ("--pressure", 5), ("--target-speedup", 1)])
+@pytest.mark.parametrize(
+    "options",
+    [("--iters", 0), ("--pressure", 5), ("--target-speedup", 1), ("--target-time", 21)],
+)
 def test_values_out_of_range_are_usage(command, options):
     result = run(command, *options, *COMMANDS[command])
     assert result.exit_code == 2
     assert "[usage]" in result.stderr
     assert options[0] in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "instead"),
+    [(("--target-time", 1.5), "--target-speedup"), (("--max-drop", 0.1), "fragprune finetune")],
+)
+def test_run_refuses_what_it_cannot_do_honestly_and_says_what_to_use(options, instead):
+    result = run("run", *options, *HOST)
+    assert result.exit_code == 2
+    assert options[0] in result.stderr
+    assert instead in result.stderr
+
+
+@pytest.mark.parametrize("bound", ["-1", "11", "much"])
+def test_a_bound_of_loss_that_is_none_is_usage(bound):
+    result = run("finetune", "--max-drop", bound, *COMMANDS["finetune"])
+    assert result.exit_code == 2
+    assert "--max-drop" in result.stderr
+
+
+def test_a_bound_of_loss_needs_photographs():
+    result = run("finetune", "model.ply", "--self", "--out", "out.ply", "--max-drop", 0.1)
+    assert result.exit_code == 2
+    assert "--self with --max-drop" in result.stderr

@@ -67,6 +67,9 @@ def test_alternating_learning_is_on_and_off_in_equal_turns():
         {"target_speedup": 1.0},
         {"target_speedup": 21.0},
         {"target_speedup": float("nan")},
+        {"target_time": 1.0},
+        {"target_time": 21.0},
+        {"target_time": float("nan")},
     ],
 )
 def test_settings_out_of_range_are_usage_errors(wrong):
@@ -118,6 +121,24 @@ def test_the_default_pressure_follows_a_loss_that_falls():
     assert observed([1.0] * 100 + [0.1] * 600, [20.0] * 700) == pytest.approx(
         ELASTICITY * 0.1 / 20, rel=0.05
     )
+
+
+@pytest.mark.parametrize(("reached", "direction"), [(1.0, 1), (3.0, -1)])
+def test_a_controller_follows_the_ratio_that_it_is_given(reached, direction):
+    pressure = PressureController(1.5, follows=0.4)
+    start = pressure.value
+    assert start > PressureController(1.5).value  # frames follow fragments only partly
+    for step in range(100):
+        pressure.observe(Observation(step / 100, 40, 40, 0.1, ratio=reached))
+    assert (pressure.value > start) == (direction > 0)
+
+
+def test_a_controller_waits_for_a_ratio_that_was_looked_at():
+    pressure = PressureController(1.5, follows=0.4)
+    start = pressure.value
+    for step in range(100):
+        pressure.observe(Observation(step / 100, 40, 40, 0.1, ratio=float("nan")))
+    assert pressure.value == start
 
 
 @pytest.mark.parametrize(("ratio", "direction"), [(1.0, 1), (0.1, -1)])

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import ELASTICITY
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
-from fragprune_plugins.learning.stage2 import Stage2
+from fragprune_plugins.learning.stage2 import FrameClock, Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 OPACITIES = torch.linspace(0.2, 0.9, 5)
@@ -182,6 +184,98 @@ def test_a_target_is_met_late_and_thresholds_then_stay(target):
     assert held == [number >= 17 for number in range(20)]  # from 85 per cent of the run on
     assert progress.target_reached
     assert progress.speedup == pytest.approx(target, rel=0.02)
+
+
+def fragments_of(outputs) -> float:
+    return float(outputs.fragments_per_pixel.detach())
+
+
+@pytest.mark.parametrize("bias", [0.6, 1.0, 1.5])
+def test_a_target_time_is_met_by_the_clock_however_prices_err(bias):
+    views: dict[str, object] = {}
+    truth = {"frame": 5.0, "rest": 1.0}  # of a frame, by its fragments; the rest is the same
+
+    def time_of(fragments: float) -> float:
+        return truth["frame"] + truth["rest"] * fragments
+
+    def measure(shots):
+        assert shots == ["a", "b", "c"]
+        now = 20 * (1 - it.store.values.detach().mean())
+        return time_of(20.0) / time_of(float(now))
+
+    clock = FrameClock(
+        lambda outputs: 5 + bias * float(outputs.fragments_per_pixel.detach()), measure
+    )
+    it = stage(settings=Settings(iterations=20, target_time=2.0), views=views, clock=clock)
+
+    def draw(view):
+        outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
+        return it.drew(view, outputs, lambda: drawing(None, 20.0))
+
+    views |= {view: lambda view=view: draw(view) for view in "abc"}
+    for number in range(20):
+        it.begin(lambda: OPACITIES)
+        if (term := draw("abc"[number % 3])) is not None:
+            term.backward()
+        it.end()
+    progress = it.progress()
+    assert progress.target_reached
+    assert progress.faster == pytest.approx(2.0, rel=0.02)
+    assert progress.faster == pytest.approx(measure(["a", "b", "c"]))
+    assert progress.speedup == pytest.approx(20 / 7.5, rel=0.05)  # of fragments
+
+
+def test_what_the_clock_said_outlives_a_checkpoint():
+    def make():
+        views = {}
+        clock = FrameClock(lambda drawn: 5 + fragments_of(drawn), lambda shots: 1.5)
+        it = stage(settings=Settings(iterations=20, target_time=2.0), views=views, clock=clock)
+
+        def draw(view):
+            outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
+            return it.drew(view, outputs, lambda: drawing(None, 20.0))
+
+        views |= {"a": lambda: draw("a")}
+        return it, draw
+
+    it, draw = make()
+    for _ in range(13):  # past two of the looks at the clock
+        it.begin(lambda: OPACITIES)
+        it.store.place(torch.zeros(5))  # half of the fragments
+        draw("a").backward()
+        it.end()
+    tensors, plain = it.state_dict()
+    again, _ = make()
+    again.load_state_dict(tensors, json.loads(json.dumps(plain)))
+    assert again._seen.slope(2.0) == it._seen.slope(2.0) != 1.0
+    assert again._timed == it._timed == 2
+    assert again.progress() == it.progress()
+    assert again._ratio([("a", 0)]) == it._ratio([("a", 0)])
+
+
+def test_no_target_makes_fragments_fewer_than_twentyfold():
+    views: dict[str, object] = {}
+    clock = FrameClock(
+        lambda outputs: 100 + float(outputs.fragments_per_pixel.detach()), lambda shots: 1.1
+    )
+    it = stage(settings=Settings(iterations=4, target_time=2.0), views=views, clock=clock)
+
+    def draw(view):
+        outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
+        return it.drew(view, outputs, lambda: drawing(None, 20.0))
+
+    views |= {"a": lambda: draw("a")}
+    for _ in range(4):
+        it.begin(lambda: OPACITIES)
+        draw("a")
+        it.end()
+    assert it.progress().target_reached is False
+    assert float(1 - it.store.values.detach().mean()) >= 1 / 20 - 1e-3
+
+
+def test_a_driver_without_a_clock_refuses_a_target_time():
+    with pytest.raises(UsageError, match="--target-speedup"):
+        stage(settings=Settings(iterations=10, target_time=1.5))
 
 
 def test_opacities_are_worked_out_only_while_there_are_rows_to_open():

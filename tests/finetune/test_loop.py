@@ -10,14 +10,16 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.errors import AlignmentError, DivergedError
+from fragprune_plugins.engines.cost import UNITS, Cost, work_of
+from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
 from fragprune_plugins.finetuning import finetune, loop, save
 from fragprune_plugins.finetuning.loop import mean_fragments
-from fragprune_plugins.learning.pressure import calibrate
+from fragprune_plugins.learning.pressure import calibrate, calibrate_measured
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.types import RasterInputs
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
@@ -197,3 +199,63 @@ def test_calibration_keeps_the_nearest_end_when_out_of_reach():
     assert calibrate(store, speedup, 2.0, rounds=6) == 1.0
     assert len(calls) == 7
     assert calls[-1] > calls[0]
+
+
+COST = Cost(dict(zip(UNITS, (2e4, 1.0, 50.0, 20.0, 0.2, 0.5), strict=True)))
+
+
+@pytest.mark.parametrize("target", [1.2, 1.4])
+def test_a_target_time_is_met_where_frames_take_what_is_measured(
+    model, dataset, target, monkeypatch
+):
+    """On a machine whose pixels and fragments cost twice what the prices say."""
+    real = Cost(COST.prices | {"pixel": 2.0, "fragment": 1.0})
+
+    def timed(work, device):
+        inputs, thresholds = work.args
+        leaves = [inputs.splats.means, inputs.splats.opacities, thresholds]
+        assert not any(leaf is not None and leaf.requires_grad for leaf in leaves)  # no states kept
+        outputs = work()
+        return outputs, real.ms(work_of(outputs))
+
+    monkeypatch.setattr(loop, "timed", timed)
+    monkeypatch.setattr(loop, "_SECONDS", 0.0)
+    settings = Settings(iterations=60, target_time=target)
+    result = finetune(model, dataset, settings, cost=COST, engine="cpu")
+    assert result.progress.target_reached
+    assert result.progress.faster == pytest.approx(target, rel=0.02)
+    engine, times = create_engine("cpu"), []
+    for splat, cut in ((model, None), (result.model, result.thresholds)):
+        drawn = [
+            engine.rasterize(RasterInputs(shot.view, splat.splats(), planes=()), cut)
+            for shot in dataset.train
+        ]
+        times.append(sum(real.ms(work_of(outputs)) for outputs in drawn))
+    assert times[0] / times[1] == pytest.approx(target, rel=0.02)
+
+
+def test_a_target_time_that_no_threshold_reaches_is_refused_before_any_work(model, dataset):
+    fixed = Cost(COST.prices | {"frame": 1e9})
+    with pytest.raises(UsageError, match=r"less than 1\.\d\dx"):
+        finetune(model, dataset, Settings(iterations=9, target_time=1.5), cost=fixed, engine="cpu")
+
+
+def test_a_target_time_needs_prices(model, dataset):
+    with pytest.raises(UsageError, match="time single frames"):
+        finetune(model, dataset, Settings(iterations=9, target_time=1.5))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_calibration_meets_what_is_measured_through_a_prediction_that_errs(noise):
+    store, stream = ThresholdStore(4), random.Random(0)
+    store.open(torch.full((4,), 0.5))
+
+    def predicted():
+        return 1 / (1 - float(store.values.detach().mean()))
+
+    def measured():
+        return predicted() ** 0.5 * (1 + noise * (2 * stream.random() - 1))
+
+    reached = calibrate_measured(store, predicted, measured, 1.6)
+    assert reached == pytest.approx(1.6, rel=0.01 + noise)
+    assert predicted() ** 0.5 == pytest.approx(1.6, rel=0.01 + 2 * noise)

@@ -1,0 +1,117 @@
+"""The strongest truncation within a bound: where it looks next, what it keeps, what it says."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from finetune import tiny
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.measure import searching
+from fragprune_plugins.measure.searching import (
+    TOLERANCE,
+    TRAININGS,
+    Trial,
+    next_pressure,
+    strongest,
+)
+
+
+def search(loss_of, bound: float, start: float) -> list[Trial]:
+    """The trials of a search in which a pressure loses what ``loss_of`` says."""
+    trials, pressure = [], start
+    while len(trials) < TRAININGS:
+        trials.append(Trial(pressure, loss_of(pressure), 0.0, 1.0 / pressure))
+        if bound - TOLERANCE <= trials[-1].loss <= bound:
+            break
+        pressure = next_pressure(trials, bound)
+    return trials
+
+
+@given(
+    start=st.floats(5e-5, 2e-3),
+    gain=st.floats(0.0, 0.4),
+    slope=st.floats(100, 2000),
+    power=st.floats(0.7, 1.2),
+    bound=st.floats(0.0, 0.5),
+)
+def test_a_loss_that_grows_about_as_the_pressure_does_is_met(start, gain, slope, power, bound):
+    def loss_of(pressure: float) -> float:
+        return slope * 1e-4 * 10 * (pressure / 1e-3) ** power - gain
+
+    trials = search(loss_of, bound, start)
+    assert all(trial.pressure > 0 for trial in trials)
+    reachable = loss_of(start / 4 ** (TRAININGS - 1)) <= bound <= loss_of(start * 4)
+    if reachable and loss_of(start * 4**3) > bound:
+        assert min(abs(trial.loss - (bound - TOLERANCE / 2)) for trial in trials) < 2 * TOLERANCE
+
+
+def test_a_loss_that_stays_above_the_bound_ends_with_ever_less_pressure():
+    trials = search(lambda pressure: 1.0, 0.05, 2e-4)
+    pressures = [trial.pressure for trial in trials]
+    assert len(trials) == TRAININGS
+    assert pressures == sorted(pressures, reverse=True)
+
+
+def test_a_loss_that_stays_below_the_bound_ends_with_ever_more():
+    pressures = [trial.pressure for trial in search(lambda pressure: -1.0, 0.05, 2e-4)]
+    assert pressures == sorted(pressures)
+    assert pressures[-1] > 30 * pressures[0]
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Trainings that lose 1 dB at a pressure of 1e-3, in proportion, and are not made."""
+    seen: list[Settings] = []
+
+    def finetune(model, dataset, settings, **options):
+        seen.append(settings)
+        pressure = 2e-4 if settings.pressure is None else settings.pressure
+        progress = SimpleNamespace(pressure=pressure, fragments_before=40.0)
+        return SimpleNamespace(
+            settings=settings, progress=progress, interrupted=False, terminated=False
+        )
+
+    def held_out(result, shots, engine):
+        lost = 1000 * result.progress.pressure if result.settings.truncate else 0.0
+        return [30.0 - lost, 32.0 - lost], 20.0 - 5 * lost
+
+    monkeypatch.setattr(searching, "finetune", finetune)
+    monkeypatch.setattr(searching, "_held_out", held_out)
+    return seen
+
+
+def test_the_strongest_within_the_bound_is_kept_and_the_control_trains_equally_long(trained):
+    model, dataset = tiny.random_model(), SimpleNamespace(test=[])
+    said: list[str] = []
+    found = strongest(model, dataset, Settings(iterations=77), 0.1, engine="cpu", say=said.append)
+    assert found.trial is not None
+    assert 0.1 - TOLERANCE <= found.trial.loss <= 0.1
+    assert found.result.progress.pressure == found.trial.pressure
+    assert {settings.iterations for settings in trained} == {77}
+    assert [settings.truncate for settings in trained] == [False] + [True] * len(found.trials)
+    assert found.as_dict(0.1)["met"]
+    assert len(said) == 1 + 2 * len(found.trials)
+
+
+def test_an_unreachable_bound_keeps_the_least_loss_and_says_so(trained, monkeypatch):
+    monkeypatch.setattr(
+        searching,
+        "_held_out",
+        lambda result, shots, engine: ([30.0 - result.settings.truncate], 20.0),
+    )
+    found = strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), 0.1, engine="cpu")
+    assert len(found.trials) == TRAININGS
+    assert not found.as_dict(0.1)["met"]
+    assert found.trial is not None
+    assert found.trial.loss == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("bound", [-0.1, 11.0, float("nan")])
+def test_a_bound_out_of_range_is_usage(bound):
+    with pytest.raises(UsageError):
+        strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), bound, engine="cpu")
