@@ -34,6 +34,7 @@ TRAININGS = 7
 """With thresholds, at most; the control comes on top."""
 
 _FARTHEST = 4.0  # factor from one pressure to the next
+_STRONGEST = 0.5  # of pressures: what it does not remove is not to be removed
 
 
 @dataclass(frozen=True)
@@ -147,9 +148,9 @@ def strongest(
             best = result, trial
         before = result.progress.fragments_before or 0.0
         enough = fragments * FEWEST < before and trial.loss <= bound
-        if enough or bound - TOLERANCE <= trial.loss <= bound:
+        if enough or bound - TOLERANCE <= trial.loss <= bound or pressure == _STRONGEST:
             break
-        pressure = next_pressure(trials, bound)
+        pressure = min(next_pressure(trials, bound), _STRONGEST)
     assert best is not None
     return Bounded(*best, control, trials)
 

@@ -111,6 +111,16 @@ def test_an_unreachable_bound_keeps_the_least_loss_and_says_so(trained, monkeypa
     assert found.trial.loss == pytest.approx(1.0)
 
 
+def test_a_loss_that_never_reaches_the_bound_ends_before_a_pressure_that_is_none(
+    trained, monkeypatch
+):
+    monkeypatch.setattr(searching, "_held_out", lambda result, shots, engine: ([30.0], 20.0))
+    monkeypatch.setattr(searching, "next_pressure", lambda trials, bound: 9 * trials[-1].pressure)
+    found = strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), 5.0, engine="cpu")
+    assert found.as_dict(5.0)["met"]
+    assert max(trial.pressure for trial in found.trials) <= 0.5
+
+
 @pytest.mark.parametrize("bound", [-0.1, 11.0, float("nan")])
 def test_a_bound_out_of_range_is_usage(bound):
     with pytest.raises(UsageError):
