@@ -61,6 +61,14 @@ _OPTIONS = (
         is_flag=True,
         help="Run the same iterations without truncation, to compare with.",
     ),
+    click.option(
+        "--on-nonfinite",
+        "nonfinite",
+        type=click.Choice(["stop", "skip"]),
+        default="stop",
+        show_default=True,
+        help="A step whose gradients are NaN or infinite stops with an error, or is skipped.",
+    ),
 )
 
 _EXCLUDE = (
@@ -98,6 +106,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
         target_speedup: float | None,
         target_time: float | None,
         control: bool,
+        nonfinite: Any,
         **kwargs: Any,
     ) -> Any:
         asked = {
@@ -123,6 +132,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
             itself=itself,
             truncate=not control,
             seed=kwargs.get("seed", 0),
+            nonfinite=nonfinite,
         )
         return function(*args, settings=settings, **kwargs)
 

@@ -329,7 +329,7 @@ class _Run:
 
     def keep(self) -> None:
         """Write a checkpoint, between two steps."""
-        if self.checkpoints is None or self.done == 0:
+        if self.checkpoints is None or not self.optimizer.state:  # no step was taken
             return
         self.stage.check()
         tensors, values = self.stage.state_dict()
@@ -344,6 +344,7 @@ class _Run:
         values |= {
             "configuration": self.asked,
             "done": self.done,
+            "adam_step": float(moments["step"]),
             "seconds": self.seconds,
             "threads": torch.get_num_threads(),
         }
@@ -356,7 +357,7 @@ class _Run:
         for name in self.rates:
             parameter = getattr(self.model, name)
             parameter.data.copy_(tensors[f"model.{name}"])
-            state: dict[str, Tensor] = {"step": torch.tensor(float(values["done"]))}
+            state: dict[str, Tensor] = {"step": torch.tensor(values["adam_step"])}
             for moment in _MOMENTS:
                 state[moment] = torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
             self.optimizer.state[parameter] = state
@@ -424,6 +425,7 @@ class _Run:
     def _learn_from(self, shot: Shot) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
+        stage.picture = shot.name
         outputs, pressure = self._draw(shot)
         loss = photometric_loss(outputs.image, shot.image)
         stage.lost(loss)
@@ -431,6 +433,9 @@ class _Run:
         rates = self.rates.items()
         for group, (name, base) in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = stage.rate(name, base)
+        gradients = {name: getattr(self.model, name).grad for name in self.rates}
+        if not stage.sound({name: each for name, each in gradients.items() if each is not None}):
+            self.optimizer.zero_grad(set_to_none=True)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()

@@ -61,6 +61,8 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     learns = state is not None and state.stage is not None and state.stage.plan is not None
     if measured and state is not None and learns and torch.is_grad_enabled():
         state.views[view] = again
+    if state is not None and state.stage is not None:
+        state.stage.picture = str(getattr(call.first, "image_name", ""))
     return again()
 
 

@@ -123,6 +123,7 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
     lent: list[tuple[dict[str, Any], float]] = []
     state.lent.append(lent)
     if not session.standing_still(model):
+        expect_sound(session, model, state)
         return
     trained = session.adapter.trained_groups(session.settings.train)
     stage, rates = state.stage, session.rates[model]
@@ -134,6 +135,26 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
         elif stage is not None and name in rates and name != "xyz":  # the host sets this rate
             lent.append((group, group["lr"]))
             group["lr"] = stage.rate(name, rates[name])
+    expect_sound(session, model, state)
+
+
+def expect_sound(session: SessionState, model: Any, state: ModelState) -> None:
+    """Before an optimizer steps, drop all gradients of a learning model if one is not finite.
+
+    Raises:
+        DivergedError: one is not, and the settings do not say that such steps are skipped.
+    """
+    if state.stage is None or state.stage.plan is None:
+        return
+    parameters = state.stage.parameters()
+    gradients = {
+        name: parameter.grad.to_dense() if parameter.grad.is_sparse else parameter.grad
+        for name, parameter in parameters.items()
+        if parameter.grad is not None
+    }
+    if not state.stage.sound(gradients):
+        for parameter in parameters.values():
+            parameter.grad = None
 
 
 def after_step(session: SessionState, reference: Any, *_: Any) -> None:

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor
 
 from fragprune_plugins.errors import DivergedError
 
-if TYPE_CHECKING:
-    from torch import Tensor
 
-CHECK_EVERY = 100
-"""Number of steps between two checks of all trained numbers. A check waits for the device."""
+def are_finite(tensors: Iterable[Tensor]) -> bool:
+    """Whether all squares of all tensors add up to a finite number: one reduction of each tensor.
+
+    False may also mean that numbers are finite and very large; ``not_finite`` looks closely.
+    """
+    norms = [torch.linalg.vector_norm(each.detach(), dtype=torch.float32) for each in tensors]
+    return not norms or bool(torch.stack([n.to(norms[0]) for n in norms]).isfinite().all())
+
+
+def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
+    """The tensors that hold NaN or infinity, as a message names them: with their rows."""
+    found = []
+    for name, tensor in tensors.items():
+        finite = tensor.detach().isfinite()
+        if not finite.all():
+            rows = finite.reshape(len(finite) if finite.ndim else 1, -1).all(dim=1)
+            found.append(f"{name} ({int((~rows).sum())} of {len(rows)} rows)")
+    return found
 
 
 def expect_finite(tensors: Mapping[str, Tensor], where: str) -> None:
@@ -21,13 +37,7 @@ def expect_finite(tensors: Mapping[str, Tensor], where: str) -> None:
         tensors: (N, ...) each, by the name that a message gives them.
         where: the training and its step, for the message.
     """
-    found = []
-    for name, tensor in tensors.items():
-        finite = tensor.detach().isfinite()
-        if not finite.all():
-            rows = finite.reshape(len(finite) if finite.ndim else 1, -1).all(dim=1)
-            found.append(f"{name} ({int((~rows).sum())} of {len(rows)} rows)")
-    if found:
+    if found := not_finite(tensors):
         raise DivergedError(
             where,
             f"NaN or infinity in {', '.join(found)}",

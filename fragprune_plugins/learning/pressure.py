@@ -186,11 +186,6 @@ class StepViews:
         known = [float(loss) for loss in self._losses if loss is not None]
         return sum(known) if known else math.nan
 
-    @property
-    def finite(self) -> bool:
-        """Whether all known losses are finite."""
-        return all(math.isfinite(loss) for loss in self._losses if loss is not None)
-
 
 def _mean(figures: list[Figure]) -> float:
     return sum(map(float, figures)) / len(figures)

@@ -64,6 +64,8 @@ class Settings:
             ``OWN_PRESSURE`` then, and no warm-up comes first, for it would have nothing to learn.
         truncate: False trains without thresholds: the control to compare with.
         seed: of the order of views in ``finetune``; hosts have their own.
+        nonfinite: what to do with a step whose gradients are NaN or infinite: "stop" with an error,
+            or "skip" it.
     """
 
     iterations: int = FINETUNE_ITERATIONS
@@ -76,6 +78,7 @@ class Settings:
     itself: bool = False
     truncate: bool = True
     seed: int = 0
+    nonfinite: Literal["stop", "skip"] = "stop"
 
     def __post_init__(self) -> None:
         if self.iterations < 1:

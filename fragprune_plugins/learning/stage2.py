@@ -7,6 +7,7 @@ optimizer of everything but the thresholds, tells it what happens, in this order
     thresholds  what one rasterization is drawn with
     drew        what came of it; the fragment pressure, a term for the driver's loss, comes back
     lost        the loss of the view drawn last went backward
+    sound       whether its gradients are finite; the driver's optimizer steps only if they are
     end         the driver's optimizer stepped; the thresholds step too
 
 A target is a ratio of fragments or of frame times. Prices of a driver predict frame times, and its
@@ -19,6 +20,7 @@ were learned from. Results on held-out views are for the driver to measure.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,9 +30,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import DivergedError, UsageError
 from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.learning.finite import CHECK_EVERY, expect_finite
+from fragprune_plugins.learning.finite import are_finite, expect_finite, not_finite
 from fragprune_plugins.learning.pressure import (
     CALIBRATE_AT,
     CALIBRATION_VIEWS,
@@ -47,13 +49,18 @@ from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
+log = logging.getLogger("fragprune")
+
 LOOK_EVERY = 10
 """Steps from one look at predicted frame times to the next."""
 
 CURVE_POINTS = 100
 """Thresholds' median, a sort of all rows, is taken this often in a run."""
 
-_COUNTED = ("steps", "taken", "_open", "_held", "_met", "_seen", "_timed", "_median")
+SKIPS_MOST = 100
+"""Steps with gradients that are not finite which a run leaves out at most."""
+
+_COUNTED = ("steps", "taken", "skipped", "_open", "_held", "_met", "_seen", "_timed", "_median")
 
 Truncate = Callable[[RasterInputs, ThresholdStore], Tensor | None]
 """Gives the thresholds (N,) to draw one rasterization with; None draws without."""
@@ -155,7 +162,9 @@ class Stage2:
         self.taken = 0  # the last that the driver's optimizer took: hosts take none at their end
         self.plan: StepPlan | None = None
         self._truncate, self._again, self._watch = truncate, views, watch
-        self._parameters, self._suspect = parameters, False
+        self.parameters = parameters
+        self.picture = ""  # the view's name, for messages; drivers set it before they draw
+        self.skipped = 0  # steps whose gradients were not finite
         self._open = False  # the warm-up is over
         self._held = False  # thresholds have met their target and stay
         self._met: float | None = None  # the ratio they met it with
@@ -189,14 +198,8 @@ class Stage2:
 
         Args:
             opacities: gives the activated opacities, (N,) or (N, 1), when they are needed.
-
-        Raises:
-            DivergedError: NaN or infinity, seen in the step that is over or by a look every
-                ``CHECK_EVERY`` steps.
         """
         self.close()
-        if self._suspect or (self.steps and self.steps % CHECK_EVERY == 0):
-            self.check()
         self.steps += 1
         self.plan = self.schedule.at(self.steps)
         self._views.begin()
@@ -268,12 +271,51 @@ class Stage2:
             return self.plan.opacity_lr
         return base * self.plan.decay
 
+    def sound(self, gradients: Mapping[str, Tensor]) -> bool:
+        """Whether the driver's optimizer may step; if not, it drops all gradients of this step.
+
+        Args:
+            gradients: of the parameters that train, by their names. Those of the thresholds are
+                looked at too, and dropped here.
+
+        Raises:
+            DivergedError: a gradient, or its square, is NaN or infinite, and the settings say
+                "stop", or say "skip" and this happened ``SKIPS_MOST`` times.
+        """
+        ours = self.store.logits.grad
+        known = dict(gradients) | ({} if ours is None else {"thresholds": ours})
+        if are_finite(known.values()):
+            return True
+        found = not_finite({name: each.float().square() for name, each in known.items()})
+        if not found:  # very large, and Adam can take it
+            return True
+        where = f"stage 2, step {self.steps}" + (f", view {self.picture}" if self.picture else "")
+        what = f"NaN or infinity in the gradient of {', '.join(found)}"
+        if self.settings.nonfinite == "stop" or self.skipped == SKIPS_MOST:
+            raise DivergedError(
+                where,
+                what + (f", after {self.skipped} skipped steps" if self.skipped else ""),
+                "finite gradients",
+                "Nothing of it was taken over. Look at that view and its photograph; "
+                "--on-nonfinite skip leaves out such steps.",
+            )
+        self.skipped += 1
+        self.store.logits.grad = None
+        log.warning("%s: %s; the step is skipped", where, what)
+        return False
+
     def end(self) -> None:
-        """The driver's optimizer has stepped: so do the thresholds."""
+        """The driver's optimizer has stepped: so do the thresholds.
+
+        Raises:
+            DivergedError: the step left NaN or infinity.
+        """
         self.taken = self.steps
         if self.learning:
             assert self.plan is not None
             self.store.step(self.plan.threshold_lr)
+        if not are_finite([*self.parameters().values(), self.store.logits]):
+            self.check()
 
     def close(self) -> None:
         """A step is over and known whole: tell the pressure and whoever watches. Once a step."""
@@ -283,7 +325,6 @@ class Stage2:
         every = max(1, self.settings.iterations // CURVE_POINTS)
         if math.isnan(self._median) or self.steps % every == 0:
             self._median = float(self.store.values.detach().median())
-        self._suspect |= not (math.isfinite(self._median) and views.finite)
         stats = StepStats(
             step=self.steps,
             fragments_per_pixel=views.fragments,
@@ -303,8 +344,7 @@ class Stage2:
     def check(self) -> None:
         """Raise DivergedError unless everything that trains is finite; before anything is saved."""
         where = f"stage 2, after step {self.steps}"
-        expect_finite({**self._parameters(), **self.store.numbers}, where)
-        self._suspect = False
+        expect_finite({**self.parameters(), **self.store.numbers}, where)
 
     def progress(self) -> Progress:
         """The state so far."""

@@ -14,7 +14,6 @@ from miniatures.vanilla_3dgs import HOST, joint, running
 from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import DivergedError
 from fragprune_plugins.injection import launch
-from fragprune_plugins.learning.finite import CHECK_EVERY
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import load_plugins
@@ -24,11 +23,6 @@ from fragprune_plugins.storage import sidecar
 def spoil(tensor, rows, value):
     with torch.no_grad():
         tensor[:rows] = value
-
-
-def steps(host, model, camera, first, last):
-    for iteration in range(first, last + 1):
-        host.step(model, camera, iteration)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
@@ -65,36 +59,53 @@ def test_before_stage_two_and_without_learning_the_host_saves_what_it_likes(tmp_
             assert model.capture()
 
 
+def spoiled_step(model, camera, host, iteration):
+    model.update_learning_rate(iteration)
+    (host.render(camera, model)["render"].mean() * torch.nan).backward()
+    model.optimizer.step()
+    model.optimizer.zero_grad(set_to_none=True)
+
+
 @pytest.mark.parametrize("begin", [running, joint])
-def test_what_spoils_the_loss_is_noticed_in_the_next_step(begin):
+def test_a_gradient_that_is_not_finite_stops_its_own_step(begin):
     with begin(Settings(iterations=9, train="opacity")) as host:
         model, camera = host.model(20), host.camera()
         host.step(model, camera, 1)
-        model.update_learning_rate(2)
-        (host.render(camera, model)["render"].mean() * torch.nan).backward()
-        model.optimizer.step()
-        with pytest.raises(DivergedError, match=r"after step 2: NaN or infinity in .*opacity"):
-            host.step(model, camera, 3)
+        before = model._opacity.detach().clone()
+        match = rf"stage 2, step 2, view {camera.image_name}: NaN or infinity in the gradient of "
+        with pytest.raises(DivergedError, match=match + r".*opacity \(20 of 20 rows\)"):
+            spoiled_step(model, camera, host, 2)
+        assert torch.equal(model._opacity, before)  # it was not taken
 
 
-def test_thresholds_that_are_not_finite_are_noticed_in_the_next_step():
-    with running(Settings(iterations=9, train="opacity")) as host:
+@pytest.mark.parametrize("begin", [running, joint])
+def test_such_a_step_can_be_skipped_and_is_told(begin, caplog):
+    with begin(Settings(iterations=9, train="opacity", nonfinite="skip")) as host:
         model, camera = host.model(20), host.camera()
         host.step(model, camera, 1)
-        spoil(host.store(model).logits, 20, torch.nan)
-        with pytest.raises(DivergedError, match="thresholds"):
-            steps(host, model, camera, 2, 3)
+        before, store = model._opacity.detach().clone(), host.store(model)
+        thresholds = store.logits.detach().clone()
+        spoiled_step(model, camera, host, 2)
+        assert torch.equal(model._opacity, before)
+        assert torch.equal(store.logits, thresholds)
+        host.step(model, camera, 3)
+        assert not torch.equal(model._opacity, before)
+        assert all(each.isfinite().all() for each in store.numbers.values())
+    assert "the step is skipped" in caplog.text
 
 
-def test_what_shows_in_no_loss_is_noticed_within_a_hundred_steps():
+@pytest.mark.parametrize(
+    ("what", "value"), [("scaling", torch.nan), ("scaling", torch.inf), ("thresholds", torch.nan)]
+)
+def test_what_shows_in_no_loss_is_noticed_in_the_same_step(what, value):
     """A Gaussian that is not finite is simply not drawn."""
     with running(Settings(iterations=300, train="opacity")) as host:
         model, camera = host.model(5), host.camera(8, 6)
         host.step(model, camera, 1)
-        spoil(model._scaling, 1, torch.inf)
-        with pytest.raises(DivergedError) as caught:
-            steps(host, model, camera, 2, 299)
-    assert caught.value.where.endswith(f"after step {CHECK_EVERY}")
+        spoil(model._scaling if what == "scaling" else host.store(model).logits, 1, value)
+        with pytest.raises(DivergedError, match=what) as caught:
+            host.step(model, camera, 2)
+    assert "step 2" in caught.value.where
 
 
 class SpoilAt:

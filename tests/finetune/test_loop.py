@@ -143,6 +143,43 @@ def test_divergence_that_no_loss_shows_is_noticed_before_there_is_a_result(model
         finetune(spoiled, dataset, Settings(iterations=3), store=store)
 
 
+@pytest.mark.parametrize(("bad", "rows"), [(torch.nan, 3), (torch.inf, 1), (1e25, 2)])
+def test_gradients_that_are_not_finite_stop_their_step_or_are_skipped(
+    model, dataset, monkeypatch, caplog, bad, rows
+):
+    """1e25 is finite; its square, which Adam keeps, is not."""
+    draw = loop._Run._draw
+
+    def drawing(run, shot):
+        if run.done in (4, 5):
+            run.model.opacity.register_hook(
+                lambda gradient: (
+                    torch.cat([torch.full((rows, 1), bad), gradient[rows:]])
+                    if run.done in (4, 5)
+                    else gradient
+                )
+            )
+        return draw(run, shot)
+
+    monkeypatch.setattr(loop._Run, "_draw", drawing)
+    with pytest.raises(DivergedError) as caught:
+        finetune(model, dataset, Settings(iterations=9))
+    assert caught.value.where.startswith("stage 2, step 5, view view0")
+    assert f"the gradient of opacity ({rows} of 60 rows)" in caught.value.found
+    result = finetune(model, dataset, Settings(iterations=9, nonfinite="skip"))
+    assert result.progress.steps == 9
+    assert caplog.text.count("the step is skipped") == 2
+    for name in ALL:
+        assert getattr(result.model, name).isfinite().all()
+
+
+def test_a_run_that_skips_too_much_stops(model, dataset, monkeypatch):
+    monkeypatch.setattr("fragprune_plugins.learning.stage2.SKIPS_MOST", 3)
+    monkeypatch.setattr(loop, "photometric_loss", lambda image, _: image.mean() * torch.nan)
+    with pytest.raises(DivergedError, match="after 3 skipped steps"):
+        finetune(model, dataset, Settings(iterations=9, nonfinite="skip"))
+
+
 def test_going_on_from_a_store(default, model, dataset):
     store = ThresholdStore(len(model))
     store.load_state_dict(default.store.state_dict())
