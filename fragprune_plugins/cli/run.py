@@ -60,6 +60,9 @@ if TYPE_CHECKING:
     show_default=True,
     help="Compare before and after on the views that the host holds out (--eval).",
 )
+@click.option(
+    "--again", is_flag=True, help="finetune: learn again, though the result is there already."
+)
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -74,6 +77,7 @@ def command(
     device: str,
     threads: int | None,
     evaluate: bool,
+    again: bool,
 ) -> Report:
     """Train with a host's own command, then learn truncation thresholds.
 
@@ -81,7 +85,8 @@ def command(
     a few thousand iterations, in which no Gaussian is added or removed. All parameters learn with
     the thresholds (but see --train). The host saves its model as usual, and the thresholds go
     beside it as a sidecar. In stage 2, Ctrl-C (exit code 130) and SIGTERM (143) save the thresholds
-    learned so far.
+    learned so far. A stage 2 that was killed starts again from the end of stage 1, with --stage
+    finetune; where it is finished already, that command says so and runs nothing.
 
     \b
     Examples:
@@ -120,6 +125,7 @@ def command(
         alternate=alternate,
         engine=engine,
         device=device,
+        again=again,
     )
     # A host prints to stdout; with --json, stdout gets only our object.
     to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None
@@ -153,6 +159,7 @@ def command(
         "pressure": summary.curves[-1]["pressure"] if summary.curves else None,
         "train_seconds": summary.train_seconds,
         "target_reached": summary.target_reached,
+        "already_finished": summary.already_finished,
         "seed": settings.seed,
         "settings": summary.settings,
     }
@@ -213,6 +220,12 @@ def _describe(
 ) -> str:
     from fragprune_plugins.measure.wording import describe, fewer, missed, outcome
 
+    if summary.already_finished:
+        return (
+            f"{summary.model_after} is finished: stage 2 with these settings wrote it before, and "
+            f"nothing was run. --again learns again.\n"
+            f"Compare: fragprune compare {summary.model_before} {summary.model_after}"
+        )
     if not summary.iterations:
         return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
     lines = []

@@ -22,6 +22,7 @@ from fragprune_plugins.errors import (
     HostFailed,
     Interrupted,
     NotComparedError,
+    SidecarError,
     Terminated,
     UsageError,
 )
@@ -58,6 +59,8 @@ class RunOptions:
         engine: "auto", "reference", "cpu", "cuda", or the name of a plugin's engine.
         device: the host's device. "cpu" runs a CUDA-only host without a GPU, "cuda" and "cuda:N"
             require a GPU, "auto" takes a GPU if torch sees one.
+        again: False leaves a finished stage 2 alone: if "finetune" finds the result of the same
+            start, settings and host, it runs nothing.
     """
 
     adapter: str | None = None
@@ -67,6 +70,7 @@ class RunOptions:
     alternate: int | None = None
     engine: str = "auto"
     device: str = "auto"
+    again: bool = True
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,7 @@ class RunSummary:
             cannot be compared.
         drawing: fields of ``RasterInputs`` with which the host draws its models.
         not_compared: the reason why learned models cannot be compared; otherwise None.
+        already_finished: ``model_after`` was there before, and nothing was run.
     """
 
     adapter: str
@@ -115,6 +120,7 @@ class RunSummary:
     photographs: Photographs | None = None
     drawing: dict[str, Any] = field(default_factory=dict)
     not_compared: NotComparedError | None = None
+    already_finished: bool = False
 
 
 def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
@@ -199,6 +205,7 @@ class _Runner:
         self.after: Path | None = None
         self.learned: Summary | None = None
         self.curves: list[dict[str, float]] = []
+        self.already_finished = False
 
     def observe(self) -> None:
         """Run the command unchanged; thresholds of sidecars apply, and nothing learns."""
@@ -278,6 +285,9 @@ class _Runner:
                 self.around, self.output = self.output, self.output / own
             if self.output is not None and str(self.output) != self.host.flags.output:
                 extra["output"] = str(self.output)
+            if not self.options.again and self._is_finished(start, self._model(total)):
+                self.after, self.already_finished = self._model(total), True
+                return
             arguments = self.host.saving(self.scratch, total, **extra)
             self._execute(arguments, learn=True, start=first)
             self.after = self._model(total)
@@ -330,6 +340,19 @@ class _Runner:
                 self.learned = session.finish()
                 self.curves = session.curves
 
+    def _is_finished(self, start: Start, result: Path | None) -> bool:
+        """Whether stage 2 from this start wrote this file, with these settings."""
+        from fragprune_plugins.storage import sidecar
+
+        if result is None or start.path.stat().st_mtime_ns > result.stat().st_mtime_ns:
+            return False
+        try:
+            _, info = sidecar.load(result)
+        except SidecarError:
+            return False
+        asked = self.options.settings.as_dict(), self.adapter.name, self.repo.commit
+        return (info.settings, info.adapter, info.host_commit) == asked
+
     def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
         """The error that reports Ctrl-C or SIGTERM and names the saved model, if there is one."""
         by_signal = isinstance(error, Terminate)
@@ -371,6 +394,7 @@ class _Runner:
             photographs=photographs,
             drawing=drawing,
             not_compared=not_compared,
+            already_finished=self.already_finished,
         )
 
     def _comparison(self) -> tuple[Photographs | None, dict[str, Any], NotComparedError | None]:

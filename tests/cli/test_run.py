@@ -91,9 +91,25 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     zero = ran(*finetune, "--control", *words)
     assert zero["model_after"].startswith(str(out / "control"))
     assert {path: path.read_bytes() for path in kept} == kept
-    again = ran(*finetune, *words)
+    again = ran(*finetune, "--again", *words)
     assert again["control"] == zero["after"]
     assert "pruning itself makes" in run_json("report", out)["result"]
+
+
+def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
+    out, scene = folder
+    finetune, words = ["--stage", "finetune", *WORDS], command(scene, out, "-r", 2)
+    result = models(out)[1]
+    written = result.stat().st_mtime_ns
+    report = ran(*finetune, *words)
+    assert report["already_finished"] is True
+    assert (report["iterations"], report["model_after"]) == (0, str(result))
+    text = run("run", *finetune, *words)
+    assert text.exit_code == 0
+    assert "is finished" in text.stdout
+    assert f"fragprune compare {models(out)[0]} {result}" in text.stdout
+    assert result.stat().st_mtime_ns == written
+    assert ran(*finetune, "--pressure", 2e-3, *words)["already_finished"] is False
 
 
 @pytest.mark.parametrize(("size", "read"), [("2", (20, 15)), ("16", (16, 12)), ("-1", (40, 30))])
