@@ -48,6 +48,9 @@ class Checkpoints:
     tell: Callable[[str], None] = lambda _: None
     _last: float = field(default_factory=time.monotonic)
 
+    def __post_init__(self) -> None:
+        self.path = Path(self.path)
+
     def due(self, step: int) -> bool:
         """Whether it is time for a checkpoint after a step."""
         if self.steps is not None and step % self.steps == 0:

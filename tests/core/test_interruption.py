@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
+from fragprune_plugins.learning.interruption import Terminate, between_steps, sigterm_interrupts
 
 
 @pytest.fixture(autouse=True)
@@ -67,3 +67,46 @@ def test_a_forked_worker_just_ends():
             os._exit(0)
         _, status = os.waitpid(child, 0)
     assert os.waitstatus_to_exitcode(status) == 143
+
+
+def test_between_steps_a_signal_waits_and_a_second_one_does_not():
+    with sigterm_interrupts():
+        with between_steps() as now:
+            signal.raise_signal(signal.SIGTERM)
+            with pytest.raises(Terminate):
+                now()
+            now()
+        with pytest.raises(KeyboardInterrupt), between_steps():
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            raise AssertionError("the second did not count")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_signal_in_the_last_step_is_not_lost():
+    with pytest.raises(KeyboardInterrupt), between_steps():
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_between_steps_a_forked_worker_just_ends():
+    with sigterm_interrupts(), between_steps():
+        child = os.fork()
+        if child == 0:
+            signal.raise_signal(signal.SIGTERM)
+            os._exit(0)
+        _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 143
+
+
+def test_between_steps_in_another_thread_than_the_main_one_changes_nothing():
+    seen = []
+
+    def inside():
+        with between_steps() as now:
+            seen.append(signal.getsignal(signal.SIGINT))
+            now()
+
+    thread = threading.Thread(target=inside)
+    thread.start()
+    thread.join()
+    assert seen == [signal.default_int_handler]
