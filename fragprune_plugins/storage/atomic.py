@@ -110,8 +110,7 @@ def _is_named(handle: int, name: Path) -> bool:
 def staging(path: Path) -> Iterator[Path]:
     """Yield an empty folder beside a file, for what is to replace it; the file is locked meanwhile.
 
-    The folder is removed at the end, and so are folders that dead processes left. Its permissions
-    are private, those of the files in it are a plain ``open``'s.
+    The folder is removed at the end, and so are folders that dead processes left.
 
     Raises:
         OutputError: the place cannot be written, or another process writes the file.
@@ -156,14 +155,23 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
         if durable:
             put(new, path)
         else:
+            _permit(new)
             os.replace(new, path)
 
 
 def put(new: Path, path: Path) -> None:
     """Rename a finished file so that even a power cut leaves the old one or the new one, whole."""
+    _permit(new)
     with open(new, "rb") as file:
         os.fsync(file.fileno())
     rename(new, path)
+
+
+def _permit(new: Path) -> None:
+    """Give a file a plain ``open``'s permissions; some writers make private ones."""
+    umask = os.umask(0)
+    os.umask(umask)
+    new.chmod(0o666 & ~umask)
 
 
 def rename(old: Path, new: Path) -> None:

@@ -28,6 +28,13 @@ def test_what_was_saved_comes_back(model, tmp_path):
     assert fp.load(tmp_path / "a.ply", truncation=False).thresholds is None
 
 
+def test_others_may_read_what_a_plain_open_lets_them(model, tmp_path):
+    (tmp_path / "plain").write_text("")
+    beside = fp.save(tmp_path / "a.ply", model)
+    for path in (tmp_path / "a.ply", beside):
+        assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_a_model_without_thresholds_replaces_one_with_them(model, tmp_path):
     fp.save(tmp_path / "a.ply", model)
     fp.save(tmp_path / "a.ply", model._replace(thresholds=None))
