@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
+import os
 import random
 import runpy
 import shutil
@@ -180,6 +182,30 @@ def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(
     assert f"SIGTERM; the thresholds learned so far are beside {saved.parent}" in error["found"]
     assert sidecar.load(saved.with_name("point_cloud.ply"))[0].steps == 4
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("moment", ["learning", "saving"])
+def test_killed_in_stage_two_it_starts_again_from_stage_one_and_leaves_nothing(
+    photographs, trained, tmp_path, monkeypatch, single_thread, moment
+):
+    finetune = replace(OPTIONS, stage="finetune")
+    killed = Path(shutil.copytree(trained, tmp_path / "killed"))
+    pid = os.fork()
+    if pid == 0:
+        if moment == "learning":
+            with_plugin(monkeypatch, InterruptAt(4, signal.SIGKILL))
+        else:  # the host has written its model, the sidecar is not there yet
+            monkeypatch.setattr(sidecar, "put", lambda *_: signal.raise_signal(signal.SIGKILL))
+        with contextlib.suppress(BaseException):
+            run(command(photographs, killed, 10), finetune)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
+    models = [run(command(photographs, out, 10), finetune).model_after for out in (trained, killed)]
+    assert models[0].read_bytes() == models[1].read_bytes()
+    one, other = (sidecar.load(model)[0] for model in models)
+    assert all(map(torch.equal, one.numbers.values(), other.numbers.values()))
+    files = [{p.relative_to(out) for p in out.rglob("*")} for out in (trained, killed)]
+    assert files[0] == files[1]
 
 
 def test_sigterm_in_stage_one_ends_the_process_as_the_host_alone(photographs, tmp_path):

@@ -11,10 +11,12 @@ from fragprune_plugins.learning.interruption import Terminate, between_steps, si
 
 @pytest.fixture(autouse=True)
 def handler():
-    """SIGTERM as a process has it that nobody prepared."""
+    """Signals as a process has them that nobody prepared, and that runs at a terminal."""
     before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    ctrl_c = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGTERM, before)
+    signal.signal(signal.SIGINT, ctrl_c)
 
 
 def test_sigterm_interrupts_as_ctrl_c_does_and_once():

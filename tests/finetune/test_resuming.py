@@ -109,6 +109,15 @@ def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatc
     require_same(whole, run(model, dataset, Settings(iterations=STEPS), path))
 
 
+@pytest.fixture
+def ctrl_c():
+    """SIGINT as at a terminal: a job in the background is started with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_waits_for_the_end_of_its_step_and_is_resumed_from_there(
     model, dataset, tmp_path, monkeypatch, single_thread, number
