@@ -28,6 +28,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.experiments.catalogue import QUESTIONS
 from fragprune_plugins.experiments.figures import new_figure, save_figure
 from fragprune_plugins.experiments.folder import Findings, Folder, markdown
+from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, View
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ def _photograph(name: str, size: int) -> Tensor:
     return torch.from_numpy(displayed(photograph(name, size, np.random.default_rng(0)))).float()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """Signals, fitted.
 
@@ -123,6 +124,8 @@ class Fit:
     fitted: Tensor
     errors: Tensor
     fragments: Tensor
+
+    __repr__ = one_line
 
 
 def fit(

@@ -22,8 +22,9 @@ def holding_tensors():
         if any(part in found.name for part in EXCLUDED) or ".native._" in found.name:
             continue
         for kind in vars(import_module(found.name)).values():
-            own = dataclasses.is_dataclass(kind) and kind.__module__ == found.name
-            if own and not kind.__name__.startswith("_"):
+            if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+                continue
+            if kind.__module__ == found.name and not kind.__name__.startswith("_"):
                 types = (str(each.type) for each in dataclasses.fields(kind))
                 if any("Tensor" in name and "Callable" not in name for name in types):
                     yield kind
