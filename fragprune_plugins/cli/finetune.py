@@ -141,6 +141,10 @@ def command(
     The same command goes on where it was interrupted or killed. If OUT is finished already, it says
     so and does nothing; --again begins anew.
 
+    With --portable no thresholds are learned: the Gaussians themselves cover less area, OUT needs
+    no sidecar, and every viewer draws it as it is. "area/pixel" in the table is what most web
+    viewers pay for: the pixels in all ellipses of sqrt(8) standard deviations.
+
     With --self no photograph is read: MODEL's own pictures are what it must go on showing, also
     between the cameras. PSNR is against those pictures then. The defaults are 1000 iterations at
     --pressure 1.5e-4.
@@ -152,6 +156,7 @@ def command(
       fragprune finetune point_cloud.ply --data scene --out fast.ply --target-time 1.4
       fragprune finetune point_cloud.ply --data scene --out good.ply --max-drop 0.05
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
+      fragprune finetune point_cloud.ply --data scene --out light.ply --portable
       fragprune finetune statue.ply --self --out pruned.ply
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
@@ -319,8 +324,11 @@ def command(
     if dropped:
         lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(seen)} views"))
     lines += [_describe_untruncated(before, plain) for plain in without]
-    together = " Keep the two together." if without else ""
-    lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
+    if settings.portable:
+        lines.append(f"Wrote {out}, which needs no sidecar: every viewer draws it as it is.")
+    else:
+        together = " Keep the two together." if without else ""
+        lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
     more: dict[str, Any] = {"curves": rows}
     if not result.interrupted:
         more |= {"configuration": asked, "text": "\n".join(lines)}
@@ -350,7 +358,9 @@ def _finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report |
         return None
     try:
         record = records.beside(out)
-        done = record is not None and record.command == "finetune" and sidecar.belongs(out)
+        plain = asked["portable"]
+        alone = sidecar.find(out) is None if plain else sidecar.belongs(out)
+        done = record is not None and record.command == "finetune" and alone
     except (RecordError, SidecarError):
         return None
     if record is None or not done or record.data.get("configuration") != asked:
@@ -386,10 +396,8 @@ def _terminated(model: Path, out: Path, result: FinetuneResult, then: str) -> Re
         "engine": result.engine,
         "settings": asked.as_dict(),
     }
-    text = (
-        f"SIGTERM at {done.steps} of {asked.iterations} iterations. Wrote {out} and its sidecar. "
-        f"{then}"
-    )
+    wrote = f"{out}" if asked.portable else f"{out} and its sidecar"
+    text = f"SIGTERM at {done.steps} of {asked.iterations} iterations. Wrote {wrote}. {then}"
     return Report(data, text, exit_code=EXIT_CODE)
 
 
@@ -493,7 +501,7 @@ def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
 
     advice = ""
     if before["psnr"] is not None and plain["psnr"] < before["psnr"] - FELL:
-        advice = " For viewers that ignore thresholds, fine-tune with --train opacity."
+        advice = " For viewers that ignore thresholds: --portable."
     return (
         f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
         f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE
+from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE, PORTABLE_ELASTICITY
 from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
 
 _OPTIONS = (
@@ -57,6 +57,13 @@ _OPTIONS = (
         "held-out views. finetune only.",
     ),
     click.option(
+        "--portable",
+        is_flag=True,
+        help="For viewers that know no thresholds: learn none, and press on the area that the "
+        "Gaussians cover instead of on drawn fragments. --pressure is its weight then; default: "
+        f"{PORTABLE_ELASTICITY:g} of the loss per pixel of area.",
+    ),
+    click.option(
         "--control",
         is_flag=True,
         help="Run the same iterations without truncation, to compare with.",
@@ -83,6 +90,9 @@ _EXCLUDE = (
     ("--control", "--pressure"),
     ("--control", "--target-speedup"),
     ("--control", "--target-time"),
+    ("--control", "--portable"),
+    ("--portable", "--target-time"),
+    ("--portable", "--max-drop"),
 )
 
 
@@ -105,6 +115,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
         pressure: float | None,
         target_speedup: float | None,
         target_time: float | None,
+        portable: bool,
         control: bool,
         nonfinite: Any,
         **kwargs: Any,
@@ -116,6 +127,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
             "--target-speedup": target_speedup is not None,
             "--target-time": target_time is not None,
             "--max-drop": kwargs["max_drop"] is not None,
+            "--portable": portable,
             "--control": control,
         }
         for one, other in _EXCLUDE:
@@ -130,6 +142,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
             target_speedup=target_speedup,
             target_time=target_time,
             itself=itself,
+            portable=portable,
             truncate=not control,
             seed=kwargs.get("seed", 0),
             nonfinite=nonfinite,

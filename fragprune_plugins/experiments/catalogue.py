@@ -7,13 +7,23 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.experiments.rules import Rule, alpha_cutoff, falloff_threshold
+from fragprune_plugins.experiments.rules import (
+    Rule,
+    Start,
+    alpha_cutoff,
+    falloff_threshold,
+    shrunk,
+    without_faint,
+)
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.learning.schedule import Settings, Train
 
 _FALLOFFS = (0.03, 0.07, 0.12, 0.2)
 _ALPHA_LEVELS = (4, 8, 12, 16)
 _PRESSURES = tuple(factor * LEAST_PRESSURE for factor in (0.5, 1, 2, 4))
+_AREA_PRESSURES = tuple(factor * LEAST_PRESSURE for factor in (2, 4))
+_SHRINKS = (0.7,)
+_FAINT = (0.15,)
 
 
 _SCORES = (
@@ -52,6 +62,7 @@ class Arm:
         rule: gives the thresholds; None where they are learned, or where nothing is truncated.
         opens: iterations before anything is truncated; None for ``Settings.warmup``.
         pruning: comes before the training; None where all Gaussians stay.
+        start: changes the model before it trains.
     """
 
     series: str
@@ -60,6 +71,7 @@ class Arm:
     rule: Rule | None = None
     opens: int | None = None
     pruning: Pruning | None = None
+    start: Start | None = None
 
     @property
     def label(self) -> str:
@@ -68,8 +80,8 @@ class Arm:
 
     @property
     def is_control(self) -> bool:
-        """Whether the arm trains all Gaussians without truncation."""
-        return not self.settings.truncate and self.pruning is None
+        """Whether the arm trains all Gaussians as they came, without truncation."""
+        return not self.settings.truncate and self.pruning is None and self.start is None
 
 
 @dataclass(frozen=True)
@@ -80,13 +92,13 @@ class Experiment:
         name: of the experiment, and of its files.
         asks: what it asks, one sentence.
         arms: what is compared.
-        over: what the plot shows quality over: fragments and frame time, or iterations.
+        over: what the plot shows quality over: fragments or area, and frame time; or iterations.
     """
 
     name: str
     asks: str
     arms: tuple[Arm, ...]
-    over: Literal["fragments", "iterations"] = "fragments"
+    over: Literal["fragments", "area", "iterations"] = "fragments"
 
     def control_of(self, arm: Arm) -> Arm | None:
         """The control of equal length that moves the same parameters; None for a control."""
@@ -97,7 +109,14 @@ class Experiment:
 
 
 def _control(settings: Settings) -> Settings:
-    return replace(settings, truncate=False, pressure=None, target_speedup=None, target_time=None)
+    return replace(
+        settings,
+        truncate=False,
+        portable=False,
+        pressure=None,
+        target_speedup=None,
+        target_time=None,
+    )
 
 
 def rules(iterations: int, train: Train | None = None) -> Experiment:
@@ -223,12 +242,40 @@ def primitives(iterations: int, train: Train | None = None) -> Experiment:
     )
 
 
+def portable(iterations: int, train: Train | None = None) -> Experiment:
+    """Pressure on the ellipses' area against simple ways to a lighter model without thresholds.
+
+    Args:
+        iterations: of every arm.
+        train: must be None or "all": shapes have to move.
+    """
+    settings = Settings(iterations=iterations, train=train or "all", portable=True)
+    control = _control(settings)
+    return Experiment(
+        "portable",
+        "For viewers that know no thresholds: is pressure on the ellipses' area better than to "
+        "shrink all Gaussians, or to remove the faint ones, and to train equally long?",
+        (
+            Arm("control", "", control),
+            *(
+                Arm("portable", f"λ={pressure:g}", replace(settings, pressure=pressure))
+                for pressure in _AREA_PRESSURES
+            ),
+            *(Arm("shrunk", f"{factor:g}", control, start=shrunk(factor)) for factor in _SHRINKS),
+            *(Arm("without faint", f"{o:g}", control, start=without_faint(o)) for o in _FAINT),
+            Arm("portable", "default", settings),
+        ),
+        over="area",
+    )
+
+
 EXPERIMENTS: dict[str, Callable[[int, Train | None], Experiment]] = {
     "rules": rules,
     "moves": moves,
     "iterations": iterations,
     "overfitting": overfitting,
     "primitives": primitives,
+    "portable": portable,
 }
 """By name: makes the experiment from the iterations of its longest arms and from what moves."""
 

@@ -20,6 +20,7 @@ AS_IT_CAME = "as it came"
 _FIGURES: dict[str, Callable[[Outcome], float]] = {
     "gaussians": lambda o: o.after["gaussians"],
     "fragments_per_pixel": lambda o: o.after["fragments_per_pixel"],
+    "area_per_pixel": lambda o: o.after["area_per_pixel"],
     "psnr": lambda o: o.after["psnr"],
     "ssim": lambda o: o.after["ssim"],
     "psnr_training": lambda o: o.after["psnr_training"],
@@ -33,6 +34,7 @@ _FIGURES: dict[str, Callable[[Outcome], float]] = {
 _COLUMNS = (
     ("Gaussians", "gaussians", "{:,.0f}"),
     ("fragments/px", "fragments_per_pixel", "{:.2f}"),
+    ("area/px", "area_per_pixel", "{:.2f}"),
     ("PSNR, dB", "psnr", "{:.2f}"),
     ("training views, dB", "psnr_training", "{:.2f}"),
     ("SSIM", "ssim", "{:.4f}"),
@@ -54,11 +56,12 @@ def rows(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[dict[str, 
 
     Returns:
         label, series, variant, iterations, and means over seeds, each with its standard deviation
-        as ``KEY_spread`` (None for one seed): gaussians, fragments_per_pixel, psnr (dB), ssim,
-        psnr_training (on the views learned from; all else is on held-out views), frame_ms, speedup
-        (frame time of the model as it came over frame_ms), frame_ms_enlarged and speedup_enlarged
-        (the same with longer sides), train_seconds, against_control (dB, PSNR over that of the
-        control of equal length; None where there is none).
+        as ``KEY_spread`` (None for one seed): gaussians, fragments_per_pixel, area_per_pixel
+        (``covered_per_pixel``), psnr (dB), ssim, psnr_training (on the views learned from; all else
+        is on held-out views), frame_ms, speedup (frame time of the model as it came over frame_ms),
+        frame_ms_enlarged and speedup_enlarged (the same with longer sides), train_seconds,
+        against_control (dB, PSNR over that of the control of equal length; None where there is
+        none).
     """
     came = [Outcome(each.arm, each.seed, each.before, each.before, 0.0) for each in outcomes]
     first = _means(came) | _mean("against_control", []) | _mean("train_seconds", [])
@@ -124,6 +127,8 @@ def _text(folder: Folder) -> str:
     spread = " ± is the standard deviation over seeds." if len(seeds) > 1 else ""
     trained = ", ".join(map(str, seeds))
     return f"""Means over {scene["held_out_views"]} held-out views and seeds {trained}.{spread}
+"Area" counts the pixels in all Gaussians' ellipses of sqrt(8) standard deviations, which viewers
+rasterize that know no thresholds.
 
 "Faster" is the frame time of the model {AS_IT_CAME}, without truncation, over the arm's, timed in
 turns: at the photographs' size, and with sides {ENLARGED} times as long. Compare arms by this
@@ -210,12 +215,14 @@ _QUALITIES = {"psnr": "held-out PSNR, dB", "psnr_training": "PSNR on training vi
 
 _FRAGMENTS = _Panel("drawn fragments per pixel", "fragments_per_pixel")
 
+_FRAMES = (
+    _Panel(f"frame time / that of the model {AS_IT_CAME}", "speedup", -1),
+    _Panel(f"the same, sides {ENLARGED} times as long", "speedup_enlarged", -1),
+)
+
 _PANELS = {
-    "fragments": (
-        _FRAGMENTS,
-        _Panel(f"frame time / that of the model {AS_IT_CAME}", "speedup", -1),
-        _Panel(f"the same, sides {ENLARGED} times as long", "speedup_enlarged", -1),
-    ),
+    "fragments": (_FRAGMENTS, *_FRAMES),
+    "area": (_Panel("area per pixel", "area_per_pixel"), *_FRAMES),
     "iterations": (
         _Panel("iterations", "iterations", quality="psnr_training"),
         _Panel("iterations", "iterations"),

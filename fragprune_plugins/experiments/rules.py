@@ -1,13 +1,20 @@
-"""Rules: thresholds that follow from opacities, to compare learned thresholds with."""
+"""Rules that are not learned, to compare learning with.
+
+A ``Rule`` gives thresholds that follow from opacities. A ``Start`` changes the Gaussians themselves
+once, before they train.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from fragprune_plugins.storage.ply import SplatFile
 
 
 @dataclass(frozen=True)
@@ -47,3 +54,40 @@ def alpha_cutoff(levels: float) -> Rule:
     """
     limit = levels / 255
     return Rule(f"alpha_cutoff({levels:g})", lambda opacities: (limit / opacities).clamp_max(1.0))
+
+
+@dataclass(frozen=True)
+class Start:
+    """A change to a model before it trains.
+
+    Attributes:
+        name: says which change, with its numbers; recorded with results.
+        model: gives the changed model.
+    """
+
+    name: str
+    model: Callable[[SplatFile], SplatFile]
+
+    def __call__(self, model: SplatFile) -> SplatFile:
+        """The changed model."""
+        return self.model(model)
+
+
+def shrunk(factor: float) -> Start:
+    """All Gaussians shrink alike: scale decay.
+
+    Args:
+        factor: on their standard deviations, in (0, 1).
+    """
+    return Start(
+        f"shrunk({factor:g})",
+        lambda model: replace(model, scaling=model.scaling + math.log(factor)),
+    )
+
+
+def without_faint(opacity: float) -> Start:
+    """Without the Gaussians whose opacity lies below a limit in (0, 1)."""
+    return Start(
+        f"without_faint({opacity:g})",
+        lambda model: model.keep(model.opacity[:, 0].sigmoid() >= opacity),
+    )

@@ -146,6 +146,7 @@ def _outcome(
 ) -> dict[str, Any]:
     """What ``Outcome`` holds of an arm, as plain values."""
     settings = replace(arm.settings, seed=seed)
+    splat = splat if arm.start is None else arm.start(splat)
     result = finetune(
         splat if arm.pruning is None else scores.prune(arm.pruning),
         dataset,
@@ -203,6 +204,7 @@ def _configuration(
                 "settings": {k: v for k, v in arm.settings.as_dict().items() if k != "seed"},
                 "rule": arm.rule and arm.rule.name,
                 "opens": arm.opens,
+                "start": arm.start and arm.start.name,
             }
             | ({"pruning": asdict(arm.pruning)} if arm.pruning else {})
             for arm in experiment.arms

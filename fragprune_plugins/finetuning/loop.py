@@ -23,6 +23,7 @@ from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.engines.cost import Cost, work_of
 from fragprune_plugins.errors import AlignmentError, CheckpointError, SidecarError, UsageError
 from fragprune_plugins.finetuning.resuming import Checkpoints, configuration
+from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, between_steps
 from fragprune_plugins.learning.losses import photometric_loss
@@ -97,9 +98,10 @@ def finetune(
     progress: bool = False,
     checkpoints: Checkpoints | None = None,
 ) -> FinetuneResult:
-    """Learn the thresholds of a trained splat on its photographs.
+    """Learn the thresholds of a trained splat on its photographs; portable, its shapes.
 
-    Loss: 0.8 L1 + 0.2 (1 - SSIM) + pressure x drawn fragments per pixel. Views come in seeded
+    Loss: 0.8 L1 + 0.2 (1 - SSIM) + pressure x drawn fragments per pixel; portable, pressure x
+    area of the ellipses per pixel. Views come in seeded
     random permutations; the global random streams are not touched.
 
     Args:
@@ -124,7 +126,8 @@ def finetune(
         CheckpointError: the checkpoint is broken, or another fine-tuning's.
         PluginError: a plugin raised, or gave an answer that cannot be used.
         AlignmentError: store and model differ in length.
-        UsageError: a target time without prices, or one that no thresholds reach.
+        UsageError: a target time without prices, or one that no thresholds reach; portable with
+            thresholds, in the store or by a rule.
         DivergedError: NaN or infinity in what trains.
     """
     settings, device = settings or Settings(), model.xyz.device
@@ -140,6 +143,13 @@ def finetune(
             f"a store of {len(store)} thresholds",
             f"{len(model)}, one per Gaussian",
             "Pass the store of this very model.",
+        )
+    if settings.portable and (rule is not None or not store.neutral):
+        raise UsageError(
+            "finetune",
+            "portable, and thresholds to draw with",
+            "a model without any: it is for viewers that know none",
+            "Pass --no-truncation to ignore thresholds stored with the model.",
         )
     run = _Run(
         model,
@@ -187,12 +197,17 @@ def mean_fragments(
     return total / len(shots)
 
 
-def save(path: Path, result: FinetuneResult) -> Path:
+def save(path: Path, result: FinetuneResult) -> Path | None:
     """Write the model and its sidecar, both complete or neither; returns the sidecar's path.
+
+    A portable model gets no sidecar, and None is returned.
 
     Raises:
         OutputError: the place cannot be written; existing files stay as they were.
     """
+    if result.settings.portable:
+        models.save_plain(path, result.model)
+        return None
     model = Model(result.model, result.store)
     return models.save(path, model, settings=result.settings.as_dict())
 
@@ -442,7 +457,7 @@ class _Run:
         self.done += 1
 
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
-        """Draw a view with its thresholds; also return the fragment pressure."""
+        """Draw a view with its thresholds; also return the pressure."""
         inputs = RasterInputs(shot.view, self.model.splats(), planes=())
         thresholds = self.stage.thresholds(inputs)
         outputs = self.engine.rasterize(inputs, thresholds)
@@ -450,4 +465,5 @@ class _Run:
         def untruncated() -> RasterOutputs:
             return outputs if thresholds is None else self.engine.rasterize(inputs, None)
 
-        return outputs, self.stage.drew(shot, outputs, untruncated)
+        area = area_per_pixel(inputs) if self.settings.portable else None
+        return outputs, self.stage.drew(shot, outputs, untruncated, area=area)

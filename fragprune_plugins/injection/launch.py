@@ -359,7 +359,9 @@ class _Runner:
         stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
         again = "Run the command again."
         if saved:
-            found += f"; the thresholds learned so far are beside {saved}"
+            learned = "model" if self.options.settings.portable else "thresholds"
+            where = "is" if self.options.settings.portable else "are beside"
+            found += f"; the {learned} learned so far {where} {saved}"
             again = (
                 "To continue from there, run fragprune run --stage finetune with "
                 f"{self.host.line.spellings('resume')[-1]} {saved} in the host's command. Without "

@@ -1,4 +1,4 @@
-"""Draws the host's views with thresholds and adds the fragment pressure to its loss."""
+"""Draws the host's views with thresholds and adds the pressure to its loss."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from fragprune_plugins.injection.stepping import (
     begin_step,
     frozen_parameters,
 )
+from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")
@@ -108,16 +109,18 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
             f"{expected} of {len(state.store)}, one per drawn threshold",
             "Report this with the host's commit.",
         )
-    if state.store.neutral:
+    stage = state.stage
+    presses = stage is not None and stage.learning and session.settings.portable
+    if state.store.neutral and not presses:
         return by_host()
     inputs, engine = unpack(session, drawn)
-    stage = state.stage
     thresholds = (
         session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
     )
-    if thresholds is None:
+    if thresholds is None and not presses:
         return by_host()
-    thresholds = thresholds if rows is None else thresholds[rows]
+    if thresholds is not None and rows is not None:
+        thresholds = thresholds[rows]
     truncated = partial(rasterize, engine, state, rendering[1], thresholds)
     return session.dialect.answer(drawn, inputs, truncated)
 
@@ -138,15 +141,20 @@ def rasterize(
     engine: Engine,
     state: ModelState,
     view: int,
-    thresholds: Tensor,
+    thresholds: Tensor | None,
     inputs: RasterInputs,
     part: int = 0,
 ) -> RasterOutputs:
-    """Draw with thresholds (N,); while learning, add the fragment pressure to the loss."""
+    """Draw with thresholds (N,) or without; while learning, add the pressure to the loss."""
     outputs = engine.rasterize(inputs, thresholds)
     if state.stage is None:
         return outputs
-    pressure = state.stage.drew(view, outputs, lambda: engine.rasterize(inputs, None), part)
+
+    def untruncated() -> RasterOutputs:
+        return outputs if thresholds is None else engine.rasterize(inputs, None)
+
+    area = area_per_pixel(inputs) if state.stage.settings.portable else None
+    pressure = state.stage.drew(view, outputs, untruncated, part, area)
     if pressure is None or not outputs.image.requires_grad:
         return outputs
     return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure))  # type: ignore[no-untyped-call]

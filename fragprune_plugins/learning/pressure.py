@@ -42,6 +42,12 @@ FEWEST = 20
 TIME_FOLLOWS = 0.4
 """d ln(frame time) / d ln(fragments), roughly: 0.3 in small pictures, 0.5 in large ones."""
 
+PORTABLE_ELASTICITY = 0.3
+"""Per cent of the loss that one per cent of the ellipses' area is worth without thresholds."""
+
+OWN_AREA_PRESSURE = 3e-4
+"""``OWN_PRESSURE`` on the ellipses' area, for a model that learns from its own pictures."""
+
 CALIBRATE_AT = 0.85
 """Share of the learning after which one shift of all thresholds meets the target, and they stay."""
 
@@ -62,8 +68,8 @@ class Observation:
 
     Attributes:
         progress: share of the learning that was over, 0 to 1.
-        fragments: drawn per pixel, mean over the step's views.
-        untruncated: the same views' before learning began.
+        fragments: drawn per pixel, mean over the step's views; or what else the pressure acts on.
+        untruncated: the same views' fragments before learning began.
         ratio: before over after of what a target counts; None for that of fragments, NaN where it
             was not looked at.
         loss: the photometric loss, without the pressure; NaN when not known.
@@ -146,6 +152,7 @@ class StepViews:
 
     expected: int = 1
     _fragments: list[Figure] = field(default_factory=list)
+    _pressed: list[Figure] = field(default_factory=list)
     _untruncated: list[Figure] = field(default_factory=list)
     _losses: list[Figure | None] = field(default_factory=list)
 
@@ -153,10 +160,18 @@ class StepViews:
         """Forget the views of the last step; their number is what the next step expects."""
         self.expected = self.drawn or self.expected
         self._fragments, self._untruncated, self._losses = [], [], []
+        self._pressed = []
 
-    def draw(self, fragments: Figure, untruncated: Figure) -> None:
-        """Note a view drawn with gradients: its fragments per pixel now and before learning."""
+    def draw(self, fragments: Figure, untruncated: Figure, pressed: Figure | None = None) -> None:
+        """Note a view drawn with gradients: its fragments per pixel now and before learning.
+
+        Args:
+            fragments: now.
+            untruncated: before.
+            pressed: what the pressure acts on; the fragments when None.
+        """
         self._fragments.append(fragments)
+        self._pressed.append(fragments if pressed is None else pressed)
         self._untruncated.append(untruncated)
         self._losses.append(None)
 
@@ -174,6 +189,11 @@ class StepViews:
     def fragments(self) -> float:
         """Fragments per pixel, mean over the views so far."""
         return _mean(self._fragments)
+
+    @property
+    def pressed(self) -> float:
+        """What the pressure acts on, mean over the views so far."""
+        return _mean(self._pressed)
 
     @property
     def untruncated(self) -> float:

@@ -8,7 +8,9 @@ from typing import Any, Literal
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import (
     ELASTICITY,
+    OWN_AREA_PRESSURE,
     OWN_PRESSURE,
+    PORTABLE_ELASTICITY,
     TIME_FOLLOWS,
     ElasticPressure,
     FixedPressure,
@@ -62,7 +64,10 @@ class Settings:
         opacity_lr: initial learning rate of opacity logits in stage 2.
         itself: True where the model's own pictures are the target. The default pressure is
             ``OWN_PRESSURE`` then, and no warm-up comes first, for it would have nothing to learn.
-        truncate: False trains without thresholds: the control to compare with.
+        portable: True for viewers that know no thresholds: none are learned. The pressure is on the
+            area of the Gaussians' ellipses instead (``area.area_per_pixel``), from the first step
+            on, and shapes must move.
+        truncate: False trains without thresholds or pressure: the control to compare with.
         seed: of the order of views in ``finetune``; hosts have their own.
         nonfinite: what to do with a step whose gradients are NaN or infinite: "stop" with an error,
             or "skip" it.
@@ -76,6 +81,7 @@ class Settings:
     threshold_lr: float = 0.05
     opacity_lr: float = 0.01
     itself: bool = False
+    portable: bool = False
     truncate: bool = True
     seed: int = 0
     nonfinite: Literal["stop", "skip"] = "stop"
@@ -102,6 +108,26 @@ class Settings:
                 "Change --target-time.",
             )
 
+        if self.portable and self.train != "all":
+            raise UsageError(
+                "options",
+                f"--portable with --train {self.train}",
+                "--train all: only shapes that move can cover less area",
+                "Drop one of the two.",
+            )
+        if self.portable and (self.target_speedup, self.target_time) != (None, None):
+            raise UsageError(
+                "options",
+                "--portable with --target-speedup or --target-time",
+                "no target: it is met by shifting thresholds, and there are none",
+                "Steer with --pressure.",
+            )
+
+    @property
+    def opens(self) -> bool:
+        """Whether thresholds open and learn."""
+        return self.truncate and not self.portable
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for the sidecar and ``--json``."""
         return asdict(self)
@@ -126,7 +152,9 @@ class Settings:
         if self.pressure is not None:
             return FixedPressure(self.pressure)
         if self.itself:
-            return FixedPressure(OWN_PRESSURE)
+            return FixedPressure(OWN_AREA_PRESSURE if self.portable else OWN_PRESSURE)
+        if self.portable:
+            return ElasticPressure(value=0.0, elasticity=PORTABLE_ELASTICITY, least=0.0)
         return ElasticPressure(
             elasticity=_RECIPES[self.train].elasticity if elasticity is None else elasticity
         )
@@ -135,7 +163,9 @@ class Settings:
     def warmup(self) -> int:
         """Steps that train without truncation before thresholds open."""
         learning = _RECIPES[self.train].steps
-        return 0 if learning is None or self.itself else max(0, self.iterations - learning)
+        if learning is None or self.itself or self.portable:
+            return 0
+        return max(0, self.iterations - learning)
 
 
 @dataclass(frozen=True)

@@ -179,14 +179,14 @@ class Stage2:
 
     @property
     def learning(self) -> bool:
-        """Whether this step moves thresholds."""
+        """Whether the pressure acts in this step, and thresholds move if they are learned."""
         plan = self.plan
         return plan is not None and plan.learn and self.settings.truncate and not self._held
 
     @property
     def warming_up(self) -> bool:
         """Whether steps were made, and thresholds that will learn have not opened yet."""
-        return self.settings.truncate and self.steps > 0 and not self._open
+        return self.settings.opens and self.steps > 0 and not self._open
 
     @property
     def viewed(self) -> bool:
@@ -205,7 +205,7 @@ class Stage2:
         self._views.begin()
         self._pictures = []
         self._open |= self.plan.learn
-        if self.plan.learn and self.settings.truncate:
+        if self.plan.learn and self.settings.opens:
             if not self.store.opened:
                 self.store.open(opacities())
             self._meet_target(self.plan.progress)
@@ -213,7 +213,7 @@ class Stage2:
 
     def thresholds(self, inputs: RasterInputs) -> Tensor | None:
         """(N,) to draw a rasterization with, or None; with gradients where they will be used."""
-        if not self.settings.truncate:
+        if not self.settings.opens:
             return None
         values = self._truncate(inputs, self.store)
         if values is None or self.plan is None or self.learning:
@@ -226,6 +226,7 @@ class Stage2:
         outputs: RasterOutputs,
         untruncated: Callable[[], RasterOutputs],
         part: int = 0,
+        area: Tensor | None = None,
     ) -> Tensor | None:
         """A rasterization was drawn with what ``thresholds`` gave.
 
@@ -234,9 +235,11 @@ class Stage2:
             outputs: of the engine.
             untruncated: draws the same without thresholds, at the view's first visit.
             part: of a view whose driver draws several pictures at once.
+            area: the ellipses' area per pixel (``area_per_pixel``) for the pressure to act on; the
+                drawn fragments when None.
 
         Returns:
-            The fragment pressure, a scalar to add to the loss; None where nothing is to be added.
+            The pressure, a scalar to add to the loss; None where nothing is to be added.
         """
         picture = view, part
         counted = torch.is_grad_enabled() and self.plan is not None and self.plan.counted
@@ -249,10 +252,11 @@ class Stage2:
         if not counted:
             return None
         self._pictures.append(picture)
-        self._views.draw(drawn[0], self._before[picture][0])
+        pressed = outputs.fragments_per_pixel if area is None else area
+        self._views.draw(drawn[0], self._before[picture][0], pressed.detach())
         if not self.learning or self.pressure.value == 0:
             return None
-        return outputs.fragments_per_pixel * (self.pressure.value / self._views.expected)
+        return pressed * (self.pressure.value / self._views.expected)
 
     def lost(self, loss: Tensor) -> None:
         """The loss of the view drawn last, without the pressure, went backward."""
@@ -311,7 +315,7 @@ class Stage2:
             DivergedError: the step left NaN or infinity.
         """
         self.taken = self.steps
-        if self.learning:
+        if self.learning and self.settings.opens:
             assert self.plan is not None
             self.store.step(self.plan.threshold_lr)
         if not are_finite([*self.parameters().values(), self.store.logits]):
@@ -335,7 +339,7 @@ class Stage2:
         if self.learning:
             ratio = self._predicted() if self._clock else None
             self.pressure.observe(
-                Observation(plan.progress, views.fragments, views.untruncated, views.loss, ratio)
+                Observation(plan.progress, views.pressed, views.untruncated, views.loss, ratio)
             )
         views.begin()  # first, so that whoever watches may raise
         if self._watch is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,9 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.datasets.dataset import Shot
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.clock import timed
+from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.measure.metrics import psnr, ssim
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
@@ -89,8 +92,8 @@ def measure(
         One dict a candidate: target ("photographs", or "itself" for a model's own pictures), psnr
         (dB; infinite against itself), ssim, lpips (None), fragments_per_pixel,
         evaluated_per_pixel, entries_per_pixel (NaN from an engine that does not count them),
-        gaussians, frame_ms (median over views and repeats), frame_ms_se (standard error over
-        repeats of the median over views), engine, device, views.
+        area_per_pixel (``covered_per_pixel``), gaussians, frame_ms (median over views and repeats),
+        frame_ms_se (standard error over repeats of the median over views), engine, device, views.
     """
     device = candidates[0].model.xyz.device
     if isinstance(engine, str):
@@ -109,10 +112,11 @@ def measure(
                     float(outputs.fragments_per_pixel),
                     float(outputs.evaluated_per_pixel),
                     float(outputs.entries_per_pixel),
+                    covered_per_pixel(engine, candidate.inputs(shot.view, splats)),
                 )
             )
         means = map(statistics.fmean, zip(*rows, strict=True))
-        quality, likeness, fragments, evaluated, entries = means
+        quality, likeness, fragments, evaluated, entries, area = means
         reports.append(
             {
                 "target": shots[0].target,
@@ -122,6 +126,7 @@ def measure(
                 "fragments_per_pixel": fragments,
                 "evaluated_per_pixel": evaluated,
                 "entries_per_pixel": entries,
+                "area_per_pixel": area,
                 "gaussians": len(splats),
             }
         )
@@ -130,6 +135,25 @@ def measure(
     for report, frame in zip(reports, frames, strict=True):
         report |= frame | {"engine": engine.name, "device": str(device), "views": len(shots)}
     return reports
+
+
+@torch.no_grad()
+def covered_per_pixel(engine: Engine, inputs: RasterInputs) -> float:
+    """Pixels in the Gaussians' ellipses of sqrt(8) standard deviations, per pixel of the picture.
+
+    It is what viewers pay that know no thresholds and do not ask how faint a Gaussian is. They
+    draw quads, whose area is 4 / pi times as large. The pixels are counted, not estimated.
+
+    Args:
+        engine: counts them.
+        inputs: of one rasterization of ``Splats``.
+    """
+    # Alpha capped at its least hides nothing; see ``visible``. A threshold then ends each ellipse.
+    assert isinstance(inputs.splats, Splats)
+    opaque = replace(inputs.splats, opacities=torch.ones_like(inputs.splats.opacities))
+    inputs = replace(inputs, splats=opaque, compensation="none", alpha_max=ALPHA_MIN)
+    ends = torch.full_like(opaque.opacities, math.exp(-SQUARED_RADIUS / 2))
+    return float(engine.rasterize(inputs, ends).fragments_per_pixel)
 
 
 @torch.no_grad()

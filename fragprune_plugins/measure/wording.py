@@ -35,6 +35,7 @@ _ROWS = (
     ("fragments/pixel", "fragments_per_pixel", 2),
     ("evaluated/pixel", "evaluated_per_pixel", 2),
     ("list entries/pixel", "entries_per_pixel", 3),
+    ("area/pixel", "area_per_pixel", 2),
     ("frame, ms", "frame_ms", 2),
     ("Gaussians", "gaussians", 0),
 )
@@ -49,6 +50,8 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
     for label, key, digits in _ROWS:
         if key == "entries_per_pixel" and not all(_known(each.get(key)) for each in reports):
             continue  # an engine that does not count them, or a record from before they were
+        if any(key not in report for report in reports):  # records of version 0.1 have no area
+            continue
         if key == "psnr" and itself:  # before, it is infinite: null in a record
             cells = [
                 "equal" if report is reports[0] else f"{report[key]:.2f}" for report in reports

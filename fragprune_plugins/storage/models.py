@@ -81,6 +81,25 @@ def _versions(path: Path) -> list[tuple[int, ...] | None]:
     return found
 
 
+def save_plain(path: str | Path, splat: SplatFile) -> None:
+    """Write a model that has no thresholds, for any viewer: no sidecar, no mark in the file.
+
+    The sidecar of an earlier model of this name goes with that model.
+
+    Raises:
+        OutputError: the place cannot be written; existing files stay as they were.
+    """
+    from fragprune_plugins.storage import sidecar
+    from fragprune_plugins.storage.atomic import staging
+    from fragprune_plugins.storage.ply import write_ply
+
+    path = Path(path)
+    with staging(path) as folder:
+        whole = folder / path.name
+        write_ply(whole, splat)
+        sidecar.replace_pair(path, whole, None)
+
+
 def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = None) -> Path:
     """Write a model and its sidecar, both complete or neither, as ``fragprune finetune`` does.
 

@@ -9,6 +9,7 @@ import torch
 from miniatures.vanilla_3dgs import joint, running
 
 from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
+from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -47,6 +48,49 @@ def test_gradients_are_those_of_loss_plus_pressure_times_fragments(pressure):
         assert torch.equal(outputs.image, image)
         for leaf, grad in zip(leaves, ours, strict=True):
             torch.testing.assert_close(leaf.grad, grad, rtol=1e-5, atol=1e-9)
+
+
+def test_portable_gradients_are_those_of_loss_plus_pressure_times_area():
+    pressure, seen = 0.02, []
+    with joint(Settings(iterations=9, pressure=pressure, portable=True)) as host:
+        model, camera = host.model(40), host.camera()
+        model.update_learning_rate(1)
+        engine = host.engine(torch.device("cpu"))
+        rasterize = engine.rasterize
+
+        def noting(inputs, thresholds):
+            seen.append((inputs, thresholds))
+            return rasterize(inputs, thresholds)
+
+        engine.rasterize = noting
+        image = host.render(camera, model)["render"]
+        ((image - camera.original_image).abs().mean() * 3).backward()
+        leaves = [g["params"][0] for g in model.optimizer.param_groups]
+        ours = [leaf.grad.clone() for leaf in leaves]
+        for leaf in leaves:
+            leaf.grad = None
+        host.render(camera, model)
+        (inputs, thresholds), area = seen[-1], area_per_pixel(seen[-1][0])
+        assert thresholds is None
+        loss = (rasterize(inputs, None).image - camera.original_image).abs().mean() * 3
+        (loss + pressure * area).backward()
+        assert area > 1
+        for leaf, grad in zip(leaves, ours, strict=True):
+            torch.testing.assert_close(leaf.grad, grad, rtol=1e-5, atol=1e-9)
+        assert host.store(model).neutral
+
+
+def test_a_portable_host_covers_less_and_its_thresholds_stay_neutral():
+    covered = []
+    for pressure in (0.0, 0.02):
+        with running(Settings(iterations=30, pressure=pressure, portable=True)) as host:
+            model, camera = host.model(40), host.camera()
+            for iteration in range(1, 31):
+                host.step(model, camera, iteration)
+            covered.append(model.get_scaling.detach().log().mean().item())
+            assert host.store(model).neutral
+            assert host.finish().steps == 30
+    assert covered[1] < covered[0] - 0.01
 
 
 def test_evaluation_renders_feel_no_pressure_and_count_for_nothing():

@@ -245,6 +245,30 @@ def test_train_then_finetune_then_render(photographs, tmp_path):
     assert truncated != [p.read_bytes() for p in sorted(renders.iterdir())]
 
 
+PORTABLE = replace(OPTIONS, stage="finetune", settings=Settings(iterations=8, portable=True))
+
+
+def test_a_portable_run_moves_shapes_and_leaves_thresholds_neutral(photographs, trained):
+    summary = run(command(photographs, trained, 10), PORTABLE)
+    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
+    assert not torch.equal(before.scaling, after.scaling)
+    assert all(c["pressure"] > 0 for c in summary.curves[1:])
+    store, info = sidecar.load(summary.model_after)
+    assert store.neutral
+    assert info.settings["portable"]
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_ctrl_c_keeps_a_portable_model_though_it_has_no_thresholds(
+    photographs, trained, monkeypatch
+):
+    with_plugin(monkeypatch, InterruptAt(4))
+    with pytest.raises(Interrupted, match="the model learned so far is "):
+        run(command(photographs, trained, 10), PORTABLE)
+    (saved,) = trained.glob("point_cloud/*/*.safetensors")
+    assert sidecar.load(saved.with_name("point_cloud.ply"))[0].neutral
+
+
 def test_a_finished_ply_without_a_checkpoint_is_enough(photographs, trained):
     before = {p for p in trained.rglob("*") if p.is_file()}
     summary = run(command(photographs, trained, 10), replace(OPTIONS, stage="finetune"))

@@ -94,7 +94,7 @@ def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
     before = {"psnr": 30.0}
     plain = {"psnr": 30.0 - drop, "target": "photographs", "fragments_per_pixel": 9.0}
     line = _describe_untruncated(before, plain | {"frame_ms": 1.0, "frame_ms_se": 0.1})
-    assert ("--train opacity" in line) == advised
+    assert ("--portable" in line) == advised
 
 
 def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):

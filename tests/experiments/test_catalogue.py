@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import pytest
+import torch
 from cli.commands import run
+from finetune import tiny
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.experiments.catalogue import EXPERIMENTS
+from fragprune_plugins.experiments.rules import shrunk, without_faint
 from fragprune_plugins.measure.scores import SCORES
 
 
@@ -48,6 +51,28 @@ def test_primitives_prunes_by_every_published_score_without_and_with_thresholds(
     assert alone == [arm.pruning for arm in arms if arm.settings.truncate]
     assert {each.score for each in alone} == set(SCORES) - {"removal-error-per-price"}
     assert {each.keep for each in alone} == {0.4, 0.6, 0.8}
+
+
+def test_portable_compares_area_pressure_with_changes_before_training():
+    experiment = EXPERIMENTS["portable"](700, None)
+    learned = [arm for arm in experiment.arms if arm.settings.portable]
+    assert [arm.settings.pressure for arm in learned] == [2e-4, 4e-4, None]
+    started = [arm for arm in experiment.arms if arm.start]
+    assert [arm.start.name for arm in started] == ["shrunk(0.7)", "without_faint(0.15)"]
+    assert not any(arm.is_control or arm.settings.truncate for arm in started)
+    with pytest.raises(UsageError, match="--train"):
+        EXPERIMENTS["portable"](700, "opacity")
+
+
+def test_a_start_shrinks_all_alike_or_removes_the_faint():
+    model = tiny.random_model()
+    small = shrunk(0.7)(model).splats()
+    torch.testing.assert_close(small.scales, 0.7 * model.splats().scales)
+    opacities = model.splats().opacities
+    limit = opacities.median().item()
+    left = without_faint(limit)(model).splats().opacities
+    assert torch.equal(left, opacities[opacities >= limit])
+    assert 0 < len(left) < len(model)
 
 
 def test_iterations_compares_lengths():

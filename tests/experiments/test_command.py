@@ -15,7 +15,7 @@ from PIL import Image
 
 from fragprune_plugins.experiments import catalogue, running
 from fragprune_plugins.experiments.catalogue import Arm, Experiment, Pruning
-from fragprune_plugins.experiments.rules import alpha_cutoff
+from fragprune_plugins.experiments.rules import alpha_cutoff, shrunk
 from fragprune_plugins.learning.schedule import Settings
 
 
@@ -62,7 +62,7 @@ def test_writes_table_sheet_plot_and_configuration(words, trained, tmp_path):
     assert len(trained) == 6
     out = tmp_path / "out"
     page = (out / "rules.md").read_text()
-    for label in ("as it came", "control", "learned", "alpha 16/255", "±", "What wins?"):
+    for label in ("as it came", "control", "learned", "alpha 16/255", "area/px", "±", "What wins?"):
         assert label in page
     with open(out / "rules.csv") as file:
         sheet = list(csv.DictReader(file))
@@ -254,3 +254,25 @@ def test_prunes_before_training_and_scores_once(words, trained, monkeypatch):
     arms = report["configuration"]["arms"]
     assert arms["opacity 50%"]["pruning"] == {"score": "opacity", "keep": 0.5}
     assert "pruning" not in arms["control"]
+
+
+def changed(iterations, train=None):
+    settings = Settings(iterations=iterations, portable=True, pressure=1e-2)
+    control = replace(settings, truncate=False, portable=False, pressure=None)
+    arms = (
+        Arm("control", "", control),
+        Arm("portable", "", settings),
+        Arm("shrunk", "0.5", control, start=shrunk(0.5)),
+    )
+    return Experiment("rules", "What is light?", arms, over="area")
+
+
+def test_an_arm_may_change_the_model_before_it_trains(words, trained, monkeypatch, tmp_path):
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", changed)
+    report = run_json(*words)
+    came, control, portable, small = report["rows"]
+    assert small["area_per_pixel"] < 0.6 * came["area_per_pixel"]
+    assert portable["area_per_pixel"] < control["area_per_pixel"]
+    assert small["against_control"] == pytest.approx(small["psnr"] - control["psnr"], abs=1e-9)
+    asked = json.loads((tmp_path / "out" / "rules.json").read_text())
+    assert asked["arms"]["shrunk 0.5"]["start"] == "shrunk(0.5)"

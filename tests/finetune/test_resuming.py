@@ -79,8 +79,9 @@ def require_same(one, other):
         Settings(iterations=STEPS, train="opacity", pressure=1e-3),
         Settings(iterations=STEPS, train="appearance", target_speedup=1.5),
         Settings(iterations=STEPS, truncate=False, seed=3),
+        Settings(iterations=STEPS, portable=True),
     ],
-    ids=["all", "opacity", "target", "control"],
+    ids=["all", "opacity", "target", "control", "portable"],
 )
 def test_cut_off_again_and_again_it_ends_as_if_never_cut(
     model, dataset, tmp_path, monkeypatch, single_thread, settings

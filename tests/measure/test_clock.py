@@ -62,7 +62,7 @@ def test_every_timed_frame_of_a_measurement_waits(events, tmp_path):
     model = tiny.random_model()
     shots = tiny.dataset_in_memory(tmp_path, model).test
     measure([Candidate(model)] * 2, shots, engine=Notes(events), repeats=3)
-    looked_at, frames = 2 * len(shots), 3 * 2 * len(shots)
+    looked_at, frames = 2 * 2 * len(shots), 3 * 2 * len(shots)
     assert events[:looked_at] == ["draw"] * looked_at
     assert events[looked_at:] == ["idle cpu", "draw", "idle cpu"] * frames
 

@@ -19,6 +19,7 @@ NAMES = {
     "fragments_per_pixel",
     "evaluated_per_pixel",
     "entries_per_pixel",
+    "area_per_pixel",
     "gaussians",
     "frame_ms",
     "frame_ms_se",

@@ -1,0 +1,162 @@
+"""Portable: no thresholds, less area, and a file that every viewer draws as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+import fragprune_plugins as fp
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.finetuning import finetune
+from fragprune_plugins.learning.pressure import OWN_AREA_PRESSURE, PORTABLE_ELASTICITY
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.measure import covered_per_pixel
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.types import RasterInputs
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return tiny.scene(tmp_path)
+
+
+def area(model, dataset):
+    engine, splats = create_engine("auto"), model.splats()
+    shots = dataset.test
+    return sum(covered_per_pixel(engine, RasterInputs(s.view, splats)) for s in shots) / len(shots)
+
+
+def test_more_pressure_covers_less(scene):
+    data, _, model = scene
+    dataset = fp.load_dataset(data)
+    settings = Settings(iterations=40, portable=True, pressure=0.0)
+    free, light = (
+        finetune(model, dataset, replace(settings, pressure=pressure)) for pressure in (0.0, 5e-2)
+    )
+    assert light.thresholds is None
+    assert area(light.model, dataset) < 0.9 * area(free.model, dataset)
+    assert len(light.model) == len(model)
+
+
+def test_without_pressure_it_is_the_control_to_the_bit(scene):
+    data, _, model = scene
+    dataset = fp.load_dataset(data)
+    portable = finetune(model, dataset, Settings(iterations=8, portable=True, pressure=0.0))
+    control = finetune(model, dataset, Settings(iterations=8, truncate=False))
+    for name in ("xyz", "opacity", "scaling", "rotation", "f_dc"):
+        assert torch.equal(getattr(portable.model, name), getattr(control.model, name))
+
+
+def test_the_pressure_is_a_share_of_the_loss_per_area(scene):
+    data, _, model = scene
+    dataset = fp.load_dataset(data)
+    result = finetune(model, dataset, Settings(iterations=3, portable=True))
+    assert result.curves[0].pressure == 0.0  # no loss is known before the first step
+    covered = area(model, replace(dataset, test=dataset.train))
+    expected = PORTABLE_ELASTICITY * result.curves[0].loss / covered
+    assert result.curves[1].pressure == pytest.approx(expected, rel=0.5)  # one view, not the mean
+
+
+def test_its_own_pictures_press_by_a_fixed_weight_from_the_first_step_on():
+    settings = Settings(iterations=5000, itself=True, portable=True)
+    assert settings.make_pressure().value == OWN_AREA_PRESSURE
+    for itself in (True, False):
+        schedule = Schedule(replace(settings, itself=itself))
+        assert schedule.at(1).learn
+
+
+def test_the_file_has_no_thresholds_and_needs_none(scene, tmp_path):
+    data, path, _ = scene
+    out = tmp_path / "out.ply"
+    sidecar_of_before = sidecar.path_beside(out)
+    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 20)
+    run_json(*arguments, "--pressure", 1e-3)
+    assert sidecar_of_before.exists()
+    result = run(*arguments, "--portable", "--pressure", 1e-3)
+    assert result.exit_code == 0, result.stderr
+    assert not sidecar_of_before.exists()
+    header = out.read_bytes().split(b"end_header")[0]
+    assert b"fragprune" not in header
+    assert b"trunc" not in header
+    assert fp.load(out).thresholds is None  # nothing is missed
+    assert "area/pixel" in result.stdout
+    assert "every viewer draws it as it is" in result.stdout
+    profile = run_json("profile", out, "--data", data)
+    assert set(profile["columns"]) == {"untruncated"}
+
+
+@pytest.mark.parametrize("more", [(), ("--drop-invisible",)])
+def test_the_record_has_the_area_of_both(scene, tmp_path, more):
+    data, path, model = scene
+    out = tmp_path / "out.ply"
+    words = ("--data", data, "--out", out, "--iters", 30, "--portable", "--pressure", 1e-2)
+    report = run_json("finetune", path, *words, *more)
+    learned = fp.load(out).splat
+    dataset = fp.load_dataset(data)
+    for side, splat in (("before", model), ("after", learned)):
+        assert report[side]["area_per_pixel"] == pytest.approx(area(splat, dataset), rel=1e-6)
+    assert report["after"]["area_per_pixel"] < report["before"]["area_per_pixel"]
+    assert report["untruncated"] is None
+    assert report["settings"]["portable"]
+
+
+def test_a_finished_command_does_nothing_and_a_sidecar_makes_it_unfinished(scene, tmp_path):
+    data, path, _ = scene
+    words = ("finetune", path, "--data", data, "--iters", 5, "--portable")
+    out = tmp_path / "out.ply"
+    first = run_json(*words, "--out", out)
+    assert first["already_finished"] is False
+    assert run_json(*words, "--out", out) == first | {"already_finished": True}
+    sidecar.save(out, ThresholdStore(60))
+    assert run_json(*words, "--out", out)["already_finished"] is False
+
+
+def test_without_photographs(scene, tmp_path):
+    data, path, _ = scene
+    out = tmp_path / "out.ply"
+    words = ("--self", "--data", data, "--out", out, "--iters", 40, "--portable")
+    report = run_json("finetune", path, *words, "--pressure", 3e-3)
+    assert report["target"] == "itself"
+    assert report["after"]["area_per_pixel"] < report["before"]["area_per_pixel"]
+    assert report["after"]["psnr"] > 25
+    assert not sidecar.path_beside(out).exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--train", "opacity"),
+        ("--train", "appearance"),
+        ("--target-speedup", 2),
+        ("--target-time", 2),
+        ("--max-drop", 0.1),
+    ],
+)
+@pytest.mark.parametrize(
+    "command", [("run", "--", "train.py"), ("finetune", "m.ply", "--data", "s", "--out", "o.ply")]
+)
+def test_what_needs_thresholds_or_still_shapes_is_refused(command, option, value):
+    name, *words = command
+    result = run(name, "--portable", option, value, *words)
+    assert result.exit_code == 2
+    assert f"--portable with {option}" in result.stderr
+
+
+def test_a_control_is_not_portable(tmp_path):
+    words = ("finetune", "m.ply", "--data", "s", "--out", tmp_path / "o.ply")
+    result = run(*words, "--control", "--portable")
+    assert result.exit_code == 2
+    assert "--control with --portable" in result.stderr
+
+
+def test_a_model_with_thresholds_is_refused(scene):
+    data, _, model = scene
+    store = ThresholdStore.from_falloff(torch.full((len(model),), 0.1))
+    with pytest.raises(UsageError, match="--no-truncation"):
+        finetune(model, fp.load_dataset(data), Settings(portable=True), store=store)
