@@ -92,6 +92,7 @@ class Compact3DGS(GraphdecoAdapter):
     )
     groups = ("xyz", "opacity", "scaling", "rotation", "mask")
     appearance = frozenset({NETWORK})
+    densifies_until = ()  # it prunes by its mask to the end
     inherited = ("rotation", "opacity")
     own_names = tuple(f"{MODEL}:{name}" for name in ("vq_scale", "recolor", "mlp_head"))
     seams = (

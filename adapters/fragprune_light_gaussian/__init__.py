@@ -81,6 +81,7 @@ class LightGaussian(GraphdecoAdapter):
     dialect_type = LightGaussianDialect
     scripts = (TRAIN, PRUNE, DISTIL)
     optimizer = "AdamW"
+    densifies_until = ("densify_until_iter", "prune_iterations")
     seams = (
         *GraphdecoAdapter.seams,
         Seam(Role.VIEW, "gaussian_renderer", "count_render", ("viewpoint_camera", "pc")),
@@ -106,6 +107,10 @@ class LightGaussian(GraphdecoAdapter):
             parser.add_argument(flag, action="store_true")
         own, shared = parser.parse_known_args(arguments)
         return script.with_name(TRAIN), [*shared, "--sh_degree", own.new_max_sh]
+
+    def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
+        """The last pruning of a training; None for scripts that go on from a checkpoint."""
+        return super().densified(repo, script, arguments) if script.name == TRAIN else None
 
     def view(self, camera: Any) -> int:
         """The camera's number, because distillation draws through copies of its cameras."""

@@ -20,6 +20,7 @@ from fragprune_plugins.adapting import (
     HostAdapter,
     HostCall,
     HostInfo,
+    HostRepo,
     RasterInputs,
     RasterizerCall,
     RasterOutputs,
@@ -129,6 +130,13 @@ class LP3DGS(GraphdecoAdapter):
                 "Fine-tune its PLY with fragprune finetune.",
             )
         return script, arguments
+
+    def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
+        """The end of densification, or of the learning of masks, after which the host prunes."""
+        names = ("prune_iterations", "train_mask_iters")
+        masks = self.numbers(repo, script, arguments, names)
+        ends = [sum(map(max, masks.values())), super().densified(repo, script, arguments) or 0]
+        return max(ends) or None
 
     def model_of(self, call: SeamCall) -> Any:
         """The model; None for the functions that the script calls at its end."""

@@ -126,6 +126,7 @@ class MiniSplatting(GraphdecoAdapter):
     )
     dialect_type = MiniSplattingDialect
     scripts = SCRIPTS
+    densifies_until = ("densify_until_iter", "simp_iteration1", "simp_iteration2")
     seams = (
         *GraphdecoAdapter.seams,
         Seam(Role.VIEW, RENDERER, "render_imp", ("viewpoint_camera", "pc")),

@@ -40,6 +40,9 @@ MODEL = "scene.gaussian_model"
 PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 """Inside the checkout, and compiled when it is imported."""
 
+WARM_UP = 10_000
+"""Iterations that ``--ours_new`` warms up."""
+
 SMALLER = {
     **dict.fromkeys(("bicycle", "flowers", "garden", "stump", "treehill"), "images_4"),
     **dict.fromkeys(("room", "counter", "kitchen", "bonsai"), "images_2"),
@@ -126,6 +129,13 @@ class RainGS(GraphdecoAdapter):
         """Vanilla's flags, with this host's flag for white; it always holds views out."""
         line = super().command_line(repo)
         return replace(line, white_background=("--white_bg",), hold_out=())
+
+    def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
+        """Later by the warm-up, which a mode of the host sets itself."""
+        until = super().densified(repo, script, arguments)
+        own = self.numbers(repo, script, arguments, ["warmup_iter"])
+        warm_up = WARM_UP if "--ours_new" in arguments else max(own.get("warmup_iter", [0]))
+        return None if until is None else until + warm_up
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
         """Vanilla's photographs, from the image folder that the scene's name implies."""

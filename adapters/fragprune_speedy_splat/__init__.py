@@ -84,6 +84,7 @@ class SpeedySplat(GraphdecoAdapter):
     calls = (RasterizerCall(outputs=3, arguments=frozenset({"scores"})),)
     own_names = ("gaussian_renderer:kernel_times",)
     dialect_type = SpeedySplatDialect
+    densifies_until = ("densify_until_iter", "prune_until_iter")
     seams = (
         *GraphdecoAdapter.seams,
         Seam(Role.STILL, "scene.gaussian_model", "GaussianModel.prune_gaussians"),

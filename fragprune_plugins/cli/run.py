@@ -45,7 +45,10 @@ if TYPE_CHECKING:
     "joint: learn inside the training. off: only apply stored thresholds.",
 )
 @click.option(
-    "--from-iter", type=click.IntRange(min=0), help="finetune, joint: learn from this iteration on."
+    "--from-iter",
+    type=click.IntRange(min=0),
+    help="finetune, joint: learn after this iteration; joint's default is the end of densification "
+    "by the host's own arguments.",
 )
 @click.option(
     "--alternate", type=click.IntRange(min=1), help="joint: learn N iterations, hold N, and so on."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -266,6 +266,27 @@ class CommandLine:
                 setattr(values, name, written.get(key, getattr(values, name)))
         return values
 
+    def numbers(self, arguments: list[str], **defaults: Sequence[int]) -> dict[str, list[int]]:
+        """Numbers of other flags, by name, as the host will read them.
+
+        Args:
+            arguments: of the host's command.
+            defaults: by a flag's name without dashes, the host's default.
+
+        Raises:
+            UsageError: a value is no number, or the configuration file cannot be read.
+        """
+        parser = Flags(add_help=False, allow_abbrev=False)
+        for name, default in defaults.items():
+            parser.add_argument(f"--{name}", type=int, nargs="+", default=[*default])
+        if self.config:
+            parser.add_argument(self.config.flag, dest="config", type=Path)
+        values, _ = parser.parse_known_args(arguments)
+        file = self.config and values.config
+        written = read_config(self.config, file) if self.config and file else {}
+        found = {name: written.get(name, getattr(values, name)) for name in defaults}
+        return {name: each if isinstance(each, list) else [each] for name, each in found.items()}
+
 
 class HostAdapter(ABC):
     """Describes one host: how to recognise it, which functions to wrap, how its tensors are named.
@@ -403,6 +424,14 @@ class ScriptAdapter(HostAdapter):
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command that can resume a training script's result; by default the same command."""
         return script, arguments
+
+    def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
+        """The iteration of a training command after which densification is over.
+
+        The host adds, relocates, prunes and resets no Gaussian after it. ``--stage joint`` learns
+        from there by default. None if the host's arguments do not tell, or if it never stops.
+        """
+        return None
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
         """The photographs that a training command reads.

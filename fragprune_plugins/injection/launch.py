@@ -53,8 +53,8 @@ class RunOptions:
             folder, or from the file that the host's resume flag names. "joint" learns inside the
             host's training. "off" only applies thresholds of sidecars and checkpoints.
         settings: settings of the fine-tuning.
-        from_iter: iteration at which learning begins inside one run. "finetune" also freezes the
-            model from there on.
+        from_iter: iteration after which learning begins inside one run. "finetune" also freezes the
+            model from there on. None: "joint" learns once the host's densification is over.
         alternate: with "joint", learn for this many iterations, hold for as many, and so on.
         engine: "auto", "reference", "cpu", "cuda", or the name of a plugin's engine.
         device: the host's device. "cpu" runs a CUDA-only host without a GPU, "cuda" and "cuda:N"
@@ -213,10 +213,14 @@ class _Runner:
 
     def joint(self) -> None:
         """Run the command once; thresholds learn while the whole model trains."""
-        resumed, start, total = self._learning(self.options.from_iter)
+        from_iter = self.options.from_iter
+        resumed, start, total = self._learning(
+            self._densified() if from_iter is None else from_iter
+        )
+        log.info("thresholds learn in iterations %d to %d", start + 1, total)
         steps = total - resumed - self.host.line.skipped
         settings = replace(self.options.settings, iterations=steps)
-        schedule = JointSchedule(settings, max(1, start - resumed), self.options.alternate)
+        schedule = JointSchedule(settings, start - resumed + 1, self.options.alternate)
         self._execute(
             self.host.saving(self.scratch, total),
             learn=True,
@@ -416,20 +420,37 @@ class _Runner:
         except NotComparedError as error:
             return None, {}, error
 
-    def _learning(self, from_iter: int | None) -> tuple[int, int, int]:
+    def _densified(self) -> int:
+        """The iteration after which the host's densification is over.
+
+        Raises:
+            UsageError: the host does not tell.
+        """
+        host = self.host
+        end = self.adapter.densified(self.repo, host.script, host.arguments)
+        if end is None:
+            raise UsageError(
+                "--stage joint",
+                f"{self.adapter.info.title}, which does not tell when its densification is over",
+                "the iteration after which thresholds learn",
+                "Add --from-iter.",
+            )
+        return end
+
+    def _learning(self, from_iter: int) -> tuple[int, int, int]:
         """(resumed, start, last): three iterations of the host.
 
         The run resumes after iteration ``resumed``, learns after ``start`` and ends with ``last``.
 
         Args:
-            from_iter: the option; None for half of the training.
+            from_iter: the option, or the end of the host's densification.
 
         Raises:
             UsageError: nothing would be learned.
         """
         total, file = self.host.iterations, self.host.flags.resume
         resumed = starting.resumed_at(self.host.line, Path(file)) if file else 0
-        start = max(resumed, total // 2 if from_iter is None else from_iter)
+        start = max(resumed, from_iter)
         if start < total - self.host.line.skipped:
             return resumed, start, total
         flag = f"Raise {self.host.line.spellings('iterations')[-1]}"

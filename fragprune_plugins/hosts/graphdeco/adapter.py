@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -170,6 +171,8 @@ class GraphdecoAdapter(ScriptAdapter):
         own_names: "module:name" of names that only this host's source mentions, not its ancestors'.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
+        densifies_until: arguments with the iterations after which the host adds, relocates, prunes
+            and resets no Gaussian; () if it does so to its end.
     """
 
     package = "diff_gaussian_rasterization"
@@ -181,6 +184,7 @@ class GraphdecoAdapter(ScriptAdapter):
     own_names: tuple[str, ...] = ()
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
+    densifies_until: tuple[str, ...] = ("densify_until_iter",)
     inherited = ("f_dc", "rotation")
     seams = (
         *MODEL_SEAMS,
@@ -287,6 +291,19 @@ class GraphdecoAdapter(ScriptAdapter):
             white_background=("-w", "--white_background"),
             hold_out=("--eval",),
         )
+
+    def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
+        """The latest of those of ``densifies_until`` that the source has, with its defaults."""
+        values = self.numbers(repo, script, arguments, self.densifies_until)
+        return max(map(max, values.values())) if values else None
+
+    def numbers(
+        self, repo: HostRepo, script: Path, arguments: list[str], names: Iterable[str]
+    ) -> dict[str, list[int]]:
+        """Numbers of a training command by argument, for those arguments that the source has."""
+        defaults = {name: numbers(repo, script, name) for name in names}
+        known = {name: default for name, default in defaults.items() if default}
+        return self.command_line(repo).numbers(arguments, **known)
 
     def means(self, model: Any) -> Tensor:
         """``get_xyz`` returns the parameter object itself."""
@@ -484,3 +501,29 @@ def default(repo: HostRepo, group: str, name: str, otherwise: float) -> float:
         ):
             return node.value.value
     return otherwise
+
+
+def numbers(repo: HostRepo, script: Path, name: str) -> list[int]:
+    """The default of an argument, of an argument group or of the script itself; [] without one.
+
+    Args:
+        repo: the checkout.
+        script: whose ``add_argument`` calls count.
+        name: the argument.
+    """
+    if value := default(repo, "OptimizationParams", name, 0):
+        return [int(value)]
+    tree = repo.tree(".".join(script.relative_to(repo.root).with_suffix("").parts))
+    for node in ast.walk(tree) if tree else ():
+        if (
+            isinstance(node, ast.Call)
+            and getattr(node.func, "attr", "") == "add_argument"
+            and any(
+                isinstance(each, ast.Constant) and each.value == f"--{name}" for each in node.args
+            )
+        ):
+            given = {each.arg: each.value for each in node.keywords}
+            with contextlib.suppress(KeyError, ValueError, TypeError):
+                value = ast.literal_eval(given["default"])
+                return [int(each) for each in (value if isinstance(value, list) else [value])]
+    return []
