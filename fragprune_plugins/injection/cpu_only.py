@@ -19,6 +19,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 _CUDA = re.compile(r"cuda(:\d+)?$")
+_NAMES = frozenset((str, torch.device))  # looked up by type: every torch call comes by
 
 
 def _redirected(value: Any) -> Any:
@@ -45,9 +46,10 @@ class _Redirect(TorchFunctionMode):
             return args[0]
         if func is torch.Tensor.get_device:  # hosts pass it to .to(), which refuses -1
             return torch.device("cpu")
-        if "device" in kwargs or len(args) > 1:
+        if not _NAMES.isdisjoint(map(type, args)):
             args = tuple(_redirected(a) for a in args)
-            kwargs = {k: _redirected(v) for k, v in kwargs.items()}
+        if "device" in kwargs:
+            kwargs["device"] = _redirected(kwargs["device"])
         return func(*args, **kwargs)
 
 
