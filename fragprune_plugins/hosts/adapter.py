@@ -399,7 +399,12 @@ class HostAdapter(ABC):
         return []
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
-        """Restore state that the host's own resume loses."""
+        """Restore state that the host's own resume loses.
+
+        Args:
+            model: the host's model.
+            output: the folder of the run that was resumed; None if stage 2 resumes none.
+        """
 
     def checkpoint_state(self, capture: Any) -> dict[str, Any]:
         """The dict inside the host's checkpoint tuple that can hold a key of ours."""

@@ -194,7 +194,9 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
     state.steps += 1
     if session.standing_still(model):
         if not state.prepared:
-            session.adapter.prepare_stage2(model, session.origin or session.output)
+            resumed = session.start > 0 or session.origin is not None
+            output = (session.origin or session.output) if resumed else None
+            session.adapter.prepare_stage2(model, output)
             state.prepared = True
         fill_gradients_read(session, model)
     if state.stage is not None and state.steps > session.from_step:

@@ -37,6 +37,7 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_vanilla_3dgs import Vanilla3DGS
+from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
 def command(scene, out, iterations, *more):
@@ -300,6 +301,22 @@ def test_joint_learning_through_densification_keeps_rows_together(photographs, t
     rows = len(read_ply(summary.model_after).xyz)
     assert rows != 150
     assert len(store) == rows == summary.gaussians
+
+
+@pytest.mark.parametrize("from_iter", [None, 18])
+def test_only_a_resumed_run_restores_what_the_folder_holds(
+    photographs, tmp_path, monkeypatch, from_iter
+):
+    """What an earlier training left there must not overwrite what this one has trained."""
+    told = []
+    monkeypatch.setattr(
+        Vanilla3DGS, "prepare_stage2", lambda self, model, output: told.append(output)
+    )
+    options = RunOptions(None, "auto", Settings(3), from_iter, device="cpu")
+    if from_iter is not None:
+        options = replace(options, stage="finetune")
+    run(command(photographs, tmp_path / "out", 22), options)
+    assert told == [None if from_iter is not None else tmp_path / "out"]
 
 
 def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path):
