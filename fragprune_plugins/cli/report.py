@@ -252,13 +252,15 @@ def _draw(
         engine, device = opened()
         loaded = [models.load(path, filtered=drawn.filtered, device=device) for path in allowed]
         if curves:
-            store = loaded[-1].thresholds if drawn.models[1] in allowed else None
+            store = loaded[-1].thresholds if drawn.models[-1] in allowed else None
             values = None if store is None else store.values
             with DOOR.stated(record.path) as reading:
                 reading.place = "data.curves"
                 rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
                 report_page.save_learning(folder / report_page.LEARNING, rows, values)
             learning = [("How it learned", report_page.LEARNING)]
+        if len(drawn.models) == 1:  # of joint learning, which leaves no model of before
+            return [], learning, ""
         if data is None and not (len(allowed) == 2 and lies_in(scene.folder, inside)):
             return [], learning, f"No views are shown: they need files outside of {inside}. {_HOW}"
         dataset = load_photographs(scene)

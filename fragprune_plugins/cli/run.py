@@ -29,6 +29,14 @@ if TYPE_CHECKING:
     from fragprune_plugins.injection.launch import RunSummary
 
 
+_WHERE = {"joint": "inside the training"}
+_CONTROL = (
+    "To see what truncation did, train as long with --stage off and another output folder, and run "
+    "fragprune compare."
+)
+"""Joint learning has no model of before."""
+
+
 @click.command(
     "run",
     cls=Command,
@@ -140,7 +148,8 @@ def command(
         if photographs and evaluate:
             try:
                 with current_gpu(device):
-                    before, after = _measure(photographs, engine, device)
+                    *first, after = _measure(photographs, engine, device)
+                    before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
     data: dict[str, Any] = {
@@ -181,13 +190,14 @@ def _text(path: Path | None) -> str | None:
 def _photographs(summary: RunSummary) -> dict[str, Any] | None:
     """The record's "photographs": how to read the host's data and draw its models.
 
-    None if the models cannot be compared.
+    None if the models cannot be measured. Joint learning leaves one model.
     """
-    if not (summary.photographs and summary.model_before and summary.model_after):
+    left = [path for path in (summary.model_before, summary.model_after) if path]
+    if not summary.photographs:
         return None
     return {
         **summary.photographs.as_dict(),
-        "models": [str(summary.model_before.resolve()), str(summary.model_after.resolve())],
+        "models": [str(path.resolve()) for path in left],
         "filtered": True,
         "drawing": summary.drawing,
     }
@@ -196,7 +206,7 @@ def _photographs(summary: RunSummary) -> dict[str, Any] | None:
 def _measure(
     photographs: dict[str, Any], engine: str = "auto", device: str = "auto"
 ) -> list[dict[str, Any]]:
-    """Measure both models on held-out views, on the host's device if an engine can draw there.
+    """Measure the models on held-out views, on the host's device if an engine can draw there.
 
     Args:
         photographs: the dict of ``_photographs``.
@@ -204,7 +214,7 @@ def _measure(
         device: the ``--device`` option.
 
     Returns:
-        The measurements before and after.
+        The measurements before and after; after joint learning only those.
     """
     from fragprune_plugins.datasets.dataset import load_photographs
     from fragprune_plugins.datasets.photographs import Photographs
@@ -213,8 +223,8 @@ def _measure(
 
     rasterizer, where = open_engine(engine, "cpu" if device == "cpu" else "auto", None)
     dataset = load_photographs(Photographs.from_dict(photographs))
-    both = [models.load(Path(path), filtered=True, device=where) for path in photographs["models"]]
-    candidates = [Candidate(*model, photographs["drawing"]) for model in both]
+    left = [models.load(Path(path), filtered=True, device=where) for path in photographs["models"]]
+    candidates = [Candidate(*model, photographs["drawing"]) for model in left]
     return measure(candidates, dataset.test, engine=rasterizer)
 
 
@@ -236,6 +246,8 @@ def _describe(
         columns = {"before": data["before"], "after": data["after"]}
         lines += [describe(columns), "", outcome("run", data, data["control"])]
     else:
+        if data["after"]:
+            lines += [describe({"after": data["after"]}), "", _CONTROL]
         if summary.fragments_before and summary.fragments_after:
             change = fewer(summary.fragments_before, summary.fragments_after)
             lines.append(
@@ -245,13 +257,13 @@ def _describe(
             why = f"{not_compared.where}: {not_compared.found}. {not_compared.remedy}"
             lines.append(f"Not compared on held-out views because of {why}")
         elif summary.photographs:
-            models = f"{summary.model_before} {summary.model_after}"
+            models = f"{summary.model_before or 'OTHER'} {summary.model_after}"
             lines.append(f"Compare: fragprune compare {models}")
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
-        f"{summary.iterations} iterations of stage 2{pressure}, {summary.train_seconds:.0f} s in "
-        "all. "
+        f"{summary.iterations} iterations {_WHERE.get(summary.stage, 'of stage 2')}{pressure}, "
+        f"{summary.train_seconds:.0f} s in all. "
         f"Model: {summary.model_after or 'not saved by the host'}."
     )
     return "\n".join(lines)

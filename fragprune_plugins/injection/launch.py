@@ -95,8 +95,8 @@ class RunSummary:
             threshold_median.
         settings: settings of the fine-tuning.
         output: the host's output folder; stage 1's, if stage 2 has its own.
-        photographs: the data set whose held-out views can measure both models; None if the models
-            cannot be compared.
+        photographs: the data set whose held-out views can measure the models; None if they cannot
+            be measured.
         drawing: fields of ``RasterInputs`` with which the host draws its models.
         not_compared: the reason why learned models cannot be compared; otherwise None.
         already_finished: ``model_after`` was there before, and nothing was run.
@@ -404,11 +404,12 @@ class _Runner:
         )
 
     def _comparison(self) -> tuple[Photographs | None, dict[str, Any], NotComparedError | None]:
-        """(photographs, drawing, None) to compare both models, or (None, {}, the reason)."""
+        """(photographs, drawing, None) to measure the models, or (None, {}, the reason)."""
         if not self.learned:
             return None, {}, None
         try:
-            if not (self.before and self.after):
+            joint = self.options.stage == "joint"  # the model of before is another training's
+            if not self.after or not (self.before or joint):
                 raise NotComparedError(
                     f"--stage {self.options.stage}",
                     f"no model from {'before' if self.after else 'after'} the learning",

@@ -20,13 +20,13 @@ class Recorded:
 
     Attributes:
         photographs: the scene.
-        models: the model before and the model after.
+        models: the model before and the model after; joint learning leaves the latter alone.
         filtered: whether the models have Mip-Splatting's 3D filter.
         drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
     """
 
     photographs: Photographs
-    models: tuple[Path, Path]
+    models: tuple[Path, ...]
     filtered: bool
     drawing: Mapping[str, Any]
 
@@ -42,11 +42,13 @@ def recorded(record: Record) -> Recorded | None:
         if values is None:
             return None
         reading.place = "data.photographs"
-        before, after = map(Path, values["models"])
+        models = tuple(map(Path, values["models"]))
+        if not 1 <= len(models) <= 2:
+            raise ValueError(f"{len(models)} models")
         drawing = dict(values["drawing"])
         for name, value in drawing.items():
             number = isinstance(value, int | float) and 0 <= value < 1e6
             if not (number if name in _NUMBERS else name == "compensation"):
                 raise ValueError(f"{name} is {value!r}")
         filtered = bool(values["filtered"])
-        return Recorded(Photographs.from_dict(values), (before, after), filtered, drawing)
+        return Recorded(Photographs.from_dict(values), models, filtered, drawing)

@@ -37,7 +37,6 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_vanilla_3dgs import Vanilla3DGS
-from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
 def command(scene, out, iterations, *more):

@@ -194,3 +194,20 @@ def test_two_models_of_nobody_need_their_photographs_named(tmp_path):
     result = run("compare", tmp_path / "a.ply", tmp_path / "b.ply", "--json")
     assert result.exit_code == 2
     assert "no record" in json.loads(result.stdout)["error"]["found"]
+
+
+def test_joint_learning_is_measured_and_compared_with_another_training(scene, tmp_path):
+    out, plain = tmp_path / "out", tmp_path / "plain"
+    words = ["--iterations", 24, "--densify_until_iter", 12]
+    text = ran("--device", "cpu", "--stage", "joint", *command(scene, out, *words))
+    measured = text["after"]
+    assert text["before"] is None
+    assert measured["psnr"] > 0
+    assert text["not_compared"] is None
+    ran("--device", "cpu", "--stage", "off", *command(scene, plain, *words))
+    last = "point_cloud/iteration_24/point_cloud.ply"
+    same = run_json("compare", plain / last, out / last)
+    assert same["b"]["psnr"] == pytest.approx(measured["psnr"], rel=1e-6)
+    page = run("report", out)
+    assert page.exit_code == 0, page.stderr
+    assert "fragments per pixel drawn" in page.stdout
