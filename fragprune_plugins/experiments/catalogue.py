@@ -61,6 +61,8 @@ class Arm:
         settings: of the training; every seed replaces theirs.
         rule: gives the thresholds; None where they are learned, or where nothing is truncated.
         opens: iterations before anything is truncated; None for ``Settings.warmup``.
+        every: iterations after which learning changes to holding thresholds, and back; None where
+            they learn all the time.
         pruning: comes before the training; None where all Gaussians stay.
         start: changes the model before it trains.
     """
@@ -70,6 +72,7 @@ class Arm:
     settings: Settings
     rule: Rule | None = None
     opens: int | None = None
+    every: int | None = None
     pruning: Pruning | None = None
     start: Start | None = None
 
@@ -215,6 +218,28 @@ def overfitting(longest: int, train: Train | None = None) -> Experiment:
     )
 
 
+def schedules(iterations: int, train: Train | None = None) -> Experiment:
+    """When thresholds learn: after everything else, together with it, or in turns.
+
+    Args:
+        iterations: of every arm.
+        train: what moves in every arm; all parameters when None.
+    """
+    settings = Settings(iterations=iterations, train=train or "all")
+    later = dict.fromkeys(round(iterations * share) for share in (0.5, 0.8))
+    turns = dict.fromkeys(max(1, iterations // number) for number in (10, 40))
+    return Experiment(
+        "schedules",
+        "Should thresholds learn after everything else, together with it, or in turns?",
+        (
+            Arm("control", "", _control(settings)),
+            Arm("together", "", settings, opens=0),
+            *(Arm("after", f"{opens:,}", settings, opens=opens) for opens in later),
+            *(Arm("in turns", f"of {n:,}", settings, opens=0, every=n) for n in turns),
+        ),
+    )
+
+
 def primitives(iterations: int, train: Train | None = None) -> Experiment:
     """Pruning of whole Gaussians by a score, then equal training without and with truncation.
 
@@ -274,6 +299,7 @@ EXPERIMENTS: dict[str, Callable[[int, Train | None], Experiment]] = {
     "moves": moves,
     "iterations": iterations,
     "overfitting": overfitting,
+    "schedules": schedules,
     "primitives": primitives,
     "portable": portable,
 }

@@ -151,7 +151,7 @@ def _outcome(
         splat if arm.pruning is None else scores.prune(arm.pruning),
         dataset,
         settings,
-        schedule=None if arm.opens is None else Schedule(settings, warmup=arm.opens),
+        schedule=None if arm.opens is None else Schedule(settings, arm.opens, arm.every),
         rule=arm.rule,
         engine=engine,
         progress=progress,
@@ -205,6 +205,7 @@ def _configuration(
                 "rule": arm.rule and arm.rule.name,
                 "opens": arm.opens,
                 "start": arm.start and arm.start.name,
+                "every": arm.every,
             }
             | ({"pruning": asdict(arm.pruning)} if arm.pruning else {})
             for arm in experiment.arms

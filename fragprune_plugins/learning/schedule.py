@@ -201,10 +201,13 @@ class Schedule:
         settings: of the run.
         warmup: steps without truncation; ``Settings.warmup`` when None, which is none in a run of
             2,000 steps or less.
+        every: when set, learning alternates: ``every`` steps on, ``every`` steps held.
     """
 
-    def __init__(self, settings: Settings, warmup: int | None = None) -> None:
-        self.settings = settings
+    def __init__(
+        self, settings: Settings, warmup: int | None = None, every: int | None = None
+    ) -> None:
+        self.settings, self.every = settings, every
         self.warmup = settings.warmup if warmup is None else warmup
 
     def at(self, step: int) -> StepPlan:
@@ -213,7 +216,7 @@ class Schedule:
         decay = _DECAY ** _share(step - 1, settings.iterations - 1)
         over = _share(step - 1 - self.warmup, settings.iterations - 1 - self.warmup)
         return StepPlan(
-            learn=step > self.warmup,
+            learn=_on(step - 1 - self.warmup, self.every),
             threshold_lr=settings.threshold_lr * _DECAY**over,
             opacity_lr=settings.opacity_lr * decay,
             progress=over,
@@ -223,6 +226,11 @@ class Schedule:
     def make_pressure(self) -> Pressure:
         """The pressure of the run, a new one."""
         return self.settings.make_pressure()
+
+
+def _on(over: int, every: int | None) -> bool:
+    """Whether thresholds learn in a step, after so many steps that could have learned."""
+    return over >= 0 and (every is None or (over // every) % 2 == 0)
 
 
 def _share(steps: int, of: int) -> float:
@@ -240,15 +248,13 @@ class JointSchedule(Schedule):
     """
 
     def __init__(self, settings: Settings, from_step: int, every: int | None = None) -> None:
-        super().__init__(settings)
-        self.from_step, self.every = from_step, every
+        super().__init__(settings, every=every)
+        self.from_step = from_step
 
     def at(self, step: int) -> StepPlan:
         """Neutral before ``from_step``; the opacity rate stays the host's."""
         progress = _share(step - self.from_step, self.settings.iterations - self.from_step)
-        on = step >= self.from_step and (
-            self.every is None or ((step - self.from_step) // self.every) % 2 == 0
-        )
+        on = _on(step - self.from_step, self.every)
         rate = self.settings.threshold_lr * _DECAY**progress
         return StepPlan(on, rate, None, progress, counted=on)
 

@@ -90,6 +90,13 @@ def test_overfitting_compares_lengths_and_openings():
     ]
 
 
+def test_schedules_compares_when_thresholds_learn():
+    arms = EXPERIMENTS["schedules"](1000, None).arms
+    truncated = [(arm.opens, arm.every) for arm in arms if not arm.is_control]
+    assert truncated == [(0, None), (500, None), (800, None), (0, 100), (0, 25)]
+    assert {arm.settings.iterations for arm in arms} == {1000}
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_is_listed_with_its_question(name):
     listed = "".join(run("experiment", "--help").stdout.split())
