@@ -454,11 +454,13 @@ class _Runner:
         start = max(resumed, from_iter)
         if start < total - self.host.line.skipped:
             return resumed, start, total
+        at_end = self.options.from_iter is None and start > resumed
+        where = "densification ends" if at_end else "learning begins"
         flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
         raise UsageError(
             f"--stage {self.options.stage}",
             f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
-            f"iterations after {start}, where learning begins",
+            f"iterations after {start}, where {where}",
             f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
         )
 

@@ -94,7 +94,9 @@ def test_joint_learning_begins_when_densification_is_over(photographs, tmp_path)
 
 def test_a_training_that_densifies_to_its_end_is_refused(photographs, tmp_path):
     words = command(HOST / "train.py", photographs, tmp_path / "out", 18)
-    with pytest.raises(UsageError, match=r"iterations after 18.*or lower --from-iter"):
+    with pytest.raises(
+        UsageError, match=r"iterations after 18, where densification ends.*or lower --from-iter"
+    ):
         run(words, RunOptions(stage="joint", device="cpu"))
     assert not (tmp_path / "out").exists()
 
