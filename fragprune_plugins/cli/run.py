@@ -104,6 +104,7 @@ def command(
       fragprune run -- python train.py -s scene -m out --eval
       fragprune run --quick --device cpu -- train.py -s scene -m out --iterations 3000
       fragprune run --stage finetune -- train.py -s scene -m out     (already trained)
+      fragprune run --stage joint -- python train.py -s scene -m out   (no added iterations)
       fragprune run -- python render.py -m out                       (renders with thresholds)
     """
     if alternate is not None and stage != "joint":
