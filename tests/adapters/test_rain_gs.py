@@ -196,8 +196,8 @@ def test_iterations_are_counted_where_the_host_sets_no_rate(mini, scene, tmp_pat
     options = RunOptions(device="cpu", stage="joint", from_iter=15, settings=OPTIONS.settings)
     summary = run(command(mini, scene, tmp_path / "out", 24, mode), options)
     assert summary.model_after.parent.name == "iteration_24"
-    assert summary.curves[0]["step"] == 15
-    assert [c["step"] for c in summary.curves] == list(range(15, 24))
+    assert summary.curves[0]["step"] == 16  # after iteration 15
+    assert [c["step"] for c in summary.curves] == list(range(16, 24))
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == len(read_ply(summary.model_after).xyz)
 
