@@ -55,7 +55,7 @@ def activate(
         plugins,
         settings,
         learn=stage != "off",
-        schedule=JointSchedule(settings, from_iter) if joint else None,
+        schedule=JointSchedule(settings, from_iter + 1) if joint else None,
         from_step=0 if joint else from_iter,
         freeze=not joint,
         engine=engine,
