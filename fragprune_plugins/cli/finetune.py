@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -14,7 +13,6 @@ from fragprune_plugins.cli.common import (
     Command,
     OutFile,
     Report,
-    describe_dropped,
     dropping,
     engine_options,
     image_options,
@@ -22,8 +20,8 @@ from fragprune_plugins.cli.common import (
     require_place,
 )
 from fragprune_plugins.cli.learning import learning_options
-from fragprune_plugins.errors import RecordError, SidecarError, UsageError
-from fragprune_plugins.learning.interruption import EXIT_CODE, sigterm_interrupts
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import models
 from fragprune_plugins.storage.atomic import locked
@@ -31,7 +29,8 @@ from fragprune_plugins.storage.atomic import locked
 if TYPE_CHECKING:
     from fragprune_plugins.datasets.dataset import Dataset
     from fragprune_plugins.engines import Engine
-    from fragprune_plugins.finetuning import FinetuneResult
+    from fragprune_plugins.finetuning import Checkpoints, FinetuneResult
+    from fragprune_plugins.measure.searching import Bounded
 
 
 def _share(
@@ -160,258 +159,136 @@ def command(
       fragprune finetune statue.ply --self --out pruned.ply
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
-    _require_target(data, itself, cameras, settings, max_drop)
-    if itself and keep == "auto":
-        raise UsageError(
-            "options",
-            "--self with --keep auto",
-            "photographs, whose error says what can be spared",
-            "Pass a share, such as --keep 0.9.",
-        )
+    _require_sense(data, itself, cameras, settings, max_drop, keep)
     require_place(out, model)
     click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
     from copy import deepcopy
 
+    from fragprune_plugins.cli import finetuned
     from fragprune_plugins.datasets.photographs import Photographs, Resolution
-    from fragprune_plugins.finetuning import Checkpoints, finetune, load_dataset, resuming, save
-    from fragprune_plugins.measure import Candidate, drop_invisible, measure
-    from fragprune_plugins.measure.scores import keep_best, keep_needed
-    from fragprune_plugins.measure.searching import strongest
-    from fragprune_plugins.measure.wording import describe, outcome
-    from fragprune_plugins.storage import records, sidecar
-
-    def say(text: str) -> None:
-        click.echo(text, err=True)
+    from fragprune_plugins.finetuning import Checkpoints, load_dataset, resuming, save
+    from fragprune_plugins.measure import Candidate
 
     rasterizer, where = open_engine(engine, device, threads)
     truncation = settings.truncate and not no_truncation
-    splat, store = models.load(model, truncation=truncation, device=where)
-    start = Candidate(splat, deepcopy(store))  # learning changes the store
+    whole = models.load(model, truncation=truncation, device=where)
+    start = Candidate(whole.splat, deepcopy(whole.thresholds))  # learning changes the store
+    photographs = None
+    if data is not None:
+        photographs = Photographs(data, Resolution(resolution), white_background)
     if itself:
         dataset = _own_pictures(
-            models.Model(splat, store),
-            data,
-            cameras,
-            resolution,
-            white_background,
-            seed,
-            rasterizer,
+            whole, data, cameras, resolution, white_background, seed, rasterizer
         )
     else:
         assert data is not None
         dataset = load_dataset(data, resolution=resolution, white_background=white_background)
 
-    checkpoints = Checkpoints(
-        resuming.path_beside(out), every or None, tell=partial(click.echo, err=True)
-    )
-    asked = resuming.configuration(splat, store, dataset, settings, rasterizer.name)
+    checkpoints = Checkpoints(resuming.path_beside(out), every or None, tell=_say)
+    asked = resuming.configuration(*whole, dataset, settings, rasterizer.name)
     asked |= {"drop_invisible": drop, "keep": keep, "max_drop": max_drop}
     if again:
         checkpoints.clear()
-    elif (finished := _finished(out, asked, curves)) is not None:
+    elif (finished := finetuned.finished(out, asked, curves)) is not None:
         checkpoints.clear()
         return finished
-    cost = found = None
-    if settings.target_time is not None:
-        from fragprune_plugins.bench.calibration import prices_of
-
-        cost = prices_of(rasterizer, where, say=say)
     with sigterm_interrupts():
-        if keep is not None:
-            shots, all_of_it = dataset.to(where).train, models.Model(splat, store)
-            splat, store = (
-                keep_needed(all_of_it, shots, engine=rasterizer, progress=True)
-                if keep == "auto"
-                else keep_best(
-                    all_of_it, keep, [s.view for s in shots], engine=rasterizer, progress=True
-                )
-            )
-        if max_drop is None:
-            result = finetune(
-                splat,
-                dataset,
-                settings,
-                store=store,
-                cost=cost,
-                engine=rasterizer,
-                progress=True,
-                checkpoints=checkpoints,
-            )
-        else:
-            found = strongest(
-                splat,
-                dataset,
-                settings,
-                max_drop,
-                store=store,
-                engine=rasterizer,
-                progress=True,
-                say=say,
-            )
-            result, settings = found.result, found.result.settings
+        kept = _keep(whole, keep, dataset.to(where), rasterizer)
+        result, found = _learn(kept, dataset, settings, max_drop, rasterizer, checkpoints)
         save(out, result)
-    done = result.progress
     if result.terminated:  # after SIGTERM there is no time for measurements
-        return _terminated(model, out, result, _GOES_ON if found is None else _BEGINS_ANEW)
+        return finetuned.terminated(model, out, result, found)
     dropped = None
     if drop:
-        whole = out.stat().st_size
-        seen = [shot.view for shot in (*dataset.train, *dataset.test)]
-        smaller, kept = drop_invisible(result.model, result.store, seen, engine=rasterizer)
-        result = replace(result, model=smaller, store=kept)
-        save(out, result)
-        dropped = dropping(out, whole, len(splat), len(smaller))
-    rows = [asdict(point) for point in result.curves]
-    if curves is not None and rows:
-        from fragprune_plugins.measure.report_page import save_learning
-
-        save_learning(curves, rows, result.thresholds)
-    candidates = [start, Candidate(result.model, result.store)]
-    if result.thresholds is not None:
-        candidates.append(Candidate(result.model))
-    if found is not None:
-        candidates.append(Candidate(found.control.model))
-    before, after, *without = measure(candidates, dataset.test, engine=rasterizer)
-    control = without.pop() if found is not None else None
-    report = {
-        "model": str(model),
-        "out": str(out),
-        "target": after["target"],
-        "before": before,
-        "after": after,
-        "untruncated": without[0] if without else None,
-        "keep": keep,
-        "dropped": dropped,
-        "speedup": done.speedup,
-        "faster": done.faster,
-        "target_reached": done.target_reached,
-        "interrupted": result.interrupted,
-        "resumed_at": result.resumed_at,
-        "already_finished": False,
-        "iterations": done.steps,
-        "pressure": done.pressure if settings.truncate else None,
-        "train_seconds": result.train_seconds,
-        "engine": result.engine,
-        "device": after["device"],
-        "adapter": None,
-        "seed": seed,
-        "settings": settings.as_dict(),
-        "max_drop": None if found is None else found.as_dict(max_drop or 0.0),
-    }
-    if control is None:
-        control = records.control_of(report, records.files(out.parent))
-    report["control"] = control
-    pressure = f" at pressure {done.pressure:.2g}" if settings.truncate else ""
-    lines = [
-        describe({"before": before, "after": after}),
-        "",
-        outcome("finetune", report, control),
-        f"{result.engine} engine, {done.steps} iterations{pressure} in "
-        f"{result.train_seconds:.0f} s.",
-    ]
-    if found is not None:
-        lines.append(_describe_bound(report["max_drop"], len(dataset.test)))
-    if result.interrupted:
-        goes_on = _GOES_ON if found is None else _BEGINS_ANEW
-        lines.append(f"Interrupted at {done.steps} of {settings.iterations} iterations. {goes_on}")
-    if keep is not None:
-        gone, of = len(start.model) - len(splat), len(start.model)
-        lines.append(
-            f"Removed {gone:,} of {of:,} Gaussians before learning, those whose removal changed "
-            "the training views least."
-        )
-    if dropped:
-        lines.append(describe_dropped(dropped, f"which reach no pixel of the {len(seen)} views"))
-    lines += [_describe_untruncated(before, plain) for plain in without]
-    if settings.portable:
-        lines.append(f"Wrote {out}, which needs no sidecar: every viewer draws it as it is.")
-    else:
-        together = " Keep the two together." if without else ""
-        lines.append(f"Wrote {out} and {sidecar.path_beside(out).name}.{together}")
-    more: dict[str, Any] = {"curves": rows}
-    if not result.interrupted:
-        more |= {"configuration": asked, "text": "\n".join(lines)}
-    if data is not None:
-        more["photographs"] = Photographs(
-            data, Resolution(resolution), white_background
-        ).as_dict() | {
-            "models": [str(model.resolve()), str(out.resolve())],
-            "filtered": False,
-            "drawing": {},
-        }
-    records.leave(out, "finetune", report | more)
+        result, dropped = _drop_invisible(out, result, dataset, rasterizer)
+    if curves is not None:
+        finetuned.draw_curves(curves, [asdict(point) for point in result.curves], result.thresholds)
+    report = finetuned.Finetuned(
+        model, out, start, result, keep, len(whole.splat) - len(kept.splat), found, dropped, seed
+    ).report(dataset, rasterizer, photographs, asked)
     if not result.interrupted:
         checkpoints.clear()  # not before: a kill while measuring goes on from it too
-    return Report(report, "\n".join(lines), exit_code=130 if result.interrupted else 0)
+    return report
 
 
-_GOES_ON = "The same command goes on from there."
-_BEGINS_ANEW = "With --max-drop the same command begins anew."
+def _say(text: str) -> None:
+    click.echo(text, err=True)
 
 
-def _finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
-    """The report of the same command, if it has written ``out`` already; else None."""
-    from fragprune_plugins.storage import records, sidecar
+def _keep(
+    whole: models.Model, keep: float | Literal["auto"] | None, dataset: Dataset, engine: Engine
+) -> models.Model:
+    """The Gaussians that --keep leaves."""
+    from fragprune_plugins.measure.scores import keep_best, keep_needed
 
-    if not out.is_file():
-        return None
-    try:
-        record = records.beside(out)
-        plain = asked["portable"]
-        alone = sidecar.find(out) is None if plain else sidecar.belongs(out)
-        done = record is not None and record.command == "finetune" and alone
-    except (RecordError, SidecarError):
-        return None
-    if record is None or not done or record.data.get("configuration") != asked:
-        return None
-    data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
-    if curves is not None and record.data["curves"]:
-        from fragprune_plugins.measure.report_page import save_learning
+    if keep is None:
+        return whole
+    if keep == "auto":
+        return keep_needed(whole, dataset.train, engine=engine, progress=True)
+    views = [shot.view for shot in dataset.train]
+    return keep_best(whole, keep, views, engine=engine, progress=True)
 
-        store = models.load(out).thresholds
-        learned = None if store is None else store.values.detach()
-        save_learning(curves, record.data["curves"], learned)
-    text = (
-        f"{record.data['text']}\n{out} was finished before: nothing was done. "
-        "--again fine-tunes again."
+
+def _learn(
+    model: models.Model,
+    dataset: Dataset,
+    settings: Settings,
+    max_drop: float | None,
+    engine: Engine,
+    checkpoints: Checkpoints,
+) -> tuple[FinetuneResult, Bounded | None]:
+    """Fine-tune once, or as often as --max-drop needs."""
+    from fragprune_plugins.bench.calibration import prices_of
+    from fragprune_plugins.finetuning import finetune
+    from fragprune_plugins.measure.searching import strongest
+
+    splat, store = model
+    if max_drop is not None:
+        found = strongest(
+            splat, dataset, settings, max_drop, store=store, engine=engine, progress=True, say=_say
+        )
+        return found.result, found
+    timed = settings.target_time is not None
+    result = finetune(
+        splat,
+        dataset,
+        settings,
+        store=store,
+        cost=prices_of(engine, splat.xyz.device, say=_say) if timed else None,
+        engine=engine,
+        progress=True,
+        checkpoints=checkpoints,
     )
-    return Report(data | {"already_finished": True}, text)
+    return result, None
 
 
-_OF_RECORDS = {"curves", "photographs", "configuration", "text"}
+def _drop_invisible(
+    out: Path, result: FinetuneResult, dataset: Dataset, engine: Engine
+) -> tuple[FinetuneResult, dict[str, int]]:
+    """Write the result again without Gaussians that no view shows; also give the counts."""
+    from fragprune_plugins.finetuning import save
+    from fragprune_plugins.measure import drop_invisible
+
+    size, views = out.stat().st_size, [shot.view for shot in (*dataset.train, *dataset.test)]
+    smaller, kept = drop_invisible(result.model, result.store, views, engine=engine)
+    left = replace(result, model=smaller, store=kept)
+    save(out, left)
+    return left, dropping(out, size, len(result.model), len(smaller))
 
 
-def _terminated(model: Path, out: Path, result: FinetuneResult, then: str) -> Report:
-    """The report after SIGTERM: the model is saved, and nothing is measured."""
-    done, asked = result.progress, result.settings
-    data = {
-        "model": str(model),
-        "out": str(out),
-        "before": None,
-        "after": None,
-        "interrupted": True,
-        "iterations": done.steps,
-        "train_seconds": result.train_seconds,
-        "engine": result.engine,
-        "settings": asked.as_dict(),
-    }
-    wrote = f"{out}" if asked.portable else f"{out} and its sidecar"
-    text = f"SIGTERM at {done.steps} of {asked.iterations} iterations. Wrote {wrote}. {then}"
-    return Report(data, text, exit_code=EXIT_CODE)
-
-
-def _require_target(
+def _require_sense(
     data: Path | None,
     itself: bool,
     cameras: Path | None,
     settings: Settings,
     max_drop: float | None,
+    keep: float | Literal["auto"] | None,
 ) -> None:
     """Prove, before any work, that it is clear what MODEL must look like.
 
     Raises:
-        UsageError: nothing says so, or two things do.
+        UsageError: nothing says so, two things do, or an option needs photographs.
     """
     if not itself and cameras is not None:
         raise UsageError(
@@ -445,6 +322,13 @@ def _require_target(
             "something to learn: without truncation the model is its own target already",
             "Drop --control; what it came in as is the comparison.",
         )
+    if itself and keep == "auto":
+        raise UsageError(
+            "options",
+            "--self with --keep auto",
+            "photographs, whose error says what can be spared",
+            "Pass a share, such as --keep 0.9.",
+        )
 
 
 def _own_pictures(
@@ -472,39 +356,3 @@ def _own_pictures(
     else:
         views = around(model.splat, background=torch.full((3,), float(white_background)), seed=seed)
     return own_pictures(model, divided(views, resolution), held_out, engine=engine, seed=seed)
-
-
-def _describe_bound(found: dict[str, Any], views: int) -> str:
-    """A line on what --max-drop found."""
-    if "loss" not in found:
-        return "No training was compared with the control."
-    tried = f"of {len(found['trials'])} trained"
-    chosen = f"the strongest truncation {tried}" if found["met"] else f"the least loss {tried}"
-    missed = "" if found["met"] else f" The bound of {found['bound']:g} dB was missed."
-    return (
-        f"Loss against the control: {found['loss']:.3f} dB at pressure {found['pressure']:.2g}, "
-        f"{chosen}. The pressure was chosen on these {views} views; others of their kind may "
-        f"differ by some {found['loss_se']:.2f} dB.{missed}"
-    )
-
-
-def _describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
-    """A line on the fine-tuned model without its thresholds.
-
-    Args:
-        before: measurement of the model before fine-tuning.
-        plain: measurement of the fine-tuned model without thresholds.
-    """
-    own = plain["target"] == "itself"
-    compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
-    from fragprune_plugins.measure.wording import FELL
-
-    advice = ""
-    if before["psnr"] is not None and plain["psnr"] < before["psnr"] - FELL:
-        advice = " For viewers that ignore thresholds: --portable."
-    return (
-        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
-        f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "
-        f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
-        f"{advice}"
-    )

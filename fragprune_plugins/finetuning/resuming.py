@@ -17,6 +17,8 @@ from fragprune_plugins.datasets.images import DOOR
 from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.storage import checkpoints
 from fragprune_plugins.storage.atomic import digest
 from fragprune_plugins.storage.ply import SplatFile
@@ -121,9 +123,17 @@ def configuration(
         "thresholds": _digest(known.values()),
         "photographs": _digest(each for shot in shots for each in _of(shot)),
         "engine": engine,
+        "plugins": _deciding(),
         "device": model.xyz.device.type,
         **settings.as_dict(),
     }
+
+
+def _deciding() -> list[str]:
+    """Names of the plugins that may decide about thresholds or about the schedule."""
+    plugins = installed()
+    hooks = (hookspecs.fragprune_truncate, hookspecs.fragprune_create_schedule)
+    return sorted({name for hook in hooks for name in plugins.answering(hook)})
 
 
 def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:

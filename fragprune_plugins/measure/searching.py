@@ -59,23 +59,25 @@ class Bounded:
     """What the search found.
 
     Attributes:
+        bound: on the loss, dB.
         result: the strongest truncation within the bound; the one that loses least where none is.
         trial: its figures; None if the search was interrupted before they were taken.
         control: the control's result.
         trials: all of them, in order.
     """
 
+    bound: float
     result: FinetuneResult
     trial: Trial | None
     control: FinetuneResult
     trials: Sequence[Trial]
 
-    def as_dict(self, bound: float) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain values for ``--json``: bound, met, the chosen trial's figures, all trials."""
         chosen = {} if self.trial is None else asdict(self.trial)
         return {
-            "bound": bound,
-            "met": self.trial is not None and self.trial.loss <= bound,
+            "bound": self.bound,
+            "met": self.trial is not None and self.trial.loss <= self.bound,
             **chosen,
             "trials": [asdict(trial) for trial in self.trials],
         }
@@ -128,7 +130,7 @@ def strongest(
     trials: list[Trial] = []
     best: tuple[FinetuneResult, Trial] | None = None
     if control.interrupted:
-        return Bounded(control, None, control, trials)
+        return Bounded(bound, control, None, control, trials)
     pressure: float | None = None
     while len(trials) < TRAININGS:
         at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
@@ -137,7 +139,7 @@ def strongest(
         if result.interrupted:
             kept, trial_kept = best or (result, None)
             ended = replace(kept, interrupted=True, terminated=result.terminated)
-            return Bounded(ended, trial_kept, control, trials)
+            return Bounded(bound, ended, trial_kept, control, trials)
         figures, fragments = _held_out(result, dataset.test, engine)
         losses = [was - now for was, now in zip(reference, figures, strict=True)]
         spread = statistics.stdev(losses) / len(losses) ** 0.5 if len(losses) > 1 else 0.0
@@ -152,7 +154,7 @@ def strongest(
             break
         pressure = min(next_pressure(trials, bound), _STRONGEST)
     assert best is not None
-    return Bounded(*best, control, trials)
+    return Bounded(bound, *best, control, trials)
 
 
 def next_pressure(trials: Sequence[Trial], bound: float) -> float:

@@ -79,7 +79,7 @@ def test_what_was_learned_there_is_saved_here(scene, engine):
     assert not store.neutral
     assert not torch.equal(read_ply(out / "small.ply").opacity, read_ply(path).opacity)
     drawn = engine.frames
-    assert run("report", out).exit_code == 0
+    assert run("report", out, "--data", data).exit_code == 0
     assert engine.frames > drawn
 
 

@@ -19,7 +19,7 @@ from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins.bench import calibration
-from fragprune_plugins.cli.finetune import _describe_untruncated
+from fragprune_plugins.cli.finetuned import describe_untruncated
 from fragprune_plugins.engines.cost import UNITS, Cost, work_of
 from fragprune_plugins.finetuning import loop
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
@@ -93,7 +93,7 @@ def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
 def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
     before = {"psnr": 30.0}
     plain = {"psnr": 30.0 - drop, "target": "photographs", "fragments_per_pixel": 9.0}
-    line = _describe_untruncated(before, plain | {"frame_ms": 1.0, "frame_ms_se": 0.1})
+    line = describe_untruncated(before, plain | {"frame_ms": 1.0, "frame_ms_se": 0.1})
     assert ("--portable" in line) == advised
 
 

@@ -116,11 +116,11 @@ def test_a_plugins_engine_is_named_like_our_own(command, scene, plug):
 
 
 def test_report_draws_with_a_plugins_engine_and_thresholds(scene, plug):
-    _, _, _, out = scene
+    data, _, _, out = scene
     run_json("finetune", *COMMANDS["finetune"](*scene))
     mine = Mine()
     plug(mine)
-    run_json("report", out, "--engine", "mine")
+    run_json("report", out, "--data", data, "--engine", "mine")
     assert mine.frames > 0
 
 

@@ -174,8 +174,10 @@ def test_an_engine_is_made_once_for_each_device():
             asked.append(str(device))
             return create_engine("reference")
 
+    # named outside: within a session on the CPU every device's name is the CPU's
+    devices = [torch.device(name) for name in ("cpu", "cuda:0", "cpu", "cuda:1")]
     with joint(plugins=[Plugin()]) as host:
-        engines = [host.engine(torch.device(name)) for name in ("cpu", "cuda:0", "cpu", "cuda:1")]
+        engines = [host.engine(device) for device in devices]
         assert host.finish().engine == "reference"
     assert asked == ["cpu", "cuda:0", "cuda:1"]
     assert engines[0] is engines[2]

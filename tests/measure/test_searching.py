@@ -94,7 +94,7 @@ def test_the_strongest_within_the_bound_is_kept_and_the_control_trains_equally_l
     assert found.result.progress.pressure == found.trial.pressure
     assert {settings.iterations for settings in trained} == {77}
     assert [settings.truncate for settings in trained] == [False] + [True] * len(found.trials)
-    assert found.as_dict(0.1)["met"]
+    assert found.as_dict()["met"]
     assert len(said) == 1 + 2 * len(found.trials)
 
 
@@ -106,7 +106,7 @@ def test_an_unreachable_bound_keeps_the_least_loss_and_says_so(trained, monkeypa
     )
     found = strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), 0.1, engine="cpu")
     assert len(found.trials) == TRAININGS
-    assert not found.as_dict(0.1)["met"]
+    assert not found.as_dict()["met"]
     assert found.trial is not None
     assert found.trial.loss == pytest.approx(1.0)
 
@@ -117,7 +117,7 @@ def test_a_loss_that_never_reaches_the_bound_ends_before_a_pressure_that_is_none
     monkeypatch.setattr(searching, "_held_out", lambda result, shots, engine: ([30.0], 20.0))
     monkeypatch.setattr(searching, "next_pressure", lambda trials, bound: 9 * trials[-1].pressure)
     found = strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), 5.0, engine="cpu")
-    assert found.as_dict(5.0)["met"]
+    assert found.as_dict()["met"]
     assert max(trial.pressure for trial in found.trials) <= 0.5
 
 

@@ -1,0 +1,257 @@
+"""What ``fragprune finetune`` reports: its data, its words, and the record beside its result."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from fragprune_plugins.cli.common import Report, describe_dropped
+from fragprune_plugins.errors import RecordError, SidecarError
+from fragprune_plugins.learning.interruption import EXIT_CODE
+from fragprune_plugins.measure import Candidate, measure
+from fragprune_plugins.measure.report_page import save_learning
+from fragprune_plugins.measure.wording import FELL, describe, outcome
+from fragprune_plugins.storage import models, records, sidecar
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from torch import Tensor
+
+    from fragprune_plugins.datasets.dataset import Dataset
+    from fragprune_plugins.datasets.photographs import Photographs
+    from fragprune_plugins.engines import Engine
+    from fragprune_plugins.finetuning import FinetuneResult
+    from fragprune_plugins.measure.searching import Bounded
+
+_OF_RECORDS = {"curves", "photographs", "configuration", "text"}
+
+
+@dataclass(frozen=True, eq=False)
+class Finetuned:
+    """A fine-tuning that is over.
+
+    Attributes:
+        model: the file that came in.
+        out: the file that was written.
+        start: the model as it came in.
+        result: what was learned.
+        keep: the share of Gaussians to learn with, or how to choose it; None for all.
+        removed: Gaussians that went before learning.
+        found: what a search for the strongest truncation found; None without one.
+        dropped: counts of Gaussians that went at the end; None where that was not asked.
+        seed: of the order of views.
+    """
+
+    model: Path
+    out: Path
+    start: Candidate
+    result: FinetuneResult
+    keep: float | Literal["auto"] | None
+    removed: int
+    found: Bounded | None
+    dropped: dict[str, int] | None
+    seed: int
+
+    def report(
+        self,
+        dataset: Dataset,
+        engine: Engine,
+        photographs: Photographs | None,
+        asked: dict[str, Any],
+    ) -> Report:
+        """Measure on held-out views, leave a record, and say what came of it.
+
+        Args:
+            dataset: whose held-out views it is measured on.
+            engine: draws them.
+            photographs: where they lie, for the record; None where there are none.
+            asked: the configuration, by which the same command is known again.
+        """
+        result, settings = self.result, self.result.settings
+        candidates = [self.start, Candidate(result.model, result.store)]
+        if result.thresholds is not None:
+            candidates.append(Candidate(result.model))
+        if self.found is not None:
+            candidates.append(Candidate(self.found.control.model))
+        before, after, *without = measure(candidates, dataset.test, engine=engine)
+        control = without.pop() if self.found is not None else None
+        done = result.progress
+        data = {
+            "model": str(self.model),
+            "out": str(self.out),
+            "target": after["target"],
+            "before": before,
+            "after": after,
+            "untruncated": without[0] if without else None,
+            "keep": self.keep,
+            "dropped": self.dropped,
+            "speedup": done.speedup,
+            "faster": done.faster,
+            "target_reached": done.target_reached,
+            "interrupted": result.interrupted,
+            "resumed_at": result.resumed_at,
+            "already_finished": False,
+            "iterations": done.steps,
+            "pressure": done.pressure if settings.truncate else None,
+            "train_seconds": result.train_seconds,
+            "engine": result.engine,
+            "device": after["device"],
+            "adapter": None,
+            "seed": self.seed,
+            "settings": settings.as_dict(),
+            "max_drop": None if self.found is None else self.found.as_dict(),
+        }
+        data["control"] = control or records.control_of(data, records.files(self.out.parent))
+        text = self._text(data, len(dataset.test), len(dataset.train) + len(dataset.test))
+        more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
+        if not result.interrupted:
+            more |= {"configuration": asked, "text": text}
+        if photographs is not None:
+            more["photographs"] = photographs.as_dict() | {
+                "models": [str(self.model.resolve()), str(self.out.resolve())],
+                "filtered": False,
+                "drawing": {},
+            }
+        records.leave(self.out, "finetune", data | more)
+        return Report(data, text, exit_code=130 if result.interrupted else 0)
+
+    def _text(self, data: dict[str, Any], held_out: int, views: int) -> str:
+        """What a person reads.
+
+        Args:
+            data: of the report.
+            held_out: number of held-out views.
+            views: number of all views.
+        """
+        result, settings, before = self.result, self.result.settings, data["before"]
+        pressure = f" at pressure {data['pressure']:.2g}" if settings.truncate else ""
+        lines = [
+            describe({"before": before, "after": data["after"]}),
+            "",
+            outcome("finetune", data, data["control"]),
+            f"{result.engine} engine, {data['iterations']} iterations{pressure} in "
+            f"{result.train_seconds:.0f} s.",
+        ]
+        if self.found is not None:
+            lines.append(_describe_bound(data["max_drop"], held_out))
+        if result.interrupted:
+            of = f"{data['iterations']} of {settings.iterations}"
+            lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
+        if self.keep is not None:
+            lines.append(
+                f"Removed {self.removed:,} of {len(self.start.model):,} Gaussians before learning, "
+                "those whose removal changed the training views least."
+            )
+        if self.dropped:
+            why = f"which reach no pixel of the {views} views"
+            lines.append(describe_dropped(self.dropped, why))
+        plain = data["untruncated"]
+        if plain is not None:
+            lines.append(describe_untruncated(before, plain))
+        if settings.portable:
+            lines.append(
+                f"Wrote {self.out}, which needs no sidecar: every viewer draws it as it is."
+            )
+        else:
+            together = " Keep the two together." if plain is not None else ""
+            lines.append(f"Wrote {self.out} and {sidecar.path_beside(self.out).name}.{together}")
+        return "\n".join(lines)
+
+
+def finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
+    """The report of the same command, if it has written ``out`` already; else None."""
+    if not out.is_file():
+        return None
+    try:
+        record = records.beside(out)
+        plain = asked["portable"]
+        alone = sidecar.find(out) is None if plain else sidecar.belongs(out)
+        done = record is not None and record.command == "finetune" and alone
+    except (RecordError, SidecarError):
+        return None
+    if record is None or not done or record.data.get("configuration") != asked:
+        return None
+    data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
+    if curves is not None:
+        store = models.load(out).thresholds
+        learned = None if store is None else store.values.detach()
+        draw_curves(curves, record.data["curves"], learned)
+    text = (
+        f"{record.data['text']}\n{out} was finished before: nothing was done. "
+        "--again fine-tunes again."
+    )
+    return Report(data | {"already_finished": True}, text)
+
+
+def terminated(model: Path, out: Path, result: FinetuneResult, found: Bounded | None) -> Report:
+    """The report after SIGTERM: the model is saved, and nothing is measured."""
+    done, asked = result.progress, result.settings
+    data = {
+        "model": str(model),
+        "out": str(out),
+        "before": None,
+        "after": None,
+        "interrupted": True,
+        "iterations": done.steps,
+        "train_seconds": result.train_seconds,
+        "engine": result.engine,
+        "settings": asked.as_dict(),
+    }
+    wrote = f"{out}" if asked.portable else f"{out} and its sidecar"
+    at = f"SIGTERM at {done.steps} of {asked.iterations} iterations."
+    text = f"{at} Wrote {wrote}. {_goes_on(found)}"
+    return Report(data, text, exit_code=EXIT_CODE)
+
+
+def draw_curves(path: Path, points: Sequence[dict[str, Any]], thresholds: Tensor | None) -> None:
+    """Draw the learning curves of --curves, if any step was made.
+
+    Args:
+        path: of the PNG.
+        points: one for each step, as plain values.
+        thresholds: (N,) learned ones, or None.
+    """
+    if points:
+        save_learning(path, points, thresholds)
+
+
+def _goes_on(found: Bounded | None) -> str:
+    if found is None:
+        return "The same command goes on from there."
+    return "With --max-drop the same command begins anew."
+
+
+def _describe_bound(found: dict[str, Any], views: int) -> str:
+    """A line on what --max-drop found."""
+    if "loss" not in found:
+        return "No training was compared with the control."
+    tried = f"of {len(found['trials'])} trained"
+    chosen = f"the strongest truncation {tried}" if found["met"] else f"the least loss {tried}"
+    missed = "" if found["met"] else f" The bound of {found['bound']:g} dB was missed."
+    return (
+        f"Loss against the control: {found['loss']:.3f} dB at pressure {found['pressure']:.2g}, "
+        f"{chosen}. The pressure was chosen on these {views} views; others of their kind may "
+        f"differ by some {found['loss_se']:.2f} dB.{missed}"
+    )
+
+
+def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
+    """A line on the fine-tuned model without its thresholds.
+
+    Args:
+        before: measurement of the model before fine-tuning.
+        plain: measurement of the fine-tuned model without thresholds.
+    """
+    own = plain["target"] == "itself"
+    compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
+    advice = ""
+    if before["psnr"] is not None and plain["psnr"] < before["psnr"] - FELL:
+        advice = " For viewers that ignore thresholds: --portable."
+    return (
+        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
+        f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "
+        f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
+        f"{advice}"
+    )
