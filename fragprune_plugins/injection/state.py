@@ -216,9 +216,10 @@ class SessionState:
         self.expect_rows(model, state, str(path))
         if state.store.neutral and not self.standing_still(model):
             # Loading would refuse the sidecar of an earlier model with this name as stale.
-            if whole is not None:
+            if whole is None:
+                sidecar.path_beside(path).unlink(missing_ok=True)
+            else:
                 sidecar.replace_pair(path, whole, None)
-            sidecar.path_beside(path).unlink(missing_ok=True)
         else:
             if state.stage is not None and state.stage.warming_up:
                 log.warning(

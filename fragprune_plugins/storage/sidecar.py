@@ -28,6 +28,7 @@ from fragprune_plugins.storage.atomic import (
     all_in_flight,
     digest,
     in_flight,
+    locked,
     put,
     rename,
     replacing,
@@ -116,6 +117,9 @@ def save(
         OutputError: the file cannot be written.
     """
     target = path_beside(model)
+    if all_in_flight(model, _ADDRESSES):  # a dead process left it there: it would be read first
+        with locked(model):
+            _tidy(model)
     with replacing(target, durable=True) as new:
         info = SidecarInfo(len(store), digest(model), adapter, host_commit, settings or {})
         _write(new, store, info)
@@ -157,6 +161,9 @@ def replace_pair(
         elif beside.exists():  # it stays with the old model for as long as that is there
             rename(beside, _address(path, digest(path) if path.is_file() else "none"))
         put(whole, path)
+        if store is None:  # also where the model kept its bytes, and so its address
+            for each in all_in_flight(path, _ADDRESSES):
+                each.unlink()
     finally:
         _tidy(path)
 

@@ -276,3 +276,5 @@ def test_an_arm_may_change_the_model_before_it_trains(words, trained, monkeypatc
     assert small["against_control"] == pytest.approx(small["psnr"] - control["psnr"], abs=1e-9)
     asked = json.loads((tmp_path / "out" / "rules.json").read_text())
     assert asked["arms"]["shrunk 0.5"]["start"] == "shrunk(0.5)"
+    parts = [json.loads(path.read_text()) for path in (tmp_path / "out" / "arms").iterdir()]
+    assert len({part["before"]["area_per_pixel"] for part in parts}) == 1, "as it came, for all"
