@@ -146,9 +146,9 @@ def _outcome(
 ) -> dict[str, Any]:
     """What ``Outcome`` holds of an arm, as plain values."""
     settings = replace(arm.settings, seed=seed)
-    splat = splat if arm.start is None else arm.start(splat)
+    begun = splat if arm.pruning is None else scores.prune(arm.pruning)
     result = finetune(
-        splat if arm.pruning is None else scores.prune(arm.pruning),
+        begun if arm.start is None else arm.start(begun),
         dataset,
         settings,
         schedule=None if arm.opens is None else Schedule(settings, arm.opens, arm.every),
