@@ -238,6 +238,27 @@ def test_what_is_left_of_other_files_stays(tmp_path):
     assert names(tmp_path / "a.ply") == sorted([*others, "a.fragprune.safetensors", "a.ply"])
 
 
+def test_the_same_model_without_thresholds_leaves_no_sidecar_behind(tmp_path):
+    """Thresholds that were written beside a file do not change its bytes."""
+    path = tmp_path / "out.ply"
+    save(path, 1, "alone")
+    sidecar.save(path, fp.ThresholdStore.from_falloff(torch.full((20,), 0.2)))
+    save(path, 1, "alone")
+    assert names(path) == ["out.ply"]
+    assert fp.load(path).thresholds is None
+
+
+def test_a_new_sidecar_counts_more_than_one_that_a_dead_process_left_at_an_address(tmp_path):
+    path = tmp_path / "out.ply"
+    save(path, 1)
+    left = sidecar._address(path, atomic.digest(path))
+    os.replace(sidecar.path_beside(path), left)
+    new = fp.ThresholdStore.from_falloff(torch.full((20,), 0.2))
+    sidecar.save(path, new)
+    assert not left.exists()
+    assert torch.equal(fp.load(path).thresholds.values, new.values)
+
+
 def test_a_sidecar_at_its_address_counts_for_that_content_alone(tmp_path):
     path = tmp_path / "a.ply"
     save(path, 1)
