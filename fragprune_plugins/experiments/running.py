@@ -19,9 +19,10 @@ from fragprune_plugins.experiments.catalogue import Arm, Experiment, Pruning
 from fragprune_plugins.experiments.folder import Folder
 from fragprune_plugins.experiments.scene import describe_photographs
 from fragprune_plugins.finetuning import FinetuneResult, finetune
-from fragprune_plugins.learning.schedule import Schedule
+from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.measure import Candidate, frame_times, measure
 from fragprune_plugins.measure.scores import SCORES, best
+from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.storage import models
 from fragprune_plugins.storage.atomic import digest
 from fragprune_plugins.storage.ply import SplatFile
@@ -151,7 +152,7 @@ def _outcome(
         begun if arm.start is None else arm.start(begun),
         dataset,
         settings,
-        schedule=None if arm.opens is None else Schedule(settings, arm.opens, arm.every),
+        schedule=_schedule(arm, settings),
         rule=arm.rule,
         engine=engine,
         progress=progress,
@@ -165,6 +166,13 @@ def _outcome(
         )
     before, after = _measure(splat, result, dataset, engine)
     return {"before": before, "after": after, "train_seconds": result.train_seconds}
+
+
+def _schedule(arm: Arm, settings: Settings) -> Schedule:
+    """A plugin's, or the default one, unless the arm has its own."""
+    if arm.opens is None:
+        return schedule_for(settings)
+    return Schedule(settings, arm.opens, arm.every)
 
 
 def _measure(
@@ -203,9 +211,8 @@ def _configuration(
             arm.label: {
                 "settings": {k: v for k, v in arm.settings.as_dict().items() if k != "seed"},
                 "rule": arm.rule and arm.rule.name,
-                "opens": arm.opens,
+                "schedule": _schedule(arm, arm.settings).as_dict(),
                 "start": arm.start and arm.start.name,
-                "every": arm.every,
             }
             | ({"pruning": asdict(arm.pruning)} if arm.pruning else {})
             for arm in experiment.arms

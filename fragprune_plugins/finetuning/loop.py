@@ -232,6 +232,10 @@ class _Run:
         if settings.target_time is not None and cost is not None:
             self._require_reach(settings.target_time, cost)
             clock = FrameClock(lambda outputs: cost.ms(work_of(outputs)), self._faster)
+        self.others: dict[str, Any] = {
+            "rule": None if rule is None else getattr(rule, "name", repr(rule)),
+            "prices": dict(cost.prices) if clock and cost else None,  # times were predicted by them
+        }
         self.curves: list[StepStats] = []
         self.done, self.between = 0, True
         self._started = time.perf_counter()
@@ -321,6 +325,8 @@ class _Run:
         self.asked = configuration(
             self.start, self.stage.store, self.dataset, self.settings, self.engine.name
         )
+        self.asked |= {"schedule": self.stage.schedule.as_dict(), **self.others}
+        del self.asked["nonfinite"]  # a run that such a step stopped may go on and skip it
         tensors, values = checkpoints.load(self.asked, self.start.xyz.device)
         if not values:
             return

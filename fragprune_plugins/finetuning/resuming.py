@@ -85,7 +85,8 @@ class Checkpoints:
             return {}, {}
         tensors, values = checkpoints.load(self.path, device)
         found = values.get("configuration", {})
-        if other := differences(found, asked):
+        if differ := differences(found, asked):
+            other = [name for name in differ if name != "schedule"] or differ  # settings make it
             raise CheckpointError(
                 str(self.path),
                 f"an unfinished fine-tuning with other {', '.join(other)}",

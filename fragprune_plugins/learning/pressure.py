@@ -82,6 +82,11 @@ class Observation:
     ratio: float | None = None
 
 
+def numbers_of(thing: object) -> dict[str, int | float]:
+    """The attributes of an object that are numbers, by name."""
+    return {name: each for name, each in vars(thing).items() if isinstance(each, int | float)}
+
+
 class Pressure(Protocol):
     """Gives lambda for the next step, and is told the figures of each step."""
 

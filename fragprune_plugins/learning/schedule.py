@@ -16,6 +16,7 @@ from fragprune_plugins.learning.pressure import (
     FixedPressure,
     Pressure,
     PressureController,
+    numbers_of,
 )
 
 Train = Literal["opacity", "appearance", "all"]
@@ -226,6 +227,15 @@ class Schedule:
     def make_pressure(self) -> Pressure:
         """The pressure of the run, a new one."""
         return self.settings.make_pressure()
+
+    def as_dict(self) -> dict[str, Any]:
+        """What decides beside the settings, as plain values: its numbers and its pressure's."""
+        pressure = self.make_pressure()
+        return {
+            "kind": type(self).__qualname__,
+            **numbers_of(self),
+            "pressure": {"kind": type(pressure).__qualname__, **numbers_of(pressure)},
+        }
 
 
 def _on(over: int, every: int | None) -> bool:

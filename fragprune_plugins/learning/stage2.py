@@ -44,6 +44,7 @@ from fragprune_plugins.learning.pressure import (
     StepViews,
     calibrate,
     calibrate_measured,
+    numbers_of,
 )
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -385,9 +386,9 @@ class Stage2:
             plain[name] = list(known)
             if known:
                 tensors[name] = torch.stack(list(known.values()))
-        pressure = {k: v for k, v in vars(self.pressure).items() if isinstance(v, int | float)}
         plain |= {name: getattr(self, name) for name in _COUNTED}
-        return tensors, plain | {"expected": self._views.expected, "pressure": pressure}
+        plain |= {"expected": self._views.expected, "pressure": numbers_of(self.pressure)}
+        return tensors, plain
 
     def load_state_dict(self, tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> None:
         """Go on where ``state_dict`` was called, with the same settings and views, to the bit.

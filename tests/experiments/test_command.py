@@ -278,3 +278,21 @@ def test_an_arm_may_change_the_model_before_it_trains(words, trained, monkeypatc
     assert asked["arms"]["shrunk 0.5"]["start"] == "shrunk(0.5)"
     parts = [json.loads(path.read_text()) for path in (tmp_path / "out" / "arms").iterdir()]
     assert len({part["before"]["area_per_pixel"] for part in parts}) == 1, "as it came, for all"
+
+
+def test_other_defaults_of_the_pressure_are_another_configuration(words, trained, monkeypatch):
+    """They are no settings, and a version under development has many of them."""
+    from fragprune_plugins.learning import schedule
+
+    def default(iterations, train=None):
+        settings = Settings(iterations=iterations)
+        control = replace(settings, truncate=False)
+        return Experiment("rules", "?", (Arm("control", "", control), Arm("learned", "", settings)))
+
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", default)
+    run_json(*words)
+    recipe = replace(schedule._RECIPES["all"], elasticity=0.7)
+    monkeypatch.setitem(schedule._RECIPES, "all", recipe)
+    result = run(*words)
+    assert result.exit_code == 1
+    assert "arms.learned.schedule.pressure.elasticity was 0.2 and is 0.7" in result.stderr

@@ -9,9 +9,11 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins.errors import CheckpointError, OutputError
+from fragprune_plugins.engines.cost import UNITS, Cost, work_of
+from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
+from fragprune_plugins.experiments.rules import falloff_threshold
 from fragprune_plugins.finetuning import Checkpoints, finetune, loop
-from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import checkpoints as files
 
@@ -38,14 +40,27 @@ class Cut(BaseException):
     """What nothing catches, as nothing catches a kill."""
 
 
-def run(model, dataset, settings, path=None, *, cut=None, monkeypatch=None, tell=None, store=None):
+def run(
+    model,
+    dataset,
+    settings,
+    path=None,
+    *,
+    cut=None,
+    monkeypatch=None,
+    tell=None,
+    store=None,
+    **options,
+):
     """Fine-tune, with a checkpoint every third step; ``cut`` ends it in the midst of that step."""
     kept = None if path is None else Checkpoints(path, None, 3, tell or (lambda _: None))
     started = store
     if started is None and path is not None:
         started = ThresholdStore(len(model))
     if cut is None:
-        return finetune(model, dataset, settings, store=started, engine="cpu", checkpoints=kept)
+        options |= {"store": started, "engine": "cpu", "checkpoints": kept}
+        return finetune(model, dataset, settings, **options)
+    options |= {"store": started, "engine": "cpu", "checkpoints": kept}
     calls, loss = 0, loop.photometric_loss
 
     def cutting(*args):
@@ -58,7 +73,7 @@ def run(model, dataset, settings, path=None, *, cut=None, monkeypatch=None, tell
     with monkeypatch.context() as patch:
         patch.setattr(loop, "photometric_loss", cutting)
         with pytest.raises(Cut):
-            finetune(model, dataset, settings, store=started, engine="cpu", checkpoints=kept)
+            finetune(model, dataset, settings, **options)
     return None
 
 
@@ -96,6 +111,63 @@ def test_cut_off_again_and_again_it_ends_as_if_never_cut(
     ]
     assert result.resumed_at == 9
     require_same(whole, result)
+
+
+PRICES = Cost(dict(zip(UNITS, (2e4, 1.0, 50.0, 20.0, 0.2, 0.5), strict=True)))
+
+
+def test_a_target_time_that_was_cut_off_keeps_what_was_timed(
+    model, dataset, tmp_path, monkeypatch, single_thread
+):
+    real = Cost(PRICES.prices | {"fragment": 1.0})
+
+    def timed(work, device):
+        outputs = work()
+        return outputs, real.ms(work_of(outputs))
+
+    monkeypatch.setattr(loop, "timed", timed)
+    monkeypatch.setattr(loop, "_SECONDS", 0.0)
+    settings, path = Settings(iterations=STEPS, target_time=1.2), tmp_path / "unfinished"
+    whole = run(model, dataset, settings, cost=PRICES)
+    for cut in (5, 8):
+        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch, cost=PRICES)
+    with pytest.raises(CheckpointError, match="with other prices;"):
+        run(model, dataset, settings, path, cost=real)
+    require_same(whole, run(model, dataset, settings, path, cost=PRICES))
+
+
+def test_what_a_caller_decides_is_part_of_the_configuration(model, dataset, tmp_path, monkeypatch):
+    settings, path = Settings(iterations=STEPS), tmp_path / "unfinished"
+    later = Schedule(settings, warmup=6)
+    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch, schedule=later)
+    with pytest.raises(CheckpointError, match="with other schedule;"):
+        run(model, dataset, settings, path)
+    one, other = falloff_threshold(0.1), falloff_threshold(0.2)
+    path.unlink()
+    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch, rule=one)
+    with pytest.raises(CheckpointError, match="with other rule;"):
+        run(model, dataset, settings, path, rule=other)
+
+
+def test_a_run_that_a_step_stopped_may_go_on_and_skip_it(
+    model, dataset, tmp_path, monkeypatch, single_thread
+):
+    loss, images = loop.photometric_loss, []
+
+    def spoiling(image, target):
+        images.append(image)
+        return loss(image, target) * (torch.nan if len(images) in bad else 1)
+
+    bad, path = {5}, tmp_path / "unfinished"
+    monkeypatch.setattr(loop, "photometric_loss", spoiling)
+    with pytest.raises(DivergedError, match="step 5"):
+        run(model, dataset, Settings(iterations=STEPS), path)
+    bad = {7}  # step 5, after the checkpoint of step 3
+    skipping = Settings(iterations=STEPS, nonfinite="skip")
+    result = run(model, dataset, skipping, path)
+    images, bad = [], {5}
+    assert result.resumed_at == 3
+    require_same(run(model, dataset, skipping), result)
 
 
 def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatch, single_thread):
