@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -256,8 +255,7 @@ def _draw(
             values = None if store is None else store.values
             with DOOR.stated(record.path) as reading:
                 reading.place = "data.curves"
-                rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in curves]
-                report_page.save_learning(folder / report_page.LEARNING, rows, values)
+                report_page.save_learning(folder / report_page.LEARNING, curves, values)
             learning = [("How it learned", report_page.LEARNING)]
         if len(drawn.models) == 1:  # of joint learning, which leaves no model of before
             return [], learning, ""

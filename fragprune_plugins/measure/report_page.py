@@ -71,7 +71,7 @@ def save_learning(
 
     Args:
         path: the PNG.
-        curves: one dict a step, from a run's summary.
+        curves: one dict a step, from a run's summary; None, in records, is what is not known.
         thresholds: (N,) learned, falloff; None, of a control, leaves out what shows them.
     """
     import numpy as np
@@ -88,14 +88,15 @@ def save_learning(
         (loss, "loss", "tab:purple", "loss, without the pressure"),
         (fragments, "fragments_per_pixel", "tab:red", "drawn fragments per pixel"),
     ):
-        values = np.array([row[key] for row in curves])
+        values = np.array([row[key] for row in curves], dtype=float)
         mean = np.convolve(values, np.ones(window) / window, mode="valid")
         axes.plot(steps, values, color=color, alpha=0.25, linewidth=0.8)
         axes.plot(steps[window // 2 :][: len(mean)], mean, color=color)
         axes.set(xlabel="step", ylabel=label, ylim=(0, None))
     if thresholds is not None:
         median, spread = others
-        median.plot(steps, [row["threshold_median"] for row in curves], color="tab:green")
+        medians = np.array([row["threshold_median"] for row in curves], dtype=float)
+        median.plot(steps, medians, color="tab:green")
         median.set(xlabel="step", ylabel="median threshold (falloff)", ylim=(0, None))
         final = thresholds.detach().cpu().numpy()
         spread.hist(np.maximum(final, 1e-4), bins=np.geomspace(1e-4, 1, 60), color="tab:blue")

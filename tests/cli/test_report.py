@@ -12,6 +12,7 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
+from fragprune_plugins.measure import report_page
 from fragprune_plugins.storage import records
 
 
@@ -88,6 +89,17 @@ def test_without_the_photographs_there_are_curves_and_the_reason(folder, tmp_pat
     refused = run("report", out, "--data", tmp_path / "nowhere", "--json")
     assert refused.exit_code == 1
     assert json.loads(refused.stdout)["error"]["code"] == "dataset"
+
+
+def test_a_loss_that_is_not_known_leaves_a_gap_in_the_curves(folder, tmp_path):
+    out, _, _ = folder
+    (record,) = records.find(out)
+    curves = record.data["curves"]
+    curves[1]["loss"] = None  # of a step that was skipped
+    report_page.save_learning(tmp_path / "curves.png", curves, torch.full((60,), 0.1))
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+    records.leave(out / "pruned.ply", "finetune", record.data)
+    assert run_json("report", out)["pictures"] == 1
 
 
 def test_a_run_that_was_not_measured_reports_its_training_views(tmp_path):
