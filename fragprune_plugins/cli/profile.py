@@ -117,11 +117,12 @@ def draw_panels(
     """
     import torch
 
+    from fragprune_plugins.learning.stage2 import evenly
     from fragprune_plugins.measure.pictures import save_panel, stems
 
     files = []
     drawn = {name: candidate.model.splats() for name, candidate in columns.items()}
-    chosen = shots[:: -(-len(shots) // PANELS)]
+    chosen = evenly(shots, PANELS)
     for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
         with torch.no_grad():
             outputs = {

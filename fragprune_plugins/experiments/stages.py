@@ -21,6 +21,7 @@ from fragprune_plugins.experiments.catalogue import QUESTIONS
 from fragprune_plugins.experiments.figures import new_figure, save_figure
 from fragprune_plugins.experiments.folder import Findings, Folder, markdown
 from fragprune_plugins.experiments.scene import describe_photographs, load_columns
+from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.measure import Candidate
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import View
@@ -70,8 +71,7 @@ def run(
     sizes = SIZES if sizes is None else sizes
     columns, said = load_columns(paths, device)
     dataset = load_photographs(photographs).to(device)
-    step = -(-len(dataset.test) // _VIEWS)
-    views = [shot.view for shot in dataset.test[::step]]
+    views = [shot.view for shot in evenly(dataset.test, _VIEWS)]
     asked = {
         "asks": QUESTIONS[NAME],
         "models": said,

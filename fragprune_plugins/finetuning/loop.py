@@ -27,7 +27,7 @@ from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, between_steps
 from fragprune_plugins.learning.losses import photometric_loss
-from fragprune_plugins.learning.pressure import FEWEST
+from fragprune_plugins.learning.pressure import CALIBRATION_VIEWS, FEWEST
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2, evenly
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -275,7 +275,7 @@ class _Run:
     def _require_reach(self, target: float, cost: Cost) -> None:
         """Refuse a target time that thresholds cannot reach: pixels and Gaussians stay."""
         splats, total = self.start.splats(), Counter[str]()
-        for shot in evenly(self.dataset.train):
+        for shot in evenly(self.dataset.train, CALIBRATION_VIEWS):
             inputs = RasterInputs(shot.view, splats, planes=())
             total.update(work_of(self.engine.rasterize(inputs, None)))
         limit = cost.limit(total, FEWEST)
@@ -323,9 +323,14 @@ class _Run:
             return
         self.checkpoints = checkpoints
         self.asked = configuration(
-            self.start, self.stage.store, self.dataset, self.settings, self.engine.name
+            self.start,
+            self.stage.store,
+            self.dataset,
+            self.settings,
+            self.engine.name,
+            self.stage.schedule,
         )
-        self.asked |= {"schedule": self.stage.schedule.as_dict(), **self.others}
+        self.asked |= self.others
         del self.asked["nonfinite"]  # a run that such a step stopped may go on and skip it
         tensors, values = checkpoints.load(self.asked, self.start.xyz.device)
         if not values:

@@ -15,9 +15,10 @@ from fragprune_plugins.constants import VERSION
 from fragprune_plugins.datasets.dataset import Dataset, Photograph, Shot
 from fragprune_plugins.datasets.images import DOOR
 from fragprune_plugins.errors import CheckpointError, OutputError
-from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.storage import checkpoints
 from fragprune_plugins.storage.atomic import digest
@@ -106,6 +107,7 @@ def configuration(
     dataset: Dataset,
     settings: Settings,
     engine: str,
+    schedule: Schedule | None = None,
 ) -> dict[str, Any]:
     """What decides the result of a fine-tuning, as plain values.
 
@@ -115,6 +117,7 @@ def configuration(
         dataset: its files are read whole, for their digest.
         settings: of the fine-tuning.
         engine: the engine's name.
+        schedule: gives the plan of each step; when None a plugin's, or the default one.
     """
     shots = (*dataset.train, *dataset.test)
     known = {} if store is None or store.neutral else store.numbers
@@ -125,6 +128,7 @@ def configuration(
         "photographs": _digest(each for shot in shots for each in _of(shot)),
         "engine": engine,
         "plugins": _deciding(),
+        "schedule": (schedule or schedule_for(settings)).as_dict(),
         "device": model.xyz.device.type,
         **settings.as_dict(),
     }

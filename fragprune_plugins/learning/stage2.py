@@ -25,7 +25,7 @@ import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -63,6 +63,8 @@ SKIPS_MOST = 100
 
 _COUNTED = ("steps", "taken", "skipped", "_open", "_held", "_met", "_seen", "_timed", "_median")
 
+View = TypeVar("View")
+
 Truncate = Callable[[RasterInputs, ThresholdStore], Tensor | None]
 """Gives the thresholds (N,) to draw one rasterization with; None draws without."""
 
@@ -75,9 +77,9 @@ def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | 
     return None if store.neutral else store.values
 
 
-def evenly(views: Sequence[Any]) -> Sequence[Any]:
-    """Those of the views that a calibration measures, at even distances."""
-    return views[:: max(1, -(-len(views) // CALIBRATION_VIEWS))]
+def evenly(views: Sequence[View], most: int) -> Sequence[View]:
+    """Views at even distances, so many at most, from the first on."""
+    return views[:: max(1, -(-len(views) // most))]
 
 
 @dataclass(frozen=True)
@@ -449,7 +451,7 @@ class Stage2:
         timed = self._clock is not None and not self._held and self._timed < passed
         if target is None or not (due or timed) or not views:
             return
-        views = list(evenly(views))
+        views = list(evenly(views, CALIBRATION_VIEWS))
         pictures = [picture for picture in self._before if picture[0] in set(views)]
 
         @torch.no_grad()

@@ -38,11 +38,12 @@ def draw_views(
     """
     import torch
 
+    from fragprune_plugins.learning.stage2 import evenly
     from fragprune_plugins.measure.pictures import save_image, save_panel, stems
 
     views = {}
     models = [("before", before, before.model.splats()), ("after", after, after.model.splats())]
-    chosen = shots[:: max(1, len(shots) // _SHOWN)][:_SHOWN]
+    chosen = evenly(shots, _SHOWN)
     for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
         shot = shot.to(before.model.xyz.device)
         with torch.no_grad():

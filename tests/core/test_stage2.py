@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +13,7 @@ import torch
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import ELASTICITY
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
-from fragprune_plugins.learning.stage2 import FrameClock, Stage2
+from fragprune_plugins.learning.stage2 import FrameClock, Stage2, evenly
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 OPACITIES = torch.linspace(0.2, 0.9, 5)
@@ -293,3 +295,12 @@ def test_opacities_are_worked_out_only_while_there_are_rows_to_open():
             it.store.append(2)
     assert asked == [1, 4]
     assert (it.store.logits > -30).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 11, 100])
+def test_chosen_views_are_spread_over_all_of_them(count):
+    chosen = evenly(range(count), 3)
+    assert len(chosen) <= 3
+    assert count == 0 or chosen[0] == 0
+    gaps = [b - a for a, b in pairwise([*chosen, count])]
+    assert max(gaps, default=0) <= math.ceil(count / 3)
