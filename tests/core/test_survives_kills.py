@@ -140,8 +140,9 @@ def kill_in_a_loop(path: Path, kills: int) -> None:
         time.sleep(stream.uniform(0, while_of))
         child.kill()
         assert child.wait() == -signal.SIGKILL
-        assert generation(path) >= done
-        done = generation(path)
+        before, done = done, generation(path)
+        assert done >= before
+        while_of *= 0.9 if done > before else 1.3  # a busy machine is slower than it was
     assert done > kills / 10  # many were in the midst of it
     save(path, 1)
     assert names(path) == ["a.fragprune.safetensors", "a.ply"]
