@@ -109,6 +109,13 @@ def command(
     """
     if alternate is not None and stage != "joint":
         raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Change one of them.")
+    if from_iter is not None and stage not in ("finetune", "joint"):
+        raise UsageError(
+            "--from-iter",
+            f"--stage {stage}",
+            "--stage finetune or joint, which learn inside one run",
+            "Add one of them, or remove --from-iter.",
+        )
     if settings.target_time is not None:
         raise UsageError(
             "--target-time",
