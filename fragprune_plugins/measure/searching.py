@@ -19,6 +19,7 @@ from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.finetuning import FinetuneResult, finetune
+from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.pressure import FEWEST
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -126,33 +127,42 @@ def strongest(
 
     say("Training the control, without truncation.")
     control = train(replace(settings, truncate=False))
-    reference, _ = _held_out(control, dataset.test, engine)
-    trials: list[Trial] = []
+    result, trials = control, list[Trial]()
     best: tuple[FinetuneResult, Trial] | None = None
-    if control.interrupted:
-        return Bounded(bound, control, None, control, trials)
     pressure: float | None = None
-    while len(trials) < TRAININGS:
-        at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
-        say(f"Training {len(trials) + 1} of at most {TRAININGS}, at {at}.")
-        result = train(replace(settings, pressure=pressure))
-        if result.interrupted:
-            kept, trial_kept = best or (result, None)
-            ended = replace(kept, interrupted=True, terminated=result.terminated)
-            return Bounded(bound, ended, trial_kept, control, trials)
-        figures, fragments = _held_out(result, dataset.test, engine)
-        losses = [was - now for was, now in zip(reference, figures, strict=True)]
-        spread = statistics.stdev(losses) / len(losses) ** 0.5 if len(losses) > 1 else 0.0
-        trial = Trial(result.progress.pressure, statistics.fmean(losses), spread, fragments)
-        trials.append(trial)
-        say(f"Loss against the control: {trial.loss:.3f} dB at {fragments:.1f} fragments/pixel.")
-        if best is None or _better(trial, best[1], bound):
-            best = result, trial
-        before = result.progress.fragments_before or 0.0
-        enough = fragments * FEWEST < before and trial.loss <= bound
-        if enough or bound - TOLERANCE <= trial.loss <= bound or pressure == _STRONGEST:
-            break
-        pressure = min(next_pressure(trials, bound), _STRONGEST)
+
+    def ended(terminated: bool) -> Bounded:
+        kept, trial = best or (result, None)
+        kept = replace(kept, interrupted=True, terminated=terminated)
+        return Bounded(bound, kept, trial, control, trials)
+
+    if control.interrupted:
+        return ended(control.terminated)
+    try:
+        reference, _ = _held_out(control, dataset.test, engine)
+        while len(trials) < TRAININGS:
+            at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
+            say(f"Training {len(trials) + 1} of at most {TRAININGS}, at {at}.")
+            result = train(replace(settings, pressure=pressure))
+            if result.interrupted:
+                return ended(result.terminated)
+            figures, fragments = _held_out(result, dataset.test, engine)
+            losses = [was - now for was, now in zip(reference, figures, strict=True)]
+            spread = statistics.stdev(losses) / len(losses) ** 0.5 if len(losses) > 1 else 0.0
+            trial = Trial(result.progress.pressure, statistics.fmean(losses), spread, fragments)
+            trials.append(trial)
+            say(
+                f"Loss against the control: {trial.loss:.3f} dB at {fragments:.1f} fragments/pixel."
+            )
+            if best is None or _better(trial, best[1], bound):
+                best = result, trial
+            before = result.progress.fragments_before or 0.0
+            enough = fragments * FEWEST < before and trial.loss <= bound
+            if enough or bound - TOLERANCE <= trial.loss <= bound or pressure == _STRONGEST:
+                break
+            pressure = min(next_pressure(trials, bound), _STRONGEST)
+    except KeyboardInterrupt as error:  # not in a training, which ends by itself
+        return ended(isinstance(error, Terminate))
     assert best is not None
     return Bounded(bound, *best, control, trials)
 

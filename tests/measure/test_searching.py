@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import make_dataclass
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.measure import searching
 from fragprune_plugins.measure.searching import (
@@ -63,6 +65,9 @@ def test_a_loss_that_stays_below_the_bound_ends_with_ever_more():
     assert pressures[-1] > 30 * pressures[0]
 
 
+Result = make_dataclass("Result", ["settings", "progress", "interrupted", "terminated"])
+
+
 @pytest.fixture
 def trained(monkeypatch):
     """Trainings that lose 1 dB at a pressure of 1e-3, in proportion, and are not made."""
@@ -72,9 +77,7 @@ def trained(monkeypatch):
         seen.append(settings)
         pressure = 2e-4 if settings.pressure is None else settings.pressure
         progress = SimpleNamespace(pressure=pressure, fragments_before=40.0)
-        return SimpleNamespace(
-            settings=settings, progress=progress, interrupted=False, terminated=False
-        )
+        return Result(settings, progress, False, False)
 
     def held_out(result, shots, engine):
         lost = 1000 * result.progress.pressure if result.settings.truncate else 0.0
@@ -125,3 +128,23 @@ def test_a_loss_that_never_reaches_the_bound_ends_before_a_pressure_that_is_none
 def test_a_bound_out_of_range_is_usage(bound):
     with pytest.raises(UsageError):
         strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), bound, engine="cpu")
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, Terminate])
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_a_signal_while_views_are_measured_keeps_what_was_trained(trained, monkeypatch, stop, at):
+    measured, held_out = [], searching._held_out
+
+    def signalled(*args):
+        measured.append(args[0])
+        if len(measured) == at:
+            raise stop
+        return held_out(*args)
+
+    monkeypatch.setattr(searching, "_held_out", signalled)
+    found = strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), 0.1, engine="cpu")
+    kept = measured[1 if at == 3 else at - 1]  # the best that was measured, else the last
+    assert found.result.settings == kept.settings
+    assert found.result.interrupted
+    assert found.result.terminated == (stop is Terminate)
+    assert (found.trial is None) == (at < 3)
