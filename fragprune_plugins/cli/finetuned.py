@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from fragprune_plugins.cli.common import Report, describe_dropped
 from fragprune_plugins.errors import RecordError, SidecarError
 from fragprune_plugins.learning.interruption import EXIT_CODE
-from fragprune_plugins.measure import Candidate, measure
-from fragprune_plugins.measure.report_page import save_learning
-from fragprune_plugins.measure.wording import FELL, describe, outcome
-from fragprune_plugins.storage import models, records, sidecar
+from fragprune_plugins.storage import records
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +20,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.datasets.photographs import Photographs
     from fragprune_plugins.engines import Engine
     from fragprune_plugins.finetuning import FinetuneResult
+    from fragprune_plugins.measure import Candidate
     from fragprune_plugins.measure.searching import Bounded
 
 _OF_RECORDS = {"curves", "photographs", "configuration", "text"}
@@ -69,6 +67,8 @@ class Finetuned:
             photographs: where they lie, for the record; None where there are none.
             asked: the configuration, by which the same command is known again.
         """
+        from fragprune_plugins.measure import Candidate, measure
+
         result, settings = self.result, self.result.settings
         candidates = [self.start, Candidate(result.model, result.store)]
         if result.thresholds is not None:
@@ -125,6 +125,9 @@ class Finetuned:
             held_out: number of held-out views.
             views: number of all views.
         """
+        from fragprune_plugins.measure.wording import describe, outcome
+        from fragprune_plugins.storage import sidecar
+
         result, settings, before = self.result, self.result.settings, data["before"]
         pressure = f" at pressure {data['pressure']:.2g}" if settings.truncate else ""
         lines = [
@@ -162,6 +165,8 @@ class Finetuned:
 
 def finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
     """The report of the same command, if it has written ``out`` already; else None."""
+    from fragprune_plugins.storage import models, sidecar
+
     if not out.is_file():
         return None
     try:
@@ -214,6 +219,8 @@ def draw_curves(path: Path, points: Sequence[dict[str, Any]], thresholds: Tensor
         thresholds: (N,) learned ones, or None.
     """
     if points:
+        from fragprune_plugins.measure.report_page import save_learning
+
         save_learning(path, points, thresholds)
 
 
@@ -244,6 +251,8 @@ def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
         before: measurement of the model before fine-tuning.
         plain: measurement of the fine-tuned model without thresholds.
     """
+    from fragprune_plugins.measure.wording import FELL
+
     own = plain["target"] == "itself"
     compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
     advice = ""
