@@ -94,6 +94,7 @@ class Finetuned:
             "resumed_at": result.resumed_at,
             "already_finished": False,
             "iterations": done.steps,
+            "skipped": done.skipped,
             "pressure": done.pressure if settings.truncate else None,
             "train_seconds": result.train_seconds,
             "engine": result.engine,
@@ -142,6 +143,8 @@ class Finetuned:
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
             lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
+        if data["skipped"]:
+            lines.append(f"Skipped {data['skipped']} steps whose gradients were not finite.")
         if self.keep is not None:
             lines.append(
                 f"Removed {self.removed:,} of {len(self.start.model):,} Gaussians before learning, "

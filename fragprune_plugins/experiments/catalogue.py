@@ -60,7 +60,7 @@ class Arm:
         variant: what sets the arm apart in its series; empty where the series has one arm.
         settings: of the training; every seed replaces theirs.
         rule: gives the thresholds; None where they are learned, or where nothing is truncated.
-        opens: iterations before anything is truncated; None for ``Settings.warmup``.
+        warmup: iterations before anything is truncated; None for ``Settings.warmup``.
         every: iterations after which learning changes to holding thresholds, and back; None where
             they learn all the time.
         pruning: comes before the training; None where all Gaussians stay.
@@ -71,7 +71,7 @@ class Arm:
     variant: str
     settings: Settings
     rule: Rule | None = None
-    opens: int | None = None
+    warmup: int | None = None
     every: int | None = None
     pruning: Pruning | None = None
     start: Start | None = None
@@ -211,8 +211,8 @@ def overfitting(longest: int, train: Train | None = None) -> Experiment:
         "it learns from?",
         (
             *(Arm("control", f"{each.iterations:,}", _control(each)) for each in every),
-            *(Arm("from the first step", f"{e.iterations:,}", e, opens=0) for e in every),
-            *(Arm("opens later", f"after {opens:,}", settings, opens=opens) for opens in later),
+            *(Arm("from the first step", f"{e.iterations:,}", e, warmup=0) for e in every),
+            *(Arm("opens later", f"after {opens:,}", settings, warmup=opens) for opens in later),
         ),
         over="iterations",
     )
@@ -233,9 +233,9 @@ def schedules(iterations: int, train: Train | None = None) -> Experiment:
         "Should thresholds learn after everything else, together with it, or in turns?",
         (
             Arm("control", "", _control(settings)),
-            Arm("together", "", settings, opens=0),
-            *(Arm("after", f"{opens:,}", settings, opens=opens) for opens in later),
-            *(Arm("in turns", f"of {n:,}", settings, opens=0, every=n) for n in turns),
+            Arm("together", "", settings, warmup=0),
+            *(Arm("after", f"{opens:,}", settings, warmup=opens) for opens in later),
+            *(Arm("in turns", f"of {n:,}", settings, warmup=0, every=n) for n in turns),
         ),
     )
 

@@ -170,9 +170,9 @@ def _outcome(
 
 def _schedule(arm: Arm, settings: Settings) -> Schedule:
     """A plugin's, or the default one, unless the arm has its own."""
-    if arm.opens is None:
+    if arm.warmup is None:
         return schedule_for(settings)
-    return Schedule(settings, arm.opens, arm.every)
+    return Schedule(settings, arm.warmup, arm.every)
 
 
 def _measure(

@@ -109,6 +109,7 @@ class Progress:
         faster: frame times before over after, as measured when a target time was met; else None.
         target_reached: the ratio is within 5 % of the target; None without a target.
         pressure: lambda.
+        skipped: steps that were left out, because gradients were not finite.
     """
 
     steps: int
@@ -119,6 +120,7 @@ class Progress:
     faster: float | None
     target_reached: bool | None
     pressure: float
+    skipped: int = 0
 
 
 class Stage2:
@@ -372,6 +374,7 @@ class Stage2:
             faster=faster,
             target_reached=reached,
             pressure=self.pressure.value,
+            skipped=self.skipped,
         )
 
     def state_dict(self) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -83,7 +83,7 @@ def test_iterations_compares_lengths():
 def test_overfitting_compares_lengths_and_openings():
     experiment = EXPERIMENTS["overfitting"](5000, None)
     truncated = [
-        (arm.settings.iterations, arm.opens) for arm in experiment.arms if not arm.is_control
+        (arm.settings.iterations, arm.warmup) for arm in experiment.arms if not arm.is_control
     ]
     assert truncated == [(500, 0), (1000, 0), (2000, 0), (5000, 0)] + [
         (5000, opens) for opens in (2000, 3000, 4000)
@@ -92,7 +92,7 @@ def test_overfitting_compares_lengths_and_openings():
 
 def test_schedules_compares_when_thresholds_learn():
     arms = EXPERIMENTS["schedules"](1000, None).arms
-    truncated = [(arm.opens, arm.every) for arm in arms if not arm.is_control]
+    truncated = [(arm.warmup, arm.every) for arm in arms if not arm.is_control]
     assert truncated == [(0, None), (500, None), (800, None), (0, 100), (0, 25)]
     assert {arm.settings.iterations for arm in arms} == {1000}
 

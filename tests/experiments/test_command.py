@@ -220,7 +220,7 @@ def test_an_arm_truncates_from_where_it_opens(words, trained, monkeypatch):
     learned = Settings(iterations=3, train="opacity", pressure=1e-2)
     arms = (
         Arm("control", "", replace(learned, truncate=False, pressure=None)),
-        *(Arm("learned", str(opens), learned, opens=opens) for opens in (0, 3)),
+        *(Arm("learned", str(opens), learned, warmup=opens) for opens in (0, 3)),
     )
     experiment = Experiment("rules", "When?", arms, over="iterations")
     monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", lambda *asked: experiment)

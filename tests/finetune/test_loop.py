@@ -169,6 +169,7 @@ def test_gradients_that_are_not_finite_stop_their_step_or_are_skipped(
     result = finetune(model, dataset, Settings(iterations=9, nonfinite="skip"))
     assert result.progress.steps == 9
     assert caplog.text.count("the step is skipped") == 2
+    assert result.progress.skipped == 2
     for name in ALL:
         assert getattr(result.model, name).isfinite().all()
 
