@@ -114,6 +114,12 @@ class SessionError(FragpruneError):
     code = "session"
 
 
+class RanksError(FragpruneError):
+    """Several processes train one model together (torchrun, DDP); thresholds learn in one only."""
+
+    code = "ranks"
+
+
 class EngineError(FragpruneError):
     """No engine on this machine can do the task."""
 

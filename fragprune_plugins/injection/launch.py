@@ -30,7 +30,7 @@ from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import ScriptAdapter
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection import process, starting
+from fragprune_plugins.injection import process, ranks, starting
 from fragprune_plugins.injection.command import HostCommand, split
 from fragprune_plugins.injection.starting import Start
 from fragprune_plugins.learning.events import Summary
@@ -137,6 +137,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         UnknownHostError: no adapter fits the script's folder.
         HostNeedsError: packages that the script imports, or its data, are missing.
         HostFailed: the host raised an exception or ended with an error code.
+        RanksError: several processes train the model together.
         Interrupted: Ctrl-C in stage 2, or SIGTERM (Terminated). Learned thresholds were saved.
         DivergedError: NaN or infinity in stage 2. Nothing of it was saved.
         SessionError: steps were counted as learned, and no view was drawn with thresholds.
@@ -166,6 +167,8 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         engine_for(options.engine, device, plugins)  # refuse before stage 1
     started = time.perf_counter()
     trains = script in (repo.root / name for name in host.line.scripts)
+    if trains and options.stage != "off":
+        ranks.expect_one()  # refuse before stage 1
     dialect = adapter.dialect(repo)
     answered = {*dialect.names(), *(dialect.spares() if device == "cpu" else ())}
     data = Path(host.flags.source) if trains and host.flags.source else None

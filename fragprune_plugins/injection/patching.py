@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -34,6 +35,7 @@ class PatchLedger:
         self._root = root
         self._live = True
         self._wrapped: list[tuple[ModuleType, Seam, Any]] = []
+        self._waiting: list[list[Callable[[ModuleType], None]]] = []
 
     def wrap(self, seam: Seam, wrapper: Wrapper) -> None:
         """Wrap a seam now if its module is imported, else as soon as the module is imported.
@@ -68,8 +70,11 @@ class PatchLedger:
         if module is not None:
             self._refuse_late(module, seam)
             apply(module)
-        else:
-            wrapt.register_post_import_hook(apply, seam.module)
+            return
+        # wrapt keeps a hook whose module is never imported: undo() empties it.
+        waiting = [apply]
+        self._waiting.append(waiting)
+        wrapt.register_post_import_hook(partial(_call_all, waiting), seam.module)
 
     def undo(self) -> list[Finding]:
         """Restore every original, newest first.
@@ -78,6 +83,8 @@ class PatchLedger:
             A finding for each wrapper that could not be removed.
         """
         self._live = False
+        for waiting in self._waiting:
+            waiting.clear()
         findings = []
         while self._wrapped:
             module, seam, handle = self._wrapped.pop()
@@ -157,6 +164,11 @@ class PatchLedger:
                 "activation before the host's imports",
                 "Start the host with fragprune run, or call activate() above those imports.",
             )
+
+
+def _call_all(functions: list[Callable[[ModuleType], None]], module: ModuleType) -> None:
+    for function in functions:
+        function(module)
 
 
 def _rebind(name: str, ours: Any, module: ModuleType) -> None:

@@ -8,11 +8,13 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from fragprune_plugins.errors import SessionError
 from fragprune_plugins.hosts.adapter import ScriptAdapter
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.seams import Seam, SeamCall
-from fragprune_plugins.injection import aligning, rasterizing, saving, stepping
+from fragprune_plugins.injection import aligning, ranks, rasterizing, saving, stepping
 from fragprune_plugins.injection.patching import PatchLedger
 from fragprune_plugins.injection.stand_ins import StandIns
 from fragprune_plugins.injection.state import SessionState
@@ -52,15 +54,19 @@ class Session(SessionState):
             SessionError: another session is active.
             LateImportError: the host is already imported.
             SeamError: a function to wrap is missing or lacks a parameter.
+            RanksError: it is to learn, and several processes train the model together.
         """
         global _active
         if _active is not None:
             raise SessionError("activate()", "a session is active", "none", "Deactivate it first.")
+        if self.learn:
+            ranks.expect_one()
         self._ledger = PatchLedger(self.repo.root)
+        enter = torch.compiler.disable(self._enter)  # a host may compile what calls a seam
         try:
             self.install_stand_ins()
             for seam in self.adapter.seams_for(self.repo):
-                self._ledger.wrap(seam, partial(self._enter, seam))
+                self._ledger.wrap(seam, partial(enter, seam))
             self._stand_ins.refuse_leftovers(self.repo.root)
         except BaseException:
             self._take_back()

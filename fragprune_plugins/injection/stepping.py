@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.hosts.seams import Role, SeamCall
+from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.stage2 import Stage2
@@ -34,6 +35,8 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
 
     A model that already has thresholds keeps them if its rows are the same, else gets neutral ones.
     """
+    if session.learn:
+        ranks.expect_one()
     model = call.model
     state = session.models.get(model)
     kept = state is not None and is_followed(session, model, state)  # needs the old optimizer
