@@ -308,6 +308,7 @@ class _Runner:
         **options: Any,
     ) -> None:
         """Run the host's script with these arguments, in a session with these options."""
+        from fragprune_plugins.injection import workers
         from fragprune_plugins.injection.session import Session
 
         session = Session(
@@ -332,6 +333,7 @@ class _Runner:
                 stack.enter_context(
                     process.host_process(host.script, arguments, self.device, folder)
                 )
+                stack.enter_context(workers.prepared(session, self.device))
                 if learn:
                     stack.enter_context(sigterm_interrupts())
                 try:

@@ -66,22 +66,26 @@ def host_process(
         device: "cpu", "cuda" or "cuda:N".
         folder: the first folder of the module search path; None for the script's folder.
     """
-    from fragprune_plugins.injection.cpu_only import cpu_only
-
     saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
     sys.argv = [str(script), *arguments]
     sys.path.insert(0, str(folder or script.parent))
     try:
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(host_checkpoints())
-            stack.enter_context(_host_pictures())
-            if device == "cpu":
-                stack.enter_context(cpu_only())
-            else:
-                stack.enter_context(current_gpu(device))
+        with surroundings(device):
             yield
     finally:
         sys.argv, sys.path[:], sys.stdout, sys.stderr = saved
+
+
+@contextlib.contextmanager
+def surroundings(device: str) -> Iterator[None]:
+    """Inside, torch and Pillow do what hosts expect of them on this device."""
+    from fragprune_plugins.injection.cpu_only import cpu_only
+
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(host_checkpoints())
+        stack.enter_context(_host_pictures())
+        stack.enter_context(cpu_only() if device == "cpu" else current_gpu(device))
+        yield
 
 
 def run_main(script: Path, module: str = "") -> None:

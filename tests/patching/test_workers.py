@@ -1,0 +1,166 @@
+"""Hosts with worker processes, a compiled render function, or several ranks."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from miniatures.runs import OPTIONS, command, edit, written
+
+from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.errors import RanksError
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.storage import sidecar
+from fragprune_plugins.testing import Host
+from fragprune_plugins.testing.fresh import fresh
+
+WORKERS = """
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from gaussian_renderer import render
+from scene.gaussian_model import GaussianModel
+
+
+class Views(torch.utils.data.Dataset):
+    def __init__(self, cameras, pipe, model=None):
+        self.cameras, self.pipe, self.model = cameras, pipe, model
+
+    def __len__(self):
+        return len(self.cameras)
+
+    def __getitem__(self, index):
+        camera, model = self.cameras[index], self.model
+        if model is None:
+            model = GaussianModel(1)
+            points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+            model.create_from_pcd(SimpleNamespace(points=points, colors=points * 0), 1.0)
+        try:
+            with torch.no_grad():
+                drawn = render(camera, model, self.pipe, torch.zeros(3, device="cuda"))["render"]
+        except Exception as error:
+            drawn = str(error)
+        return camera.image_name, camera.original_image.cuda(), drawn
+
+
+def look(kind, cameras, pipe, model, out):
+    here = Views(cameras[:2], pipe, model)
+    there = Views(cameras[:2], pipe, model if kind == "fork" else None)
+    loader = torch.utils.data.DataLoader(
+        there, batch_size=None, num_workers=1, multiprocessing_context=kind
+    )
+    found = [[a[0] == b[0], torch.equal(a[1], b[1]), same(a[2], b[2])] for a, b in zip(here, loader)]
+    Path(out, "seen").write_text(json.dumps(found))
+
+
+def same(here, there):
+    return there if isinstance(there, str) else torch.equal(here, there)
+"""
+
+JOINT = RunOptions(stage="joint", from_iter=4, device="cpu", settings=OPTIONS.settings)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    make_scene(folder, SceneSettings(views=6, width=40, height=30, supersample=1, points=150))
+    return folder
+
+
+def trained(root: Path, scene: Path, options: RunOptions) -> tuple[bytes, list[float], list[str]]:
+    """Train 12 iterations: the model, its thresholds, and what Python could only print."""
+    unraisable: list[str] = []
+    sys.unraisablehook = lambda raised: unraisable.append(repr(raised.exc_value))
+    run(command(root / "host" / "train.py", scene, root / "out", 12), options)
+    model = root / "out/point_cloud/iteration_12/point_cloud.ply"
+    return model.read_bytes(), sidecar.load(model)[0].logits.tolist(), unraisable
+
+
+@pytest.mark.parametrize("kind", ["fork", "spawn"])
+def test_workers_load_the_hosts_views_and_draw_with_thresholds_or_are_refused(
+    kind, scene, tmp_path
+):
+    """A forked worker knows the thresholds of its moment; a spawned one has none."""
+    root = written(Host, tmp_path / "host")
+    (root / "watching.py").write_text(WORKERS)
+    look = f"    from watching import look\n    look('{kind}', scene.getTrainCameras(), pipe, "
+    edit(root / "train.py", "    bar.close()\n", look + "gaussians, dataset.model_path)\n")
+    fresh(trained, tmp_path, scene, JOINT)
+    for name, photograph, picture in json.loads((tmp_path / "out/seen").read_text()):
+        assert (name, photograph) == (True, True)
+        if kind == "fork":
+            assert picture is True
+        else:
+            assert "a spawned worker process that draws" in picture
+            assert "Start workers by fork" in picture
+
+
+def test_a_compiled_render_function_learns_the_same_bits(scene, tmp_path):
+    results = []
+    for name in ("plain", "compiled"):
+        root = written(Host, tmp_path / name / "host")
+        if name == "compiled":
+            line = "    gaussians.training_setup(opt)\n"
+            compiled = "    global render\n    render = torch.compile(render, backend='eager')\n"
+            edit(root / "train.py", line, line + compiled)
+        results.append(fresh(trained, tmp_path / name, scene, JOINT))
+    assert results[0] == results[1]
+    assert results[1][2] == []
+
+
+@pytest.mark.parametrize("stage", ["auto", "finetune", "joint"])
+def test_under_torchrun_learning_is_refused_before_the_host_runs(
+    stage, scene, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    script = written(Host, tmp_path / "host") / "train.py"
+    script.write_text(f"raise SystemExit('it ran')\n{script.read_text()}")
+    words = command(script, scene, tmp_path / "out", 12)
+    with pytest.raises(RanksError) as caught:
+        run(words, RunOptions(stage=stage, device="cpu"))
+    assert caught.value.found == "WORLD_SIZE=2 in the environment"
+    assert "--stage finetune without torchrun" in caught.value.remedy
+
+
+@pytest.mark.parametrize("said", ["1", "", "many"])
+def test_one_rank_is_no_reason_to_refuse(said, monkeypatch):
+    from fragprune_plugins.injection import ranks
+
+    monkeypatch.setenv("WORLD_SIZE", said)
+    ranks.expect_one()
+
+
+def as_two_ranks(root: Path, scene: Path) -> str:
+    """Run the host as one of two ranks that it makes itself; the other rank is a fork of us."""
+    import torch
+
+    meet = {"backend": "gloo", "init_method": f"file://{root / 'meet'}", "world_size": 2}
+    other = os.fork()
+    if other == 0:
+        torch.distributed.init_process_group(rank=1, **meet)
+        torch.distributed.barrier()
+        os._exit(0)
+    line = "    gaussians = GaussianModel(dataset.sh_degree)\n"
+    ranks = (
+        f"    torch.distributed.init_process_group(rank=0, **{meet})\n"
+        "    torch.distributed.barrier()\n"
+    )
+    edit(root / "host/train.py", line, ranks + line)
+    try:
+        trained(root, scene, JOINT)
+    except RanksError as error:
+        return error.found
+    finally:
+        os.waitpid(other, 0)
+    return "not refused"
+
+
+def test_a_host_that_makes_ranks_itself_is_refused_when_it_begins_to_train(scene, tmp_path):
+    written(Host, tmp_path / "host")
+    assert fresh(as_two_ranks, tmp_path, scene) == "torch.distributed with 2 processes"
