@@ -72,7 +72,7 @@ class PatchLedger:
             apply(module)
             return
         # wrapt keeps a hook whose module is never imported: undo() empties it.
-        waiting = [apply]
+        waiting: list[Callable[[ModuleType], None]] = [apply]
         self._waiting.append(waiting)
         wrapt.register_post_import_hook(partial(_call_all, waiting), seam.module)
 

@@ -62,7 +62,8 @@ class Session(SessionState):
         if self.learn:
             ranks.expect_one()
         self._ledger = PatchLedger(self.repo.root)
-        enter = torch.compiler.disable(self._enter)  # a host may compile what calls a seam
+        disable: Any = torch.compiler.disable
+        enter = disable(self._enter)  # a host may compile what calls a seam
         try:
             self.install_stand_ins()
             for seam in self.adapter.seams_for(self.repo):

@@ -55,7 +55,8 @@ def look(kind, cameras, pipe, model, out):
     loader = torch.utils.data.DataLoader(
         there, batch_size=None, num_workers=1, multiprocessing_context=kind
     )
-    found = [[a[0] == b[0], torch.equal(a[1], b[1]), same(a[2], b[2])] for a, b in zip(here, loader)]
+    pairs = zip(here, loader)
+    found = [[a[0] == b[0], torch.equal(a[1], b[1]), same(a[2], b[2])] for a, b in pairs]
     Path(out, "seen").write_text(json.dumps(found))
 
 
