@@ -97,16 +97,15 @@ def test_its_own_command_trains_and_is_fine_tuned(mode, photographs, tmp_path):
         assert first == [pytest.approx(position, abs=1e-5) for position in second]  # rate: 1e-2
 
 
-@pytest.mark.parametrize("stage", ["joint", "finetune"])
-def test_a_run_may_begin_from_a_ply(stage, photographs, tmp_path):
+@pytest.mark.parametrize(("stage", "begins"), [("joint", 1), ("finetune", None)])
+def test_a_run_may_begin_from_a_ply(stage, begins, photographs, tmp_path):
     words = ["python", "-m", "gaussian_splatting.train", "-s", photographs, "--sh_degree", 1]
     words += ["--no_image_mask", "--no_depth_data"]
     command = [str(word) for word in words]
     run([*command, "-d", str(tmp_path / "first"), "-i", "3"], RunOptions(stage="off", device="cpu"))
     (model,) = tmp_path.glob("first/point_cloud/iteration_3/*.ply")
-    options = RunOptions(
-        stage=stage, device="cpu", settings=Settings(iterations=6, train="opacity")
-    )
+    settings = Settings(iterations=6, train="opacity")
+    options = RunOptions(stage=stage, device="cpu", settings=settings, from_iter=begins)
     out = tmp_path / "second"
     summary = run([*command, "-d", str(out), "-l", str(model), "-i", "6"], options)
     assert summary.model_after.is_relative_to(out if stage == "joint" else out / "finetuned")
