@@ -14,7 +14,6 @@ from reference_renderer.project import Footprints
 from reference_renderer.render import (
     Blended,
     blended,
-    fragment_weights,
     render,
     render_footprints,
 )
@@ -30,7 +29,6 @@ __all__ = [
     "Rendering",
     "SpacetimeGaussians",
     "blended",
-    "fragment_weights",
     "render",
     "render_footprints",
     "slice_gaussians",

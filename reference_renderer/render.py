@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from reference_renderer.composite import alive, blend, weights_of
+from reference_renderer.composite import alive, blend, transmittances, weights_of
 from reference_renderer.fragment import fragments
 from reference_renderer.project import (
     TILE,
@@ -77,6 +77,16 @@ class Blended:
     opacity: Tensor
     color: Tensor
 
+    @property
+    def light(self) -> Tensor:
+        """(K, P) transmittance before each fragment."""
+        return transmittances(self.alpha)[:-1]
+
+    @property
+    def weights(self) -> Tensor:
+        """(K, P) alpha T of each fragment."""
+        return weights_of(self.alpha)
+
 
 def render(
     camera: Camera,
@@ -127,7 +137,7 @@ def blended(
         gaussians: N of them.
         thresholds: as in ``render``.
         options: as in ``render``.
-        every: only each so-manieth tile is drawn.
+        every: 1 for all tiles, 2 for every second one, and so on.
     """
     options = options or Options()
     front = rows_in_front(camera, gaussians.means, options.near)
@@ -141,28 +151,6 @@ def blended(
         yield Blended(
             front[block.rows], found.alpha * live, found.drawn & live, here.opacity, here.color
         )
-
-
-def fragment_weights(
-    camera: Camera,
-    gaussians: Gaussians,
-    thresholds: Tensor | None = None,
-    *,
-    options: Options | None = None,
-    every: int = 1,
-) -> Tensor:
-    """(F,) weights alpha T of the drawn fragments, one by one, by tiles.
-
-    Args:
-        camera: the view.
-        gaussians: N of them.
-        thresholds: as in ``render``.
-        options: as in ``render``.
-        every: only each so-manieth tile is drawn.
-    """
-    blocks = blended(camera, gaussians, thresholds, options=options, every=every)
-    found = [weights_of(block.alpha)[block.drawn] for block in blocks]
-    return torch.cat([camera.background.new_empty(0), *found])
 
 
 def render_footprints(

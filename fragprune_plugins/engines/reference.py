@@ -31,7 +31,6 @@ from reference_renderer import (
     slice_gaussians,
 )
 from reference_renderer import Footprints as Projected
-from reference_renderer import fragment_weights as weights_one_by_one
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -105,17 +104,26 @@ class Fallback(ReferenceEngine):
         return super().rasterize(inputs, thresholds)
 
 
-def fragments(inputs: RasterInputs, thresholds: Tensor | None) -> Iterator[Blended]:
+def fragments(
+    inputs: RasterInputs, thresholds: Tensor | None, tiles: int | None = None
+) -> Iterator[Blended]:
     """The fragments themselves, tile by tile, for what no engine sums up. Slow.
 
     Args:
         inputs: Gaussians in the world.
         thresholds: (N,) falloff in (0, 1), or None for no truncation.
+        tiles: how many tiles are looked at, at most, evenly spread; None for all.
     """
     assert isinstance(inputs.splats, Splats)
     inputs.check_thresholds(thresholds)
+    view = inputs.view
+    count = -(-view.width // TILE) * -(-view.height // TILE)
     return blended(
-        camera_of(inputs), gaussians_of(inputs.splats), thresholds, options=options_of(inputs)
+        camera_of(inputs),
+        gaussians_of(inputs.splats),
+        thresholds,
+        options=options_of(inputs),
+        every=1 if tiles is None else -(-count // tiles),
     )
 
 
@@ -130,27 +138,6 @@ def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:
     projected = projected_of(splats)
     return render_footprints(
         camera, projected, splats.tiles, thresholds, means2d_hook=hook, options=options
-    )
-
-
-def fragment_weights(inputs: RasterInputs, thresholds: Tensor | None, tiles: int) -> Tensor:
-    """(F,) weights alpha T of drawn fragments of evenly spread tiles, one by one.
-
-    Args:
-        inputs: with Gaussians in the world.
-        thresholds: (N,) falloff in (0, 1), or None for no truncation.
-        tiles: how many tiles are looked at, at most.
-    """
-    inputs.check_thresholds(thresholds)
-    assert isinstance(inputs.splats, Splats)
-    view = inputs.view
-    count = -(-view.width // TILE) * -(-view.height // TILE)
-    return weights_one_by_one(
-        camera_of(inputs),
-        gaussians_of(inputs.splats),
-        None if thresholds is None else thresholds.to(inputs.splats.opacities),
-        options=options_of(inputs),
-        every=-(-count // tiles),
     )
 
 

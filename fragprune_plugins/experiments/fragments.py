@@ -12,19 +12,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.bench.machine import describe_machine
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.datasets.dataset import Shot, load_photographs
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.engines.reference import fragment_weights
+from fragprune_plugins.engines.reference import fragments
 from fragprune_plugins.experiments.catalogue import QUESTIONS
 from fragprune_plugins.experiments.figures import new_figure, save_figure
 from fragprune_plugins.experiments.folder import Findings, Folder, markdown
-from fragprune_plugins.experiments.scene import describe_photographs, load_columns
+from fragprune_plugins.experiments.scene import describe_drawing, describe_photographs, load_columns
 from fragprune_plugins.measure import Candidate
 from fragprune_plugins.measure.pictures import COLOURS, LABEL
 from fragprune_plugins.plugins.hooks import thresholds_for
+from fragprune_plugins.types import RasterInputs
 
 NAME = "fragments"
 
@@ -69,10 +69,7 @@ def run(
         "models": said,
         "photographs": describe_photographs(photographs, dataset),
         "tiles": _TILES,
-        "engine": engine.name,
-        "device": str(device),
-        "threads": torch.get_num_threads(),
-        "machine": describe_machine(device),
+        **describe_drawing(engine, device),
     }
     folder = Folder(out, NAME, asked)
     parts = {}
@@ -88,6 +85,12 @@ def run(
     return _findings(folder, parts, dataset.test[views // 2])
 
 
+def weigh(inputs: RasterInputs, thresholds: Tensor | None, tiles: int) -> Tensor:
+    """(F,) weights alpha T of the drawn fragments in so many tiles at most, one by one."""
+    found = [each.weights[each.drawn] for each in fragments(inputs, thresholds, tiles)]
+    return torch.cat([inputs.view.background.new_empty(0), *found])
+
+
 @torch.no_grad()
 def _count(column: Candidate, shots: Sequence[Shot], engine: Engine, bar: Any) -> dict[str, Any]:
     """Everything that the table and the plot show of one model, as plain values."""
@@ -101,7 +104,7 @@ def _count(column: Candidate, shots: Sequence[Shot], engine: Engine, bar: Any) -
         assert mine is not None
         assert seen is not None
         inputs = column.inputs(shot.view, splats)
-        weights = fragment_weights(inputs, thresholds_for(inputs, column.thresholds), _TILES)
+        weights = weigh(inputs, thresholds_for(inputs, column.thresholds), _TILES)
         owned += mine
         pixels += seen.numel()
         maps.append(seen.cpu().tolist())

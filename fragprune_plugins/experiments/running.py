@@ -10,14 +10,13 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.bench.machine import describe_machine
 from fragprune_plugins.datasets.dataset import Dataset, load_photographs
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import Interrupted, Terminated
 from fragprune_plugins.experiments.catalogue import Arm, Experiment, Pruning
 from fragprune_plugins.experiments.folder import Folder
-from fragprune_plugins.experiments.scene import describe_photographs
+from fragprune_plugins.experiments.scene import describe_drawing, describe_photographs
 from fragprune_plugins.finetuning import FinetuneResult, finetune
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.measure import Candidate, frame_times, measure
@@ -220,8 +219,5 @@ def _configuration(
         "seeds": list(seeds),
         "model": {"name": model.name, "sha256": digest(model)},
         "photographs": describe_photographs(photographs, dataset),
-        "engine": engine.name,
-        "device": str(device),
-        "threads": torch.get_num_threads(),
-        "machine": describe_machine(device),
+        **describe_drawing(engine, device),
     }

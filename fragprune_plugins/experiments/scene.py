@@ -9,8 +9,10 @@ from typing import Any
 
 import torch
 
+from fragprune_plugins.bench.machine import describe_machine
 from fragprune_plugins.datasets.dataset import Dataset
 from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.engines import Engine
 from fragprune_plugins.measure import Candidate
 from fragprune_plugins.storage import models, sidecar
 from fragprune_plugins.storage.atomic import digest
@@ -56,6 +58,16 @@ def describe_photographs(photographs: Photographs, dataset: Dataset) -> dict[str
         "sha256": _digest(dataset),
         "training_views": len(dataset.train),
         "held_out_views": len(dataset.test),
+    }
+
+
+def describe_drawing(engine: Engine, device: torch.device | str) -> dict[str, Any]:
+    """What draws, and on what, as plain values."""
+    return {
+        "engine": engine.name,
+        "device": str(device),
+        "threads": torch.get_num_threads(),
+        "machine": describe_machine(device),
     }
 
 

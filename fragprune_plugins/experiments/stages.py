@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.bench.machine import describe_machine
 from fragprune_plugins.datasets.dataset import load_photographs
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.engines import Engine
@@ -20,7 +19,7 @@ from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.experiments.catalogue import QUESTIONS
 from fragprune_plugins.experiments.figures import new_figure, save_figure
 from fragprune_plugins.experiments.folder import Findings, Folder, markdown
-from fragprune_plugins.experiments.scene import describe_photographs, load_columns
+from fragprune_plugins.experiments.scene import describe_drawing, describe_photographs, load_columns
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.measure import Candidate
 from fragprune_plugins.plugins.hooks import thresholds_for
@@ -79,10 +78,7 @@ def run(
         "views": len(views),
         "sizes": list(sizes),
         "repeats": repeats,
-        "engine": engine.name,
-        "device": str(device),
-        "threads": torch.get_num_threads(),
-        "machine": describe_machine(device),
+        **describe_drawing(engine, device),
     }
     folder = Folder(out, NAME, asked)
     rows = []

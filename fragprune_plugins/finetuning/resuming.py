@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -150,9 +152,16 @@ def _of(shot: Shot) -> Iterable[Tensor | str]:
     yield f"{shot.name} {shot.view.width} {shot.view.height} {shot.target}"
     yield from (shot.view.viewmatrix, shot.view.projmatrix, shot.view.background)
     if isinstance(shot, Photograph):
-        with DOOR.reading(shot.path):
-            content = digest(shot.path)
+        with DOOR.reading(shot.path) as reading:
+            version = os.fstat(reading.file.fileno())
+            content = _photograph(shot.path, version.st_mtime_ns, version.st_size)
         yield content
+
+
+@lru_cache(maxsize=10_000)  # a command asks for its configuration more than once
+def _photograph(path: Path, changed: int, size: int) -> str:
+    """The digest of a photograph, read once for as long as it does not change."""
+    return digest(path)
 
 
 def _digest(parts: Iterable[Tensor | str]) -> str:

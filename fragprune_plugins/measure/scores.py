@@ -150,7 +150,7 @@ def largest_weight(
     scores = model.opacity.new_zeros(len(model))
     for inputs in _inputs(model, views):
         for tile in fragments(inputs, thresholds):
-            largest = (tile.alpha * _light(tile.alpha)).amax(dim=1)
+            largest = tile.weights.amax(dim=1)
             scores[tile.rows] = scores[tile.rows].maximum(largest)
     return scores
 
@@ -201,7 +201,7 @@ def falloff_gradient(
     for inputs in _inputs(model, views):
         background = inputs.view.background.sum()
         for tile in fragments(inputs, thresholds):
-            light, color = _light(tile.alpha), tile.color.sum(dim=1)[:, None]
+            light, color = tile.light, tile.color.sum(dim=1)[:, None]
             given = tile.alpha * light * color
             behind = given.sum(dim=0) - given.cumsum(dim=0)
             behind += background * (1 - tile.alpha).prod(dim=0)
@@ -319,9 +319,3 @@ def _summed(
         assert each is not None
         scores += each
     return scores
-
-
-def _light(alpha: Tensor) -> Tensor:
-    """(K, P) transmittance before each fragment of alpha (K, P), front to back."""
-    whole = torch.cat([alpha.new_ones(1, alpha.shape[1]), 1 - alpha])
-    return whole.cumprod(dim=0)[:-1]

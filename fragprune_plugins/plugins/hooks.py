@@ -155,8 +155,8 @@ def _no_engine(answer: Any) -> Wrong | None:
 
 
 def _no_schedule(answer: Any) -> Wrong | None:
-    fits = callable(getattr(answer, "at", None))
-    return None if fits else (repr(answer), "a schedule: at(step) gives a StepPlan")
+    expected = "a schedule: a Schedule, or a subclass of it"
+    return None if isinstance(answer, Schedule) else (repr(answer), expected)
 
 
 def _no_thresholds(answer: Any, count: int, device: torch.device) -> Wrong | None:

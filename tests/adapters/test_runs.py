@@ -129,14 +129,6 @@ def trained(photographs, tmp_path):
     return out
 
 
-@pytest.fixture
-def ctrl_c():
-    """SIGINT as at a terminal: a job in the background is started with it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_in_stage_two_keeps_what_was_learned_and_the_run_can_be_resumed(
     photographs, trained, monkeypatch

@@ -70,14 +70,6 @@ def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path)
     assert left == {"out.ply", "out.fragprune.safetensors", "out.fragprune.json"}
 
 
-@pytest.fixture
-def ctrl_c():
-    """SIGINT as at a terminal: a job in the background is started with it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_is_gone_on_from(scene, tmp_path, monkeypatch):
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"

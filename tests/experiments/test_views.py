@@ -9,8 +9,8 @@ from finetune import tiny
 
 import fragprune_plugins as fp
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.reference import fragment_weights
 from fragprune_plugins.experiments import stages
+from fragprune_plugins.experiments.fragments import weigh
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 
@@ -33,11 +33,11 @@ def test_weights_one_by_one_sum_to_what_is_drawn(tau):
     thresholds = None if tau is None else torch.full((len(model),), tau)
     inputs = RasterInputs(view, model.splats(), counts=True)
     drawn = create_engine("auto").rasterize(inputs, thresholds)
-    weights = fragment_weights(inputs, thresholds, 10**6)
+    weights = weigh(inputs, thresholds, 10**6)
     assert len(weights) == drawn.fragments.sum()
     assert 0 < weights.min() <= weights.max() <= 0.99
     torch.testing.assert_close(weights.sum(), drawn.alpha.sum(), rtol=1e-4, atol=0)
-    assert 0 < len(fragment_weights(inputs, thresholds, 2)) < len(weights)
+    assert 0 < len(weigh(inputs, thresholds, 2)) < len(weights)
 
 
 def test_fragments_are_counted_alike_in_every_way(words):

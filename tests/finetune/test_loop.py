@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cost import UNITS, Cost, work_of
@@ -22,21 +21,6 @@ from fragprune_plugins.storage.ply import read_ply
 from fragprune_plugins.types import RasterInputs
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return tiny.random_model()
-
-
-@pytest.fixture(scope="module")
-def model(truth):
-    return tiny.perturbed(truth)
-
-
-@pytest.fixture(scope="module")
-def dataset(truth, tmp_path_factory):
-    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth)
 
 
 @pytest.fixture(scope="module")

@@ -12,28 +12,13 @@ from finetune import tiny
 from fragprune_plugins.engines.cost import UNITS, Cost, work_of
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
 from fragprune_plugins.experiments.rules import falloff_threshold
-from fragprune_plugins.finetuning import Checkpoints, finetune, loop
+from fragprune_plugins.finetuning import Checkpoints, finetune, load_dataset, loop, resuming
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import checkpoints as files
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 STEPS = 12
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return tiny.random_model()
-
-
-@pytest.fixture(scope="module")
-def model(truth):
-    return tiny.perturbed(truth)
-
-
-@pytest.fixture(scope="module")
-def dataset(truth, tmp_path_factory):
-    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth)
 
 
 class Cut(BaseException):
@@ -149,6 +134,21 @@ def test_what_a_caller_decides_is_part_of_the_configuration(model, dataset, tmp_
         run(model, dataset, settings, path, rule=other)
 
 
+def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkeypatch):
+    data, _, model = tiny.scene(tmp_path)
+    dataset, read, digest = load_dataset(data), [], resuming.digest
+    monkeypatch.setattr(resuming, "digest", lambda path: read.append(path) or digest(path))
+
+    def asked():
+        return resuming.configuration(model, None, dataset, Settings(), "cpu")["photographs"]
+
+    first = asked()
+    assert asked() == first
+    assert len(read) == len(dataset.train) + len(dataset.test)
+    read[0].write_bytes(read[0].read_bytes() + b"0")
+    assert asked() != first
+
+
 def test_a_run_that_a_step_stopped_may_go_on_and_skip_it(
     model, dataset, tmp_path, monkeypatch, single_thread
 ):
@@ -180,14 +180,6 @@ def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatc
     for cut in (5, 8):
         run(model, dataset, Settings(iterations=STEPS), path, cut=cut, monkeypatch=monkeypatch)
     require_same(whole, run(model, dataset, Settings(iterations=STEPS), path))
-
-
-@pytest.fixture
-def ctrl_c():
-    """SIGINT as at a terminal: a job in the background is started with it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("ctrl_c")

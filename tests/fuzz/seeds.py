@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from finetune import tiny
-from miniatures.vanilla_3dgs import HOST
 from PIL import Image
 from plyfile import PlyData
 
@@ -24,6 +23,24 @@ from fragprune_plugins.storage import checkpoints, records, sidecar
 from fragprune_plugins.storage.ply import write_ply
 
 CORPUS = Path(__file__).parent / "corpus"
+
+_RENDERER = b"""import math
+
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+
+from scene.gaussian_model import GaussianModel
+
+
+def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color, scaling_modifier=1.0):
+    rasterizer = GaussianRasterizer(
+        raster_settings=GaussianRasterizationSettings(
+            tanfovx=math.tan(viewpoint_camera.FoVx * 0.5), bg=bg_color, debug=pipe.debug
+        )
+    )
+    image, radii = rasterizer(means3D=pc.get_xyz, opacities=pc.get_opacity, shs=pc.get_features)
+    return {"render": image, "visibility_filter": (radii > 0).nonzero(), "radii": radii}
+"""
 
 GAUSSIANS = 3
 VIEWS = 3
@@ -156,7 +173,6 @@ def make() -> dict[str, dict[str, bytes]]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         binary, text = _scene(folder, binary=True), _scene(folder, binary=False)
-        renderer = (HOST / "gaussian_renderer" / "__init__.py").read_bytes()
         return {
             "ply": {
                 "binary.ply": model(),
@@ -182,7 +198,7 @@ def make() -> dict[str, dict[str, bytes]]:
             },
             "checkpoint": {"a.pth": _checkpoint(folder)},
             "progress": {"a.safetensors": _progress(folder)},
-            "source": {"renderer.py": renderer},
+            "source": {"renderer.py": _RENDERER},
             "git": {"head": b"ref: refs/heads/main\n", "commit": b"0123456789abcdef" * 2 + b"\n"},
             "config": {"a.json": b'{"iterations": 30000, "source_path": "scene", "lambda": 0.2}'},
             "prices": {"a.json": _prices(folder)},

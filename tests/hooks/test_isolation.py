@@ -123,7 +123,7 @@ def test_a_plugin_without_an_answer_leaves_it_to_us(hook):
         ("fragprune_create_engine", SimpleNamespace(name="mine"), "expected an engine"),
         ("fragprune_create_engine", SimpleNamespace(rasterize=print), "expected an engine"),
         ("fragprune_create_schedule", "soon", "'soon'; expected a schedule"),
-        ("fragprune_create_schedule", SimpleNamespace(at=3), "expected a schedule"),
+        ("fragprune_create_schedule", SimpleNamespace(at=print), "expected a schedule"),
         ("fragprune_select_adapter", "c-host", "'c-host'; expected one of a-host, b-host"),
         ("fragprune_select_adapter", 1, "expected one of a-host, b-host"),
         ("fragprune_truncate", 0.1, r"0\.1; expected \(60,\) floating-point thresholds"),

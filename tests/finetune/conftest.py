@@ -1,0 +1,21 @@
+"""A tiny model that is to be learned again from its pictures."""
+
+from __future__ import annotations
+
+import pytest
+from finetune import tiny
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return tiny.random_model()
+
+
+@pytest.fixture(scope="module")
+def model(truth):
+    return tiny.perturbed(truth)
+
+
+@pytest.fixture(scope="module")
+def dataset(truth, tmp_path_factory):
+    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth)
