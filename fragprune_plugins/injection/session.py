@@ -62,8 +62,9 @@ class Session(SessionState):
         if self.learn:
             ranks.expect_one()
         self._ledger = PatchLedger(self.repo.root)
-        disable: Any = torch.compiler.disable
-        enter = disable(self._enter)  # a host may compile what calls a seam
+        disable: Any = torch.compiler.disable  # a host may compile what calls a seam
+        # It imports dynamo, which takes a second, and which an optimizer imports anyway.
+        enter = disable(self._enter) if self.learn else self._enter
         try:
             self.install_stand_ins()
             for seam in self.adapter.seams_for(self.repo):
