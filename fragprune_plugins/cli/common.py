@@ -215,7 +215,20 @@ def together(*options: Callable[[Function], Function]) -> Callable[[Function], F
     return decorate
 
 
+DATA_HELP = (
+    "Scene folder: COLMAP (sparse/, images/), Blender (transforms_*.json) or nerfstudio "
+    "(transforms.json)."
+)
+
 image_options = together(
+    click.option(
+        "--images",
+        metavar="NAME",
+        default="images",
+        show_default=True,
+        help="Folder of --data with the images, such as images_4. Without images/, the largest of "
+        "images_2, images_4 and images_8 serves.",
+    ),
     click.option(
         "--resolution",
         type=click.IntRange(1, 16),
@@ -235,7 +248,7 @@ data_options = together(
         "--data",
         type=FILE,
         required=True,
-        help="Scene folder: COLMAP (sparse/, images/) or Blender (transforms_*.json).",
+        help=DATA_HELP,
     ),
     image_options,
 )
@@ -338,7 +351,7 @@ def load_shots(
         views: "test", "train" or "all".
         resolution: divisor of the images' sides, or a rule.
         white_background: whether transparent images lie over white.
-        images: name of the images' folder in a COLMAP scene.
+        images: name of the folder with the images.
         device: the device of the views.
 
     Raises:

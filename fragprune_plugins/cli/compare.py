@@ -10,6 +10,7 @@ import click
 from click.core import ParameterSource
 
 from fragprune_plugins.cli.common import (
+    DATA_HELP,
     FILE,
     Command,
     Report,
@@ -34,8 +35,7 @@ if TYPE_CHECKING:
 @click.option(
     "--data",
     type=FILE,
-    help="Scene folder: COLMAP (sparse/, images/) or Blender (transforms_*.json). Default: the "
-    "scene of the run or fine-tuning that wrote the models.",
+    help=f"{DATA_HELP} Default: that of the run or fine-tuning that wrote the models.",
 )
 @image_options
 @click.option("--out", type=FILE, help="Folder for side-by-side pictures.")
@@ -48,6 +48,7 @@ def command(
     a: Path,
     b: Path,
     data: Path | None,
+    images: str,
     resolution: int,
     white_background: bool,
     out: Path | None,
@@ -82,6 +83,8 @@ def command(
     scene = _scene(data, known)
     if ctx.get_parameter_source("resolution") is not ParameterSource.DEFAULT:
         scene = replace(scene, resolution=Resolution(resolution))
+    if ctx.get_parameter_source("images") is not ParameterSource.DEFAULT:
+        scene = replace(scene, images=images)
     scene = replace(scene, white_background=scene.white_background or white_background)
     columns = {}
     for label, path in (("A", a), ("B", b)):

@@ -108,6 +108,7 @@ def _train(
     name: str,
     model: Path,
     data: Path,
+    images: str,
     resolution: int,
     white_background: bool,
     out: Path,
@@ -129,7 +130,7 @@ def _train(
     from fragprune_plugins.experiments import results, running
 
     rasterizer, where = open_engine(engine, device, threads)
-    photographs = Photographs(data, Resolution(resolution), white_background)
+    photographs = Photographs(data, Resolution(resolution), white_background, images)
     with sigterm_interrupts():
         folder, outcomes = running.run(
             experiment,
@@ -211,6 +212,7 @@ _views_options = together(
 def _time_stages(
     models: tuple[Path, ...],
     data: Path,
+    images: str,
     resolution: int,
     white_background: bool,
     out: Path,
@@ -232,7 +234,7 @@ def _time_stages(
     from fragprune_plugins.experiments import stages
 
     drawer, where = open_engine(engine, device, threads)
-    photographs = Photographs(data, Resolution(resolution), white_background)
+    photographs = Photographs(data, Resolution(resolution), white_background, images)
     return _report(
         stages.run(
             models, photographs, out, engine=drawer, device=where, repeats=repeats, progress=True
@@ -245,6 +247,7 @@ def _time_stages(
 def _count_fragments(
     models: tuple[Path, ...],
     data: Path,
+    images: str,
     resolution: int,
     white_background: bool,
     out: Path,
@@ -265,7 +268,7 @@ def _count_fragments(
     from fragprune_plugins.experiments import fragments
 
     drawer, where = open_engine(engine, device, threads)
-    photographs = Photographs(data, Resolution(resolution), white_background)
+    photographs = Photographs(data, Resolution(resolution), white_background, images)
     return _report(
         fragments.run(models, photographs, out, engine=drawer, device=where, progress=True)
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from fragprune_plugins.cli.common import (
+    DATA_HELP,
     FILE,
     Command,
     OutFile,
@@ -58,7 +59,7 @@ def _share(
 @click.option(
     "--data",
     type=FILE,
-    help="Scene folder: COLMAP (sparse/, images/) or Blender (transforms_*.json).",
+    help=DATA_HELP,
 )
 @click.option(
     "--self",
@@ -114,6 +115,7 @@ def command(
     data: Path | None,
     itself: bool,
     cameras: Path | None,
+    images: str,
     resolution: int,
     white_background: bool,
     settings: Settings,
@@ -166,8 +168,9 @@ def command(
     from copy import deepcopy
 
     from fragprune_plugins.cli import finetuned
+    from fragprune_plugins.datasets.dataset import load_photographs
     from fragprune_plugins.datasets.photographs import Photographs, Resolution
-    from fragprune_plugins.finetuning import Checkpoints, load_dataset, resuming, save
+    from fragprune_plugins.finetuning import Checkpoints, resuming, save
     from fragprune_plugins.measure import Candidate
 
     rasterizer, where = open_engine(engine, device, threads)
@@ -176,14 +179,14 @@ def command(
     start = Candidate(whole.splat, deepcopy(whole.thresholds))  # learning changes the store
     photographs = None
     if data is not None:
-        photographs = Photographs(data, Resolution(resolution), white_background)
+        photographs = Photographs(data, Resolution(resolution), white_background, images)
     if itself:
         dataset = _own_pictures(
             whole, data, cameras, resolution, white_background, seed, rasterizer
         )
     else:
-        assert data is not None
-        dataset = load_dataset(data, resolution=resolution, white_background=white_background)
+        assert photographs is not None
+        dataset = load_photographs(photographs)
 
     checkpoints = Checkpoints(resuming.path_beside(out), every or None, tell=_say)
     asked = resuming.configuration(*whole, dataset, settings, rasterizer.name)

@@ -40,6 +40,7 @@ PANELS = 4
 def command(
     model: Path,
     data: Path,
+    images: str,
     resolution: int,
     white_background: bool,
     out: Path | None,
@@ -69,7 +70,12 @@ def command(
         writable_folder(out)
     splat, store = models.load(model, truncation=not no_truncation, device=where)
     shots = load_shots(
-        data, views, resolution=resolution, white_background=white_background, device=where
+        data,
+        views,
+        resolution=resolution,
+        white_background=white_background,
+        images=images,
+        device=where,
     )
     columns = {"untruncated": Candidate(splat)}
     if store is not None:

@@ -38,6 +38,7 @@ def command(
     out: Path,
     heatmap: bool,
     views: str,
+    images: str,
     resolution: int,
     white_background: bool,
     no_truncation: bool,
@@ -71,7 +72,9 @@ def command(
     writable_folder(out)
     splat, store = models.load(model, truncation=not no_truncation, device=where)
     if data is not None:
-        shots = load_shots(data, views, resolution=resolution, white_background=white_background)
+        shots = load_shots(
+            data, views, resolution=resolution, white_background=white_background, images=images
+        )
         named = [(shot.name, shot.view) for shot in shots]
     else:
         assert cameras is not None

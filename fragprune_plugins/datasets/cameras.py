@@ -1,22 +1,30 @@
 """Cameras without their photographs: of a file, or of a scene folder.
 
-Two kinds of file: the ``cameras.json`` a host writes beside its model (a list of ``id, img_name,
+Three kinds of file: the ``cameras.json`` a host writes beside its model (a list of ``id, img_name,
 width, height, position, rotation, fx, fy``; rotation is camera to world, principal point centred),
-and a Blender ``transforms_*.json``, which needs ``w`` and ``h`` where its images are absent.
+a transforms file, which needs ``w`` and ``h`` where its images are absent, and the
+``camera_path.json`` that nerfstudio's viewer saves (``camera_to_world`` of 16 numbers in OpenGL's
+axes, ``fov`` of the height in degrees).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from fragprune_plugins.datasets.blender import load_json, matrix, read_transforms
 from fragprune_plugins.datasets.dataset import read_scene
 from fragprune_plugins.datasets.photographs import Resolution
 from fragprune_plugins.datasets.pinhole import Camera
+from fragprune_plugins.datasets.transforms import (
+    load_json,
+    matrix,
+    opengl_pose,
+    read_transforms,
+)
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.storage.reading import Door
 from fragprune_plugins.types import View
@@ -36,8 +44,15 @@ def load_cameras(path: Path, *, white_background: bool = False) -> list[tuple[st
         DatasetError: the file is missing, broken or empty.
     """
     content = load_json(path)
-    if isinstance(content, dict):
-        cameras = [(name, camera) for name, camera, _ in read_transforms(path)]
+    if isinstance(content, dict) and "camera_path" in content:
+        with _CAMERAS.stated(path) as reading:
+            size = int(content["render_width"]), int(content["render_height"])
+            cameras = []
+            for number, entry in enumerate(content["camera_path"]):
+                reading.place = f"camera_path[{number}]"
+                cameras.append((f"{number:05d}", _of_path(entry, *size)))
+    elif isinstance(content, dict):
+        cameras = [(row.name, row.camera) for row in read_transforms(path)]
     else:
         cameras = []
         with _CAMERAS.stated(path) as reading:
@@ -60,7 +75,7 @@ def load_scene_cameras(
     """
     background = torch.full((3,), float(white_background))
     train, test = (
-        [(name, camera.view(background)) for name, camera, _ in part] for part in read_scene(folder)
+        [(row.name, row.camera.view(background)) for row in part] for part in read_scene(folder)
     )
     return train, test
 
@@ -73,6 +88,12 @@ def divided(views: list[tuple[str, View]], by: int) -> list[tuple[str, View]]:
         (name, replace(view, width=width, height=height))
         for (name, view), (width, height) in zip(views, sizes, strict=True)
     ]
+
+
+def _of_path(entry: dict[str, Any], width: int, height: int) -> Camera:
+    pose = matrix([entry["camera_to_world"][at : at + 4] for at in (0, 4, 8)], (3, 4))
+    focal = height / (2 * math.tan(math.radians(float(entry["fov"])) / 2))
+    return Camera(*opengl_pose(pose), width, height, focal, focal, width / 2, height / 2)
 
 
 def _camera(entry: dict[str, Any]) -> Camera:

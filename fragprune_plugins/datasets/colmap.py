@@ -12,15 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.datasets.pinhole import Camera
+from fragprune_plugins.datasets.images import find_image
+from fragprune_plugins.datasets.lenses import Lens
+from fragprune_plugins.datasets.pinhole import Posed, split
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.storage.reading import Door, Reading
 
-HOLD_OUT = 8
-"""Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""
-
-Row = tuple[str, Camera, Path]
-"""name, camera, image file"""
+NERFSTUDIOS = Path("colmap", "sparse", "0")
 
 _DOOR = Door(
     DatasetError,
@@ -47,30 +45,44 @@ _MODELS = {
     10: ("THIN_PRISM_FISHEYE", 12),
 }
 
-Intrinsics = tuple[int, int, float, float, float, float]
-"""width, height, fx, fy, cx, cy"""
+# The models that OpenCV can straighten: how many focal lengths, and where in OpenCV's order
+# (k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4) the parameters after cx, cy belong.
+_OPENCV: dict[str, tuple[int, tuple[int, ...]]] = {
+    "SIMPLE_PINHOLE": (1, ()),
+    "PINHOLE": (2, ()),
+    "SIMPLE_RADIAL": (1, (0,)),
+    "RADIAL": (1, (0, 1)),
+    "OPENCV": (2, (0, 1, 2, 3)),
+    "FULL_OPENCV": (2, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "OPENCV_FISHEYE": (2, (0, 1, 2, 3)),
+    "SIMPLE_RADIAL_FISHEYE": (1, (0,)),
+    "RADIAL_FISHEYE": (1, (0, 1)),
+}
 
 Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
 """name, camera id, quaternion w x y z, translation"""
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder with the cameras and images files: sparse/0 or sparse; None if neither."""
-    for candidate in (folder / "sparse" / "0", folder / "sparse"):
+    """The folder with the cameras and images files; None if there is none.
+
+    sparse/0 or sparse, as COLMAP and the hosts have it; else colmap/sparse/0, as nerfstudio has.
+    """
+    for candidate in (folder / "sparse" / "0", folder / "sparse", folder / NERFSTUDIOS):
         if any(os.path.exists(candidate / f"images.{kind}") for kind in ("bin", "txt")):
             return candidate
     return None
 
 
-def read(folder: Path, images: str = "images") -> tuple[list[Row], list[Row]]:
-    """Read training and held-out views: name, camera, image path.
+def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
+    """Read training and held-out views.
 
     Args:
         folder: the scene.
         images: name of the folder with the images.
 
     Raises:
-        DatasetError: a file is broken, a camera has distortion, or an image has no camera.
+        DatasetError: a file is broken, an image has no camera, or a lens cannot be straightened.
     """
     model = find_model(folder)
     assert model is not None, "the caller looked"
@@ -94,17 +106,32 @@ def read(folder: Path, images: str = "images") -> tuple[list[Row], list[Row]]:
                     "Export images and cameras from the same COLMAP model.",
                 )
             place = torch.tensor(translation, dtype=torch.float64)
-            camera = Camera(_rotation(quaternion), place, *cameras[camera_id])
-            rows.append((name, camera, _image_path(folder / images, name)))
-    rows.sort(key=lambda row: Path(row[0]).stem)
-    train = [row for index, row in enumerate(rows) if index % HOLD_OUT]
-    return train, rows[::HOLD_OUT]
+            lens = cameras[camera_id]
+            rows.append(
+                Posed(
+                    name,
+                    lens.camera(_rotation(quaternion), place),
+                    _image_path(folder / images, name),
+                    None if lens.straight else lens,
+                    _mask_path(folder / "masks", name),
+                )
+            )
+    return split(rows)
 
 
 def _image_path(images: Path, name: str) -> Path:
     """The image's path, by its base name as hosts do; COLMAP's name may include subfolders."""
-    full = images / name
-    return full if full.exists() else images / Path(name).name
+    full = find_image(images / name)
+    return full if full.exists() else find_image(images / Path(name).name)
+
+
+def _mask_path(masks: Path, name: str) -> Path | None:
+    """The image's mask, named as COLMAP names it (with .png at the end) or as the image."""
+    if not masks.is_dir():
+        return None
+    named = masks / f"{name}.png"
+    found = named if named.exists() else find_image(masks / name)
+    return found if found.exists() else None
 
 
 def _rotation(quaternion: tuple[float, ...]) -> Tensor:
@@ -123,19 +150,23 @@ def _rotation(quaternion: tuple[float, ...]) -> Tensor:
     )
 
 
-def _intrinsics(model: str, width: int, height: int, values: Sequence[float]) -> Intrinsics:
-    if model == "PINHOLE":
-        fx, fy, cx, cy = values
-        return width, height, fx, fy, cx, cy
-    if model == "SIMPLE_PINHOLE":
-        f, cx, cy = values
-        return width, height, f, f, cx, cy
-    raise DatasetError(
-        "COLMAP camera",
-        f"model {model}",
-        "PINHOLE or SIMPLE_PINHOLE: rasterization has no lens distortion",
-        "Undistort first: colmap image_undistorter.",
-    )
+def _lens(model: str, width: int, height: int, values: Sequence[float]) -> Lens:
+    """A lens by COLMAP's parameters of a model."""
+    if model not in _OPENCV:
+        raise DatasetError(
+            "COLMAP camera",
+            f"model {model}",
+            f"one of {', '.join(_OPENCV)}",
+            "Undistort first: colmap image_undistorter.",
+        )
+    focals, places = _OPENCV[model]
+    f, rest = values[:focals], values[focals + 2 :]
+    cx, cy = values[focals : focals + 2]
+    fisheye = model.endswith("FISHEYE")
+    bend = [0.0] * (4 if fisheye else 8)
+    for place, value in zip(places, rest, strict=True):
+        bend[place] = value
+    return Lens(width, height, f[0], f[-1], cx, cy, tuple(bend), fisheye)
 
 
 def _text_lines(reading: Reading) -> Iterator[str]:
@@ -146,12 +177,12 @@ def _text_lines(reading: Reading) -> Iterator[str]:
             yield line.decode("utf-8")
 
 
-def _cameras_text(reading: Reading) -> Iterator[tuple[int, Intrinsics]]:
+def _cameras_text(reading: Reading) -> Iterator[tuple[int, Lens]]:
     for line in _text_lines(reading):
         if line.strip():
             number, model, width, height, *values = line.split()
-            lens = [float(value) for value in values]
-            yield int(number), _intrinsics(model, int(width), int(height), lens)
+            numbers = [float(value) for value in values]
+            yield int(number), _lens(model, int(width), int(height), numbers)
 
 
 def _images_text(reading: Reading) -> Iterator[Pose]:
@@ -177,13 +208,13 @@ def _announced(reading: Reading, least: int) -> Iterator[int]:
         yield number
 
 
-def _cameras_binary(reading: Reading) -> Iterator[tuple[int, Intrinsics]]:
+def _cameras_binary(reading: Reading) -> Iterator[tuple[int, Lens]]:
     for _ in _announced(reading, least=24):
         number, code, width, height = _unpack(reading, "iiQQ")
         if code not in _MODELS:
             raise ValueError(f"camera model number {code}")
         model, count = _MODELS[code]
-        yield number, _intrinsics(model, width, height, _unpack(reading, f"{count}d"))
+        yield number, _lens(model, width, height, _unpack(reading, f"{count}d"))
 
 
 def _images_binary(reading: Reading) -> Iterator[Pose]:

@@ -1,28 +1,44 @@
-"""Loads photographs with their cameras from a COLMAP or a Blender (transforms) folder."""
+"""Loads photographs with their cameras from a COLMAP folder or one with transforms files."""
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
+import PIL.Image
 import torch
 from torch import Tensor
 
-from fragprune_plugins.datasets import blender, colmap
-from fragprune_plugins.datasets.images import image_size, opened
+from fragprune_plugins.datasets import colmap, transforms
+from fragprune_plugins.datasets.images import SUFFIXES, image_size, opened
+from fragprune_plugins.datasets.lenses import Lens
+from fragprune_plugins.datasets.memory import PICTURES, Slot
 from fragprune_plugins.datasets.photographs import Photographs, Resolution
-from fragprune_plugins.datasets.pinhole import Camera
+from fragprune_plugins.datasets.pinhole import Camera, Posed
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import View
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from fragprune_plugins.datasets.lenses import Pixels
+
 _ASPECT_TOLERANCE = 0.01
 _ROWS = 256  # of a picture, composited at a time
+_SEEN = 128  # grey levels of a mask, from which on the photograph is looked at
+_SMALLER = ("images_2", "images_4", "images_8")
+_LAYOUTS = (
+    "sparse/0 with images/ (COLMAP), or transforms_train.json (Blender) or transforms.json "
+    "(nerfstudio)"
+)
+
+log = logging.getLogger(__name__)
 
 SomeShot = TypeVar("SomeShot", bound="Shot")
 
@@ -49,6 +65,10 @@ class Shot:
         """(3, H, W) RGB on the view's device."""
         raise NotImplementedError
 
+    def looked_at(self, image: Tensor) -> Tensor:
+        """A picture of this view (3, H, W), black where the target is not to be looked at."""
+        return image
+
     def to(self: SomeShot, device: torch.device | str) -> SomeShot:
         """The same with its view on a device; ``self`` if it is there already."""
         if self.view.background.device == torch.device(device):
@@ -61,37 +81,67 @@ class Photograph(Shot):
     """One photograph with its camera; RGB in [0, 1], composited over the view's background.
 
     Attributes:
-        path: the image file. It is read at first use and kept in main memory at 8 bits a channel,
-            because a scene's photographs may be larger than a GPU's memory.
+        path: the image file. It is read at first use, and kept in main memory at 8 bits a channel
+            as long as there is room: a scene's photographs may be larger than any memory.
+        camera: of the whole photograph, straightened; None if ``lens`` is.
+        lens: what bends the photograph; None if it is straight.
+        mask: an image of the same aspect. The photograph is black where this is.
     """
 
     path: Path
+    camera: Camera | None = None
+    lens: Lens | None = None
+    mask: Path | None = None
+    _pixels: Slot = field(default_factory=Slot, repr=False)
 
     __repr__ = one_line
 
     @property
     def image(self) -> Tensor:
         """(3, H, W) RGB in [0, 1] on the view's device."""
-        return self._bytes.to(self.view.background.device).permute(2, 0, 1).float() / 255
+        return self._read()[..., :3].permute(2, 0, 1).float() / 255
 
-    @cached_property
-    def _bytes(self) -> Tensor:
+    def looked_at(self, image: Tensor) -> Tensor:
+        """A picture of this view (3, H, W), black where the mask is."""
+        return image if self.mask is None else image * (self._read()[..., 3] > 0)
+
+    def _read(self) -> Tensor:
+        """(H, W, 3) uint8, or 4 with a mask, on the view's device."""
+        return PICTURES.get(self._pixels, self._load).to(self.view.background.device)
+
+    def _load(self) -> Tensor:
+        size = (self.view.width, self.view.height)
         with opened(self.path) as file:
-            picture = file.convert("RGBA") if "A" in file.getbands() else file.convert("RGB")
-            size = (self.view.width, self.view.height)
-            if picture.size != size:
-                picture = picture.resize(size)
-        values = np.asarray(picture)
-        if values.shape[2] == 3:
-            return torch.from_numpy(values.copy())
-        behind = 255 * self.view.background.cpu().numpy()
-        flat = np.empty((*values.shape[:2], 3), np.uint8)
-        for begin in range(0, len(values), _ROWS):  # as floats, a large picture takes gigabytes
-            rows = values[begin : begin + _ROWS]
-            alpha = rows[..., 3:].astype(np.float32) / 255
-            over = rows[..., :3] * alpha + behind * (1 - alpha)
-            flat[begin : begin + _ROWS] = np.round(over).astype(np.uint8)
+            transparent = "A" in file.getbands() or "transparency" in file.info
+            picture = self._fitted(file.convert("RGBA" if transparent else "RGB"), size)
+        flat = _over(picture, 255 * self.view.background.cpu().numpy())
+        if self.mask is not None:
+            with opened(self.mask) as file:
+                seen = self._fitted(file.convert("L"), size) >= _SEEN
+            shown = seen[..., None].astype(np.uint8)
+            flat = np.concatenate([flat * shown, shown], axis=2)
         return torch.from_numpy(flat)
+
+    def _fitted(self, picture: Image, size: tuple[int, int]) -> Pixels:
+        """The pixels of a picture, straightened and of the view's size."""
+        if self.lens is not None:
+            assert self.camera is not None
+            straight = self.lens.straighten(np.asarray(picture), self.camera)
+            picture = PIL.Image.fromarray(straight)
+        return np.array(picture if picture.size == size else picture.resize(size))
+
+
+def _over(picture: Pixels, behind: np.ndarray[Any, Any]) -> Pixels:
+    """A picture (H, W, 3 or 4) over a colour (3,) in [0, 255]."""
+    if picture.shape[2] == 3:
+        return picture
+    flat = np.empty((*picture.shape[:2], 3), np.uint8)
+    for begin in range(0, len(picture), _ROWS):  # as floats, a large picture takes gigabytes
+        rows = picture[begin : begin + _ROWS]
+        alpha = rows[..., 3:].astype(np.float32) / 255
+        over = rows[..., :3] * alpha + behind * (1 - alpha)
+        flat[begin : begin + _ROWS] = np.round(over).astype(np.uint8)
+    return flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +184,7 @@ def load_dataset(
     white_background: bool = False,
     images: str = "images",
 ) -> Dataset:
-    """Read a COLMAP folder (sparse/, images/) or a Blender one (transforms_train/test.json).
+    """Read a COLMAP folder (sparse/, images/), or Blender's or nerfstudio's transforms files.
 
     COLMAP holds out every 8th view of the sorted names, as hosts do. Images whose size differs
     from their camera's are accepted when the aspect agrees to 1 %: intrinsics scale with them.
@@ -143,29 +193,29 @@ def load_dataset(
         folder: the scene.
         resolution: a divisor of the images' sides, or a ``Resolution``.
         white_background: composite images with alpha over white instead of black, and render so.
-        images: name of the image folder of a COLMAP scene.
+        images: name of the image folder, if it is not ``images`` or not what the transforms say.
+            Without ``images/``, the largest of ``images_2``, ``images_4`` and ``images_8`` serves.
 
     Raises:
         DatasetError: the folder has neither layout or both, an image is missing, a camera model is
-            unknown, or sizes do not match.
+            unknown, a lens cannot be straightened, or sizes do not match.
     """
     background = torch.full((3,), float(white_background))
     size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
     train, test = (
-        [make_shot(name, camera, path, background, size) for name, camera, path in part]
-        for part in read_scene(folder, images)
+        [make_shot(row, background, size) for row in part] for part in read_scene(folder, images)
     )
     return Dataset(train, test)
 
 
-def read_scene(folder: Path, images: str = "images") -> tuple[list[colmap.Row], list[colmap.Row]]:
+def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
     """Read the training and the held-out cameras of a scene, and where their images should be.
 
     No image is opened, but for the size of one whose transforms file has no ``w`` and ``h``.
 
     Args:
         folder: the scene.
-        images: name of the image folder of a COLMAP scene.
+        images: name of the image folder; see ``load_dataset``.
 
     Raises:
         DatasetError: the folder has neither layout or both, a file is broken, a camera model is
@@ -176,16 +226,16 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[colmap.Row], 
         raise DatasetError(
             str(folder), "no such folder", "a folder with photographs", "Check --data."
         )
-    is_colmap = colmap.find_model(folder) is not None
-    is_blender = os.path.exists(folder / "transforms_train.json")
-    layouts = "sparse/0 with images/ (COLMAP), or transforms_train.json (Blender)"
-    if is_colmap == is_blender:
-        found = "both a COLMAP and a Blender layout" if is_colmap else "neither layout"
-        remedy = (
-            "Move one of the two aside." if is_colmap else "Pass the folder that contains them."
+    model = colmap.find_model(folder)
+    has_transforms = transforms.has_transforms(folder)
+    if model is not None and has_transforms and model != folder / colmap.NERFSTUDIOS:
+        raise DatasetError(
+            str(folder), "both COLMAP's and a transforms layout", _LAYOUTS, "Move one aside."
         )
-        raise DatasetError(str(folder), found, layouts, remedy)
-    train, test = colmap.read(folder, images) if is_colmap else blender.read(folder)
+    if model is None and not has_transforms:
+        raise DatasetError(str(folder), "neither layout", _LAYOUTS, _where_else(folder))
+    images = _image_folder(folder, images)
+    train, test = (transforms if has_transforms else colmap).read(folder, images)
     for name, part in (("training", train), ("held-out", test)):
         if not part:
             raise DatasetError(
@@ -197,20 +247,40 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[colmap.Row], 
     return train, test
 
 
-def make_shot(
-    name: str, camera: Camera, path: Path, background: Tensor, resolution: Resolution
-) -> Photograph:
+def _where_else(folder: Path) -> str:
+    """What to do about a folder that is no scene."""
+    for other in (folder.parent, *sorted(each for each in folder.iterdir() if each.is_dir())):
+        if colmap.find_model(other) is not None or transforms.has_transforms(other):
+            return f"Pass {other}."
+    if any(each.suffix.lower() in SUFFIXES for each in folder.iterdir()):
+        return "These images have no cameras; run COLMAP on them first."
+    return "Pass the folder that contains them."
+
+
+def _image_folder(folder: Path, images: str) -> str:
+    """The image folder asked for; a smaller one in place of an ``images/`` that is not there."""
+    if images == "images" and not (folder / images).exists():
+        for smaller in _SMALLER:
+            if (folder / smaller).is_dir():
+                log.warning("%s: no images/; reading the photographs of %s/", folder, smaller)
+                return smaller
+    return images
+
+
+def make_shot(row: Posed, background: Tensor, resolution: Resolution) -> Photograph:
     """Pair an image file with its camera. This reads only the file's header.
 
     Raises:
         DatasetError: the file is missing or unreadable, or its size does not fit the camera.
     """
-    width, height = image_size(path)
+    width, height = image_size(row.image)
+    camera = row.camera
     if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT_TOLERANCE:
         raise DatasetError(
-            str(path),
+            str(row.image),
             f"{width}x{height} pixels",
             f"those of its camera, {camera.width}x{camera.height}, or that aspect",
             "Use the images that the cameras were calibrated with.",
         )
-    return Photograph(name, camera.resized(*resolution.of(width, height)).view(background), path)
+    view = camera.resized(*resolution.of(width, height)).view(background)
+    return Photograph(row.name, view, row.image, camera, row.lens, row.mask)

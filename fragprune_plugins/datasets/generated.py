@@ -15,7 +15,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from fragprune_plugins.datasets.colmap import HOLD_OUT
+from fragprune_plugins.datasets.pinhole import HOLD_OUT
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import View

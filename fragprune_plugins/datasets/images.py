@@ -30,6 +30,29 @@ DOOR = Door(
 )
 
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+
+
+def find_image(path: Path) -> Path:
+    """The image file that a scene lists: the path, or one of its folder and stem.
+
+    Scenes list images without a suffix (Blender's), or with that of the images before they were
+    made smaller or renamed (.JPG, .png).
+
+    Returns:
+        The path of the file; the path as it came if there is no file, or more than one.
+    """
+    if path.is_file():
+        return path
+    stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
+    try:
+        beside = [each for each in path.parent.iterdir() if each.stem == stem]
+    except OSError:
+        return path
+    found = [each for each in beside if each.suffix.lower() in SUFFIXES]
+    return found[0] if len(found) == 1 else path
+
+
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Image]:
     """Open an image for the length of a block; its pixels are read on use.

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import View, check_lens, check_pose
+
+if TYPE_CHECKING:
+    from fragprune_plugins.datasets.lenses import Lens
 
 
 @dataclass(frozen=True)
@@ -79,3 +84,31 @@ class Camera:
             campos=exact.campos.float(),
             background=torch.zeros(3) if background is None else background,
         )
+
+
+HOLD_OUT = 8
+"""Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""
+
+
+class Posed(NamedTuple):
+    """A photograph that a scene lists, before any of its pixels is read.
+
+    Attributes:
+        name: unique in the scene.
+        camera: of the straightened photograph.
+        image: the file.
+        lens: what straightens it; None if it is straight.
+        mask: a picture of the same aspect, black where the photograph is to be ignored.
+    """
+
+    name: str
+    camera: Camera
+    image: Path
+    lens: Lens | None = None
+    mask: Path | None = None
+
+
+def split(rows: list[Posed]) -> tuple[list[Posed], list[Posed]]:
+    """The training views and the held-out views of a scene that does not say which they are."""
+    ordered = sorted(rows, key=lambda row: Path(row.name).stem)
+    return [row for index, row in enumerate(ordered) if index % HOLD_OUT], ordered[::HOLD_OUT]

@@ -453,7 +453,7 @@ class _Run:
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
         stage.picture = shot.name
         outputs, pressure = self._draw(shot)
-        loss = photometric_loss(outputs.image, shot.image)
+        loss = photometric_loss(shot.looked_at(outputs.image), shot.image)
         stage.lost(loss)
         torch.autograd.backward(loss if pressure is None else loss + pressure)
         rates = self.rates.items()

@@ -152,10 +152,17 @@ def _of(shot: Shot) -> Iterable[Tensor | str]:
     yield f"{shot.name} {shot.view.width} {shot.view.height} {shot.target}"
     yield from (shot.view.viewmatrix, shot.view.projmatrix, shot.view.background)
     if isinstance(shot, Photograph):
-        with DOOR.reading(shot.path) as reading:
-            version = os.fstat(reading.file.fileno())
-            content = _photograph(shot.path, version.st_mtime_ns, version.st_size)
-        yield content
+        yield _content(shot.path)
+        if shot.lens is not None:
+            yield repr(shot.lens)
+        if shot.mask is not None:
+            yield _content(shot.mask)
+
+
+def _content(image: Path) -> str:
+    with DOOR.reading(image) as reading:
+        version = os.fstat(reading.file.fileno())
+    return _photograph(image, version.st_mtime_ns, version.st_size)
 
 
 @lru_cache(maxsize=10_000)  # a command asks for its configuration more than once

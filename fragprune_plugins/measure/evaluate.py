@@ -105,10 +105,11 @@ def measure(
         rows = []
         for shot in shots:
             outputs = candidate.draw(engine, shot.view, splats)
+            seen = shot.looked_at(outputs.image)
             rows.append(
                 (
-                    psnr(outputs.image, shot.image),
-                    ssim(outputs.image, shot.image),
+                    psnr(seen, shot.image),
+                    ssim(seen, shot.image),
                     float(outputs.fragments_per_pixel),
                     float(outputs.evaluated_per_pixel),
                     float(outputs.entries_per_pixel),

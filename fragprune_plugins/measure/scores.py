@@ -96,7 +96,7 @@ def keep_needed(
     with torch.no_grad():
         for shot in shots:
             image = drawer.rasterize(RasterInputs(shot.view, splats, planes=()), thresholds).image
-            error += float((image.clamp(0, 1) - shot.image).square().sum())
+            error += float((shot.looked_at(image).clamp(0, 1) - shot.image).square().sum())
     views = _bar([shot.view for shot in shots], progress)
     each, least = removal_error(splat, thresholds, views, drawer).double().sort(stable=True)
     spared = int((each.cumsum(0) <= SPARE * error).sum())

@@ -212,6 +212,6 @@ def _held_out(
     for shot in shots:
         shot = shot.to(splats.device)
         outputs = candidate.draw(engine, shot.view, splats)
-        figures.append(psnr(outputs.image, shot.image))
+        figures.append(psnr(shot.looked_at(outputs.image), shot.image))
         fragments.append(float(outputs.fragments_per_pixel))
     return figures, statistics.fmean(fragments)

@@ -280,8 +280,8 @@ def test_a_camera_that_is_none_is_refused_with_its_place(tmp_path, how):
         (EYE, {"cx": NAN}),
         (EYE, {"frames": [3]}),
         (EYE, {"frames": 3}),
-        (EYE, {"k5": 0.1}),
-        (EYE, {"camera_model": "OPENCV_FISHEYE"}),
+        (EYE, {"k1": 1e30}),
+        (EYE, {"camera_model": "EQUIRECTANGULAR"}),
     ],
 )
 def test_transforms_that_are_none_are_refused(tmp_path, matrix, changed):

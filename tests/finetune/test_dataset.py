@@ -110,7 +110,7 @@ def break_scene(folder: Path, images, how: str) -> None:
     if how == "empty":
         folder.mkdir()
         return
-    if how in ("no test file", "no frames", "not json", "distorted transforms"):
+    if how in ("no test file", "no frames", "not json", "unknown lens of transforms"):
         tiny.write_blender(folder, images)
         path = folder / "transforms_test.json"
         content = json.loads(path.read_text())
@@ -122,11 +122,11 @@ def break_scene(folder: Path, images, how: str) -> None:
         elif how == "not json":
             path.write_text("{")
         else:
-            path.write_text(json.dumps(content | {"k1": 0.1}))
+            path.write_text(json.dumps(content | {"camera_model": "EQUIRECTANGULAR"}))
         return
     binary = "binary" in how
     tiny.write_colmap(
-        folder, images, binary=binary, model="OPENCV" if "distortion" in how else "PINHOLE"
+        folder, images, binary=binary, model="FOV" if "unknown lens" in how else "PINHOLE"
     )
     if how == "both":
         tiny.write_blender(folder, images)
@@ -154,9 +154,9 @@ def break_scene(folder: Path, images, how: str) -> None:
 MESSAGES = {
     "no folder": "no such folder",
     "empty": "neither layout",
-    "both": "both a COLMAP and a Blender layout",
-    "distortion": "model OPENCV.*image_undistorter",
-    "distortion binary": "model OPENCV.*image_undistorter",
+    "both": "both COLMAP's and a transforms layout",
+    "unknown lens": "model FOV.*image_undistorter",
+    "unknown lens binary": "model FOV.*image_undistorter",
     "image missing": "view03.png: no such image",
     "image broken": "view03.png: not readable",
     "image size": "32x24 pixels.*32x32",
@@ -168,7 +168,7 @@ MESSAGES = {
     "no test file": "transforms_test.json: no such file",
     "no frames": "not a transforms file",
     "not json": "not readable as JSON",
-    "distorted transforms": r"lens distortion \(k1\)",
+    "unknown lens of transforms": "camera_model 'EQUIRECTANGULAR'",
 }
 
 

@@ -89,9 +89,9 @@ def write_colmap(
     parameters = {
         "PINHOLE": [FOCAL, FOCAL, half, half],
         "SIMPLE_PINHOLE": [FOCAL, half, half],
-        "OPENCV": [FOCAL, FOCAL, half, half, 0.1, 0.0, 0.0, 0.0],
+        "FOV": [FOCAL, FOCAL, half, half, 0.9],
     }[model]
-    code = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "OPENCV": 4}[model]
+    code = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "FOV": 7}[model]
     poses = [
         (f"view{i:02d}.png", quaternion(camera.rotation), camera.translation.tolist())
         for i, camera in enumerate(cameras())

@@ -1,0 +1,226 @@
+"""What people have on disk: nerfstudio's folder, smaller images, other suffixes, masks."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from finetune import tiny
+from PIL import Image
+
+from fragprune_plugins.datasets.cameras import load_cameras
+from fragprune_plugins.datasets.dataset import load_dataset
+from fragprune_plugins.datasets.memory import Pictures, Slot
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.finetuning.loop import photometric_loss
+from fragprune_plugins.measure import Candidate, measure
+
+NAMES = [f"view{i:02d}" for i in range(9)]
+
+
+@pytest.fixture(scope="module")
+def images():
+    return tiny.photographs(tiny.random_model())
+
+
+def stems(shots):
+    return [Path(shot.name).stem for shot in shots]
+
+
+def write_nerfstudio(folder: Path, images, **more: object) -> Path:
+    """images/ and transforms.json, as ns-process-data leaves them, with names out of order."""
+    for name, image in zip(NAMES, images, strict=True):
+        tiny.save_png(folder / "images" / f"{name}.png", image)
+    content = tiny.transforms([f"images/{name}.png" for name in NAMES], tiny.cameras())
+    content["frames"].reverse()
+    content |= {"w": tiny.SIDE, "h": tiny.SIDE, "applied_transform": torch.eye(4)[:3].tolist()}
+    (folder / "transforms.json").write_text(json.dumps(content | more))
+    return folder
+
+
+def test_nerfstudios_folder_holds_out_every_eighth_name(tmp_path, images):
+    data = load_dataset(write_nerfstudio(tmp_path, images))
+    assert stems(data.test) == ["view00", "view08"]
+    assert stems(data.train) == NAMES[1:8]
+    torch.testing.assert_close(data.train[2].view.viewmatrix, tiny.cameras()[3].view().viewmatrix)
+
+
+def test_nerfstudios_file_may_say_which_views_are_held_out(tmp_path, images):
+    listed = {
+        "train_filenames": [f"images/{name}.png" for name in NAMES[:5]],
+        "val_filenames": ["images/view06.png"],
+        "test_filenames": ["images/view06.png", "images/view07.png"],
+    }
+    data = load_dataset(write_nerfstudio(tmp_path, images, **listed))
+    assert sorted(stems(data.train)) == NAMES[:5]
+    assert sorted(stems(data.test)) == ["view06", "view07"]
+
+
+def test_nerfstudios_file_goes_before_its_colmap_model(tmp_path, images):
+    write_nerfstudio(tmp_path, images)
+    tiny.write_colmap(tmp_path / "colmap", images)
+    assert len(load_dataset(tmp_path).train) == 7
+    (tmp_path / "transforms.json").unlink()
+    assert stems(load_dataset(tmp_path).train) == NAMES[1:8]  # colmap/sparse/0 with images/
+
+
+def test_a_smaller_image_folder_serves_and_is_named(tmp_path, images, caplog):
+    tiny.write_colmap(tmp_path, images)
+    (tmp_path / "images").rename(tmp_path / "images_4")
+    with caplog.at_level(logging.WARNING):
+        load_dataset(tmp_path)
+    assert "reading the photographs of images_4/" in caplog.text
+
+
+@pytest.mark.parametrize("write", [tiny.write_colmap, write_nerfstudio])
+def test_the_image_folder_can_be_chosen(tmp_path, images, write):
+    write(tmp_path, images)
+    for name in NAMES:
+        half = Image.new("RGB", (tiny.SIDE // 2,) * 2, (255, 0, 0))
+        (tmp_path / "images_2").mkdir(exist_ok=True)
+        half.save(tmp_path / "images_2" / f"{name}.png")
+    shot = load_dataset(tmp_path, images="images_2").train[0]
+    assert shot.image.shape == (3, tiny.SIDE // 2, tiny.SIDE // 2)
+    assert float(shot.image[0].min()) == 1.0
+    assert shot.view.tan_fov_x == pytest.approx(tiny.SIDE / (2 * tiny.FOCAL))
+
+
+@pytest.mark.parametrize("suffix", [".JPG", ".jpeg", ".PNG", ".webp"])
+def test_images_under_another_suffix_are_found(tmp_path, images, suffix):
+    tiny.write_colmap(tmp_path, images)
+    for path in list((tmp_path / "images").iterdir()):
+        with Image.open(path) as picture:
+            picture.save(path.with_suffix(suffix))
+        if path.with_suffix(suffix).name.lower() != path.name:
+            path.unlink()
+        elif suffix != ".png":
+            path.unlink(missing_ok=True)
+    shot = load_dataset(tmp_path).train[0]
+    assert shot.path.suffix == suffix
+    assert shot.image.shape == (3, tiny.SIDE, tiny.SIDE)
+
+
+def test_two_images_of_one_stem_are_not_guessed_between(tmp_path, images):
+    tiny.write_colmap(tmp_path, images)
+    path = tmp_path / "images" / "view03.png"
+    with Image.open(path) as picture:
+        picture.save(path.with_suffix(".jpg"))
+        picture.save(path.with_suffix(".webp"))
+    path.unlink()
+    with pytest.raises(DatasetError, match=r"view03\.png: no such image"):
+        load_dataset(tmp_path)
+
+
+def test_the_right_folder_is_named_where_another_was_given(tmp_path, images):
+    scene = tiny.write_colmap(tmp_path / "scene", images)
+    for wrong in (scene / "images", tmp_path):
+        with pytest.raises(DatasetError, match=f"neither layout.*Pass {scene}"):
+            load_dataset(wrong)
+
+
+def test_photographs_without_cameras_are_told_apart(tmp_path, images):
+    tiny.save_png(tmp_path / "a.png", images[0])
+    with pytest.raises(DatasetError, match="run COLMAP on them first"):
+        load_dataset(tmp_path)
+
+
+def mask_half(path: Path) -> None:
+    mask = np.zeros((tiny.SIDE, tiny.SIDE), np.uint8)
+    mask[:, tiny.SIDE // 2 :] = 255
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(mask).save(path)
+
+
+@pytest.mark.parametrize("name", ["view01.png.png", "view01.png"])
+def test_colmaps_masks_hide_a_part_of_the_photograph(tmp_path, images, name):
+    tiny.write_colmap(tmp_path, images)
+    mask_half(tmp_path / "masks" / name)
+    shot, other = load_dataset(tmp_path).train[:2]
+    half = tiny.SIDE // 2
+    assert float(shot.image[..., :half].abs().max()) == 0
+    torch.testing.assert_close(shot.image[..., half:], images[1][..., half:], atol=0.002, rtol=0)
+    assert other.mask is None
+
+
+def test_what_a_mask_hides_neither_teaches_nor_counts(tmp_path, images):
+    write_nerfstudio(tmp_path, images)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["mask_path"] = "masks/half.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    mask_half(tmp_path / "masks" / "half.png")
+    data = load_dataset(tmp_path)
+    shot = data.train[0]
+    drawn = images[1].clone().requires_grad_()
+    hidden = torch.ones(3, tiny.SIDE, tiny.SIDE)
+    hidden[..., tiny.SIDE // 2 :] = 0
+    photometric_loss(shot.looked_at(drawn + 5 * hidden), shot.image).backward()
+    assert drawn.grad is not None
+    assert float((drawn.grad * hidden).abs().max()) == 0
+    assert float((drawn.grad * (1 - hidden)).abs().max()) > 0
+    with_mask = measure([Candidate(tiny.random_model())], data.test, repeats=1)[0]["psnr"]
+    for path in (tmp_path / "images").iterdir():  # what the mask hides changes
+        with Image.open(path) as picture:
+            pixels = np.array(picture)
+        pixels[:, : tiny.SIDE // 2] = 255
+        Image.fromarray(pixels).save(path)
+    again = measure([Candidate(tiny.random_model())], load_dataset(tmp_path).test, repeats=1)
+    assert again[0]["psnr"] == with_mask
+
+
+def test_the_path_that_nerfstudios_viewer_saves(tmp_path):
+    want = tiny.cameras()[3]
+    frame = tiny.transforms(["a"], [want])["frames"][0]
+    entry = {
+        "camera_to_world": [number for row in frame["transform_matrix"] for number in row],
+        "fov": math.degrees(2 * math.atan(tiny.SIDE / (2 * tiny.FOCAL))),
+        "aspect": 1.0,
+    }
+    content = {"camera_path": [entry], "render_width": tiny.SIDE, "render_height": tiny.SIDE}
+    (tmp_path / "camera_path.json").write_text(json.dumps(content))
+    ((_, view),) = load_cameras(tmp_path / "camera_path.json")
+    torch.testing.assert_close(view.projmatrix, want.view().projmatrix)
+
+
+def test_pictures_are_kept_only_while_there_is_room():
+    loads: list[int] = []
+
+    def loader(number: int):
+        def load() -> torch.Tensor:
+            loads.append(number)
+            return torch.full((100,), number, dtype=torch.uint8)
+
+        return load
+
+    kept, slots = Pictures(room=250), [Slot() for _ in range(5)]
+    for number in (0, 1, 0, 2, 0, 1):  # 1 was not used for longest when 2 came
+        assert int(kept.get(slots[number], loader(number))[0]) == number
+        assert kept.size <= 250
+    assert loads == [0, 1, 2, 1]
+
+
+def test_pictures_larger_than_the_room_are_kept_one_at_a_time():
+    kept = Pictures(room=10)
+    slots = [Slot() for _ in range(3)]
+    for slot in slots:
+        kept.get(slot, lambda: torch.zeros(100, dtype=torch.uint8))
+        assert kept.size == 100
+
+
+def test_a_forgotten_photograph_takes_its_pixels_along():
+    kept = Pictures(room=1000)
+    for _ in range(50):
+        kept.get(Slot(), lambda: torch.zeros(100, dtype=torch.uint8))
+    assert kept.size == 0
+
+
+def test_copies_of_a_photograph_share_its_pixels(tmp_path, images):
+    shot = load_dataset(tiny.write_colmap(tmp_path, images)).train[0]
+    assert shot.image.shape == (3, tiny.SIDE, tiny.SIDE)
+    shot.path.unlink()
+    assert torch.equal(shot.to("cpu").image, shot.image)
