@@ -10,6 +10,7 @@ import click
 
 from fragprune_plugins.cli.common import (
     FILE,
+    MODEL,
     Command,
     OutFile,
     Report,
@@ -46,7 +47,7 @@ def _size(text: str) -> tuple[int, int]:
     show_default=True,
     help="Number of Gaussians in the generated scene; may be given several times.",
 )
-@click.option("--model", type=FILE, help="Time this .ply with its own thresholds instead.")
+@click.option("--model", type=MODEL, help="Time this .ply with its own thresholds instead.")
 @click.option("--cameras", type=FILE, help="With --model: file of cameras; the first one draws.")
 @click.option(
     "--repeats",

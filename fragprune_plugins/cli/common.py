@@ -7,16 +7,18 @@ import functools
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from fragprune_plugins.errors import (
     FragpruneError,
     Interrupted,
     MemoryLimitError,
+    ModelFileError,
     OutputError,
     PathError,
     Terminated,
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     import torch
 
     from fragprune_plugins.datasets.dataset import Shot
-    from fragprune_plugins.datasets.photographs import Resolution
+    from fragprune_plugins.datasets.photographs import Photographs
     from fragprune_plugins.engines import Engine
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -55,6 +57,30 @@ class OutFile(click.Path):
         if path.suffix.lower() != self.suffix:
             self.fail(f"'{path}' does not end with {self.suffix}.", param, ctx)
         return path
+
+
+class ModelFile(click.Path):
+    """Type of an argument for a model: its file, or the output folder of a training."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The file; of an output folder that of the highest iteration, which is named on stderr."""
+        path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
+        if not path.is_dir():
+            return path
+        from fragprune_plugins.hosts.graphdeco.output import newest_model
+
+        try:
+            found = newest_model(path)
+        except ModelFileError as error:
+            self.fail(f"'{path}' is {error.found}. {error.remedy}", param, ctx)
+        click.echo(f"Model: {found}", err=True)
+        return found
+
+
+MODEL = ModelFile()
 
 
 def require_place(out: Path, model: Path) -> None:
@@ -220,6 +246,8 @@ DATA_HELP = (
     "(transforms.json)."
 )
 
+TRAINED_ON = "Default: the photographs that MODEL was trained on, by the cfg_args of its host."
+
 image_options = together(
     click.option(
         "--images",
@@ -244,13 +272,7 @@ image_options = together(
 )
 
 data_options = together(
-    click.option(
-        "--data",
-        type=FILE,
-        required=True,
-        help=DATA_HELP,
-    ),
-    image_options,
+    click.option("--data", type=FILE, help=f"{DATA_HELP} {TRAINED_ON}"), image_options
 )
 
 
@@ -304,6 +326,48 @@ views_option = click.option(
 )
 
 
+def photographs_for(
+    model: Path,
+    data: Path | None,
+    images: str,
+    resolution: int,
+    white_background: bool,
+    *,
+    remedy: str = "Name the scene's folder with --data.",
+) -> Photographs:
+    """The photographs that the options name; without --data those that the model was trained on.
+
+    Options that were given override what the training says.
+
+    Raises:
+        UsageError: there is no folder, and the model lies in no output folder with arguments.
+        DatasetError: the training's arguments cannot be read.
+    """
+    from fragprune_plugins.datasets.photographs import Photographs, Resolution
+    from fragprune_plugins.hosts.graphdeco.output import ARGUMENTS, trained_on
+
+    if data is not None:
+        return Photographs(data, Resolution(resolution), white_background, images)
+    known = trained_on(model)
+    if known is None:
+        raise UsageError(
+            "--data",
+            f"no folder, and no {ARGUMENTS} of a training around {model}",
+            "photographs",
+            remedy,
+        )
+    given = click.get_current_context().get_parameter_source
+    changed: dict[str, Any] = {}
+    if given("images") is not ParameterSource.DEFAULT:
+        changed["images"] = images
+    if given("resolution") is not ParameterSource.DEFAULT:
+        changed["resolution"] = Resolution(resolution)
+    if white_background:
+        changed["white_background"] = True
+    click.echo(f"Photographs: {known.folder}, which the model was trained on", err=True)
+    return replace(known, **changed)
+
+
 def bound_threads(threads: int | None) -> None:
     """Limit torch and the engines to this many CPU threads; None sets no limit."""
     if threads is not None:
@@ -336,32 +400,21 @@ def open_engine(engine: str, device: str, threads: int | None) -> tuple[Engine, 
 
 
 def load_shots(
-    folder: Path,
-    views: str,
-    *,
-    resolution: int | Resolution,
-    white_background: bool,
-    images: str = "images",
-    device: torch.device | str = "cpu",
+    photographs: Photographs, views: str, device: torch.device | str = "cpu"
 ) -> Sequence[Shot]:
     """Load the views of a scene folder onto a device.
 
     Args:
-        folder: the scene.
+        photographs: the scene, and how its images are read.
         views: "test", "train" or "all".
-        resolution: divisor of the images' sides, or a rule.
-        white_background: whether transparent images lie over white.
-        images: name of the folder with the images.
         device: the device of the views.
 
     Raises:
         DatasetError: the folder cannot be read as a scene.
     """
-    from fragprune_plugins.datasets.dataset import load_dataset
+    from fragprune_plugins.datasets.dataset import load_photographs
 
-    dataset = load_dataset(
-        folder, resolution=resolution, white_background=white_background, images=images
-    ).to(device)
+    dataset = load_photographs(photographs).to(device)
     return {
         "test": dataset.test,
         "train": dataset.train,

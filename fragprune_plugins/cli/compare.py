@@ -12,6 +12,7 @@ from click.core import ParameterSource
 from fragprune_plugins.cli.common import (
     DATA_HELP,
     FILE,
+    MODEL,
     Command,
     Report,
     engine_options,
@@ -30,12 +31,12 @@ if TYPE_CHECKING:
 
 
 @click.command("compare", cls=Command)
-@click.argument("a", type=FILE)
-@click.argument("b", type=FILE)
+@click.argument("a", type=MODEL)
+@click.argument("b", type=MODEL)
 @click.option(
     "--data",
     type=FILE,
-    help=f"{DATA_HELP} Default: that of the run or fine-tuning that wrote the models.",
+    help=f"{DATA_HELP} Default: that of the training, run or fine-tuning that wrote the models.",
 )
 @image_options
 @click.option("--out", type=FILE, help="Folder for side-by-side pictures.")
@@ -72,7 +73,7 @@ def command(
     from fragprune_plugins.cli.profile import draw_panels
     from fragprune_plugins.datasets.photographs import Resolution
     from fragprune_plugins.measure import Candidate, measure
-    from fragprune_plugins.measure.wording import describe, gain, nothing_drawn
+    from fragprune_plugins.measure.wording import describe, gain, nothing_drawn, strangers
     from fragprune_plugins.storage import records
     from fragprune_plugins.storage.atomic import writable_folder
 
@@ -80,7 +81,7 @@ def command(
     if out is not None:
         writable_folder(out)
     known = _records(a, b)
-    scene = _scene(data, known)
+    scene = _scene(data, known, a, b)
     if ctx.get_parameter_source("resolution") is not ParameterSource.DEFAULT:
         scene = replace(scene, resolution=Resolution(resolution))
     if ctx.get_parameter_source("images") is not ParameterSource.DEFAULT:
@@ -92,14 +93,7 @@ def command(
         filtered, drawing = (how.filtered, how.drawing) if how else (False, {})
         model = models.load(path, truncation=not no_truncation, filtered=filtered, device=where)
         columns[label] = Candidate(*model, drawing)
-    shots = load_shots(
-        scene.folder,
-        views,
-        resolution=scene.resolution,
-        white_background=scene.white_background,
-        images=scene.images,
-        device=where,
-    )
+    shots = load_shots(scene, views, where)
     first, second = measure(list(columns.values()), shots, engine=rasterizer)
     report: dict[str, Any] = {
         "a": {"model": str(a)} | first,
@@ -110,7 +104,8 @@ def command(
         "engine": rasterizer.name,
         "device": first["device"],
         "scene": scene.as_dict(),
-        "warnings": nothing_drawn([each["fragments_per_pixel"] for each in (first, second)]),
+        "warnings": nothing_drawn([each["fragments_per_pixel"] for each in (first, second)])
+        + strangers(first, second),
     }
     size = f"{shots[0].view.width}x{shots[0].view.height} pixels"
     lines = [
@@ -142,15 +137,21 @@ def _records(*models: Path) -> dict[Path, Recorded]:
     return known
 
 
-def _scene(data: Path | None, known: dict[Path, Recorded]) -> Photographs:
-    """The photographs to measure on: those of the records, in the folder ``data`` if given.
+def _scene(data: Path | None, known: dict[Path, Recorded], *models: Path) -> Photographs:
+    """The photographs to measure on, in the folder ``data`` if given.
+
+    Those of the records; without records, those that the models were trained on.
 
     Raises:
-        UsageError: there is no folder, and the records are missing or differ.
+        UsageError: there is no folder, and nothing says which, or the models differ in it.
+        DatasetError: a training's arguments cannot be read.
     """
     from fragprune_plugins.datasets.photographs import Photographs
+    from fragprune_plugins.hosts.graphdeco.output import trained_on
 
     read = {each.photographs for each in known.values()}
+    if not read and data is None:
+        read = {each for each in map(trained_on, models) if each is not None}
     if len(read) == 1:
         (scene,) = read
         return scene if data is None else replace(scene, folder=data)
@@ -159,7 +160,7 @@ def _scene(data: Path | None, known: dict[Path, Recorded]) -> Photographs:
             "--data",
             "no folder, and the models' runs read photographs in two ways"
             if read
-            else "no folder, and no record of a run beside the models",
+            else "no folder, and no record of a run or cfg_args of a training beside the models",
             "a scene folder",
             "Name it with --data.",
         )

@@ -11,6 +11,7 @@ import click
 
 from fragprune_plugins.cli.common import (
     FILE,
+    MODEL,
     Command,
     Function,
     Group,
@@ -19,6 +20,7 @@ from fragprune_plugins.cli.common import (
     engine_option,
     engine_options,
     open_engine,
+    photographs_for,
     threads_option,
     together,
 )
@@ -71,7 +73,7 @@ def _seeds_option(default: str) -> Callable[[Function], Function]:
 
 
 _training_options = together(
-    click.argument("model", type=FILE),
+    click.argument("model", type=MODEL),
     data_options,
     _out_option,
     click.option(
@@ -107,7 +109,7 @@ Example:
 def _train(
     name: str,
     model: Path,
-    data: Path,
+    data: Path | None,
     images: str,
     resolution: int,
     white_background: bool,
@@ -126,11 +128,10 @@ def _train(
     longest = iters or max(1, round(FINETUNE_ITERATIONS * (1.0 if scale is None else scale)))
     experiment = EXPERIMENTS[name](longest, train)
 
-    from fragprune_plugins.datasets.photographs import Photographs, Resolution
     from fragprune_plugins.experiments import results, running
 
     rasterizer, where = open_engine(engine, device, threads)
-    photographs = Photographs(data, Resolution(resolution), white_background, images)
+    photographs = photographs_for(model, data, images, resolution, white_background)
     with sigterm_interrupts():
         folder, outcomes = running.run(
             experiment,
@@ -197,7 +198,7 @@ def _fit_signals(
 
 
 _views_options = together(
-    click.argument("models", metavar="MODEL...", type=FILE, nargs=-1, required=True),
+    click.argument("models", metavar="MODEL...", type=MODEL, nargs=-1, required=True),
     data_options,
     _out_option,
     engine_options,
@@ -211,7 +212,7 @@ _views_options = together(
 )
 def _time_stages(
     models: tuple[Path, ...],
-    data: Path,
+    data: Path | None,
     images: str,
     resolution: int,
     white_background: bool,
@@ -230,11 +231,10 @@ def _time_stages(
     Example:
       fragprune experiment stages point_cloud.ply pruned.ply --data scene --out experiments
     """
-    from fragprune_plugins.datasets.photographs import Photographs, Resolution
     from fragprune_plugins.experiments import stages
 
     drawer, where = open_engine(engine, device, threads)
-    photographs = Photographs(data, Resolution(resolution), white_background, images)
+    photographs = photographs_for(models[0], data, images, resolution, white_background)
     return _report(
         stages.run(
             models, photographs, out, engine=drawer, device=where, repeats=repeats, progress=True
@@ -246,7 +246,7 @@ def _time_stages(
 @_views_options
 def _count_fragments(
     models: tuple[Path, ...],
-    data: Path,
+    data: Path | None,
     images: str,
     resolution: int,
     white_background: bool,
@@ -264,11 +264,10 @@ def _count_fragments(
     Example:
       fragprune experiment fragments point_cloud.ply pruned.ply --data scene --out experiments
     """
-    from fragprune_plugins.datasets.photographs import Photographs, Resolution
     from fragprune_plugins.experiments import fragments
 
     drawer, where = open_engine(engine, device, threads)
-    photographs = Photographs(data, Resolution(resolution), white_background, images)
+    photographs = photographs_for(models[0], data, images, resolution, white_background)
     return _report(
         fragments.run(models, photographs, out, engine=drawer, device=where, progress=True)
     )

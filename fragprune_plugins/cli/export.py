@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from fragprune_plugins.cli.common import (
-    FILE,
+    MODEL,
     Command,
     OutFile,
     Report,
@@ -20,7 +20,7 @@ from fragprune_plugins.storage import models
 
 
 @click.command("export", cls=Command)
-@click.argument("model", type=FILE)
+@click.argument("model", type=MODEL)
 @click.option("--out", type=OutFile(".ply"), required=True, help="PLY to write.")
 @click.option(
     "--drop-invisible",

@@ -11,6 +11,8 @@ import click
 from fragprune_plugins.cli.common import (
     DATA_HELP,
     FILE,
+    MODEL,
+    TRAINED_ON,
     Command,
     OutFile,
     Report,
@@ -18,6 +20,7 @@ from fragprune_plugins.cli.common import (
     engine_options,
     image_options,
     open_engine,
+    photographs_for,
     require_place,
 )
 from fragprune_plugins.cli.learning import learning_options
@@ -52,14 +55,14 @@ def _share(
 
 
 @click.command("finetune", cls=Command)
-@click.argument("model", type=FILE)
+@click.argument("model", type=MODEL)
 @click.option(
     "--out", type=OutFile(".ply"), required=True, help="New .ply; its sidecar goes beside it."
 )
 @click.option(
     "--data",
     type=FILE,
-    help=DATA_HELP,
+    help=f"{DATA_HELP} {TRAINED_ON}",
 )
 @click.option(
     "--self",
@@ -169,17 +172,19 @@ def command(
 
     from fragprune_plugins.cli import finetuned
     from fragprune_plugins.datasets.dataset import load_photographs
-    from fragprune_plugins.datasets.photographs import Photographs, Resolution
     from fragprune_plugins.finetuning import Checkpoints, resuming, save
     from fragprune_plugins.measure import Candidate
 
+    photographs = None
+    if data is not None or not itself:
+        remedy = "Pass --data FOLDER with photographs; without any, --self."
+        photographs = photographs_for(
+            model, data, images, resolution, white_background, remedy=remedy
+        )
     rasterizer, where = open_engine(engine, device, threads)
     truncation = settings.truncate and not no_truncation
     whole = models.load(model, truncation=truncation, device=where)
     start = Candidate(whole.splat, deepcopy(whole.thresholds))  # learning changes the store
-    photographs = None
-    if data is not None:
-        photographs = Photographs(data, Resolution(resolution), white_background, images)
     if itself:
         dataset = _own_pictures(
             whole, data, cameras, resolution, white_background, seed, rasterizer
@@ -299,13 +304,6 @@ def _require_sense(
             "--cameras without --self",
             "photographs, or the model's own pictures from those cameras",
             "Add --self, or pass --data FOLDER instead of --cameras.",
-        )
-    if not itself and data is None:
-        raise UsageError(
-            "options",
-            "neither --data nor --self",
-            "what to learn from",
-            "Pass --data FOLDER with photographs; without any, --self.",
         )
     if data is not None and cameras is not None:
         raise UsageError(

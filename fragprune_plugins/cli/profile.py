@@ -9,12 +9,14 @@ import click
 
 from fragprune_plugins.cli.common import (
     FILE,
+    MODEL,
     Command,
     Report,
     data_options,
     engine_options,
     load_shots,
     open_engine,
+    photographs_for,
     truncation_option,
     views_option,
 )
@@ -31,7 +33,7 @@ PANELS = 4
 
 
 @click.command("profile", cls=Command)
-@click.argument("model", type=FILE)
+@click.argument("model", type=MODEL)
 @data_options
 @click.option("--out", type=FILE, help="Folder for pictures: photograph, render, fragment density.")
 @views_option
@@ -39,7 +41,7 @@ PANELS = 4
 @engine_options
 def command(
     model: Path,
-    data: Path,
+    data: Path | None,
     images: str,
     resolution: int,
     white_background: bool,
@@ -55,8 +57,9 @@ def command(
     A model with thresholds is measured with and without them, on the same frames in turns.
 
     \b
-    Example:
+    Examples:
       fragprune profile pruned.ply --data scene --out pictures
+      fragprune profile out                          (the output folder of a training)
     """
     import torch
 
@@ -69,14 +72,8 @@ def command(
     if out is not None:
         writable_folder(out)
     splat, store = models.load(model, truncation=not no_truncation, device=where)
-    shots = load_shots(
-        data,
-        views,
-        resolution=resolution,
-        white_background=white_background,
-        images=images,
-        device=where,
-    )
+    photographs = photographs_for(model, data, images, resolution, white_background)
+    shots = load_shots(photographs, views, where)
     columns = {"untruncated": Candidate(splat)}
     if store is not None:
         columns["truncated"] = Candidate(splat, store)

@@ -8,12 +8,14 @@ import click
 
 from fragprune_plugins.cli.common import (
     FILE,
+    MODEL,
     Command,
     Report,
     engine_options,
     image_options,
     load_shots,
     open_engine,
+    photographs_for,
     truncation_option,
     views_option,
 )
@@ -22,8 +24,13 @@ from fragprune_plugins.storage import models
 
 
 @click.command("render", cls=Command)
-@click.argument("model", type=FILE)
-@click.option("--cameras", type=FILE, help="cameras.json of a 3DGS model, or transforms_*.json.")
+@click.argument("model", type=MODEL)
+@click.option(
+    "--cameras",
+    type=FILE,
+    help="cameras.json of a 3DGS model, transforms*.json, or nerfstudio's camera_path.json. "
+    "Default: the cameras.json that the training of MODEL wrote.",
+)
 @click.option("--data", type=FILE, help="Scene folder whose cameras draw, instead of --cameras.")
 @click.option("--out", type=FILE, required=True, help="Folder for the PNG files.")
 @click.option("--heatmap", is_flag=True, help="Also draw fragments per pixel, on one shared scale.")
@@ -54,10 +61,12 @@ def command(
     Examples:
       fragprune render pruned.ply --data scene --out renders --heatmap
       fragprune render pruned.ply --cameras out/cameras.json --out renders
+      fragprune render out --out renders                (the output folder of a training)
     """
-    if (cameras is None) == (data is None):
-        found = "neither" if data is None else "both"
-        raise UsageError("options", f"{found} of --cameras and --data", "one of them", "Pass one.")
+    if cameras is not None and data is not None:
+        raise UsageError("options", "both of --cameras and --data", "one of them", "Pass one.")
+    if cameras is None and data is None:
+        cameras = _of_training(model)
 
     import torch
 
@@ -72,9 +81,8 @@ def command(
     writable_folder(out)
     splat, store = models.load(model, truncation=not no_truncation, device=where)
     if data is not None:
-        shots = load_shots(
-            data, views, resolution=resolution, white_background=white_background, images=images
-        )
+        scene = photographs_for(model, data, images, resolution, white_background)
+        shots = load_shots(scene, views)
         named = [(shot.name, shot.view) for shot in shots]
     else:
         assert cameras is not None
@@ -116,3 +124,18 @@ def command(
             ]
         ),
     )
+
+
+def _of_training(model: Path) -> Path:
+    """The cameras that a host wrote beside a model."""
+    from fragprune_plugins.hosts.graphdeco.output import CAMERAS, output_folder
+
+    folder = output_folder(model)
+    if folder is None or not (folder / CAMERAS).is_file():
+        raise UsageError(
+            "options",
+            f"neither --cameras nor --data, and no {CAMERAS} of a training around {model}",
+            "cameras to draw from",
+            "Pass --cameras FILE or --data FOLDER.",
+        )
+    return folder / CAMERAS

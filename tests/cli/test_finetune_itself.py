@@ -155,7 +155,7 @@ def test_the_target_is_what_the_model_shows_as_it_came_in(scene, falloff):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ((), ("neither --data nor --self", "Pass --data FOLDER with photographs", "--self")),
+        ((), ("no folder", "Pass --data FOLDER with photographs", "--self")),
         (("--cameras", "c.json"), ("--cameras without --self", "Add --self")),
         (
             ("--self", "--data", "scene", "--cameras", "c.json"),

@@ -15,7 +15,7 @@ import pytest
 import torch
 from miniatures.vanilla_3dgs import running
 
-from fragprune_plugins.datasets.dataset import Dataset
+from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.finetuning import finetune
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
@@ -27,16 +27,15 @@ STEPS = 24
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
+class Photograph(Shot):
     """What ``finetune`` takes of a photograph, made of a host's camera."""
 
-    name: str
-    view: View
-    image: torch.Tensor
+    pixels: torch.Tensor
 
-    def to(self, device):
-        """It is there."""
-        return self
+    @property
+    def image(self):
+        """The host's own picture."""
+        return self.pixels
 
 
 class Nearer:

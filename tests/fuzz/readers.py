@@ -20,6 +20,7 @@ from fragprune_plugins.datasets.dataset import Photograph
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cost import UNITS, Cost
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
+from fragprune_plugins.hosts.graphdeco.output import trained_on
 from fragprune_plugins.hosts.preflight import missing_imports
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import resumed_at
@@ -101,8 +102,8 @@ def _colmap(name: str) -> Callable[[Path], None]:
         (sparse / partner).write_bytes(good.read_bytes())
         file.replace(sparse / name)
         for part in colmap.read(file.parent):
-            for _, camera, _ in part:
-                _plausible(camera.view())
+            for row in part:
+                _plausible(row.camera.view())
 
     return read
 
@@ -168,6 +169,13 @@ def _config(file: Path) -> None:
     _sound("no names", all(isinstance(name, str) for name in values))
 
 
+def _arguments(file: Path) -> None:
+    folder = file.parent / "point_cloud" / "iteration_7"
+    folder.mkdir(parents=True, exist_ok=True)
+    file.rename(file.with_name("cfg_args"))
+    trained_on(folder / "point_cloud.ply")
+
+
 @dataclass(frozen=True)
 class Reader:
     """A reader.
@@ -200,5 +208,6 @@ READERS = [
     Reader("git", _git),
     Reader("config", _config),
     Reader("prices", _prices),
+    Reader("cfg_args", _arguments),
 ]
 BY_NAME = {reader.name: reader for reader in READERS}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import tempfile
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,15 @@ def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color, scaling_modifier
     image, radii = rasterizer(means3D=pc.get_xyz, opacities=pc.get_opacity, shs=pc.get_features)
     return {"render": image, "visibility_filter": (radii > 0).nonzero(), "radii": radii}
 """
+
+_LENSES = b"""7 OPENCV 32 32 36 36 16 16 -0.1 0.02 0.001 0.002
+8 SIMPLE_RADIAL_FISHEYE 32 32 36 16 16 0.03
+"""
+
+_ARGUMENTS = (
+    b"Namespace(sh_degree=3, source_path='scene', model_path='out', images='images', "
+    b"resolution=-1, white_background=False, data_device='cuda', eval=True)"
+)
 
 GAUSSIANS = 3
 VIEWS = 3
@@ -162,6 +172,24 @@ def _transforms() -> bytes:
     return json.dumps(content | {"w": 32, "h": 32, "cx": 16.0, "cy": 16.0}).encode()
 
 
+def _nerfstudio() -> bytes:
+    """Intrinsics and a lens of the file, others of a frame."""
+    content = tiny.transforms([f"images/{i}.png" for i in range(VIEWS)], tiny.cameras(VIEWS))
+    content |= {"camera_model": "OPENCV", "fl_x": 36.0, "fl_y": 36.0, "cx": 16.0, "cy": 16.0}
+    content |= {"w": 32, "h": 32, "k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0}
+    content["frames"][1] |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "mask_path": "m.png"}
+    return json.dumps(content).encode()
+
+
+def _camera_path() -> bytes:
+    frames = tiny.transforms(["a", "b"], tiny.cameras(2))["frames"]
+    path = [
+        {"camera_to_world": [*chain(*frame["transform_matrix"])], "fov": 50.0, "aspect": 1.0}
+        for frame in frames
+    ]
+    return json.dumps({"camera_path": path, "render_width": 32, "render_height": 32}).encode()
+
+
 def _prices(folder: Path) -> bytes:
     machine = {"engine": "cpu", "processor": "one", "threads": 2}
     cost = Cost(dict.fromkeys(UNITS, 1.5), 0.07, machine)
@@ -184,9 +212,13 @@ def make() -> dict[str, dict[str, bytes]]:
             "sidecar": {"a.safetensors": _sidecar(folder)},
             "cameras.bin": {"a.bin": binary["cameras.bin"]},
             "images.bin": {"a.bin": binary["images.bin"]},
-            "cameras.txt": {"a.txt": text["cameras.txt"]},
+            "cameras.txt": {"a.txt": text["cameras.txt"], "lenses.txt": _LENSES},
             "images.txt": {"a.txt": text["images.txt"]},
-            "transforms": {"a.json": _transforms()},
+            "transforms": {
+                "a.json": _transforms(),
+                "nerfstudio.json": _nerfstudio(),
+                "camera-path.json": _camera_path(),
+            },
             "cameras.json": {"a.json": _cameras()},
             "record": {"a.json": _record(folder)},
             "image": {
@@ -202,6 +234,7 @@ def make() -> dict[str, dict[str, bytes]]:
             "git": {"head": b"ref: refs/heads/main\n", "commit": b"0123456789abcdef" * 2 + b"\n"},
             "config": {"a.json": b'{"iterations": 30000, "source_path": "scene", "lambda": 0.2}'},
             "prices": {"a.json": _prices(folder)},
+            "cfg_args": {"a.txt": _ARGUMENTS},
         }
 
 

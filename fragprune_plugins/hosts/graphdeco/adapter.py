@@ -22,6 +22,7 @@ from fragprune_plugins.hosts.adapter import (
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_plugins.hosts.graphdeco.densifying import clones, splits
+from fragprune_plugins.hosts.graphdeco.output import WIDEST
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import Function, HostRepo
 
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 CAMERAS = "utils.camera_utils"
-WIDEST = 1600
-"""Pixels: hosts shrink wider images to this width where no size is asked for (-r -1)."""
 OTHER = "Use the adapter of that host."
 
 GROUPS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")

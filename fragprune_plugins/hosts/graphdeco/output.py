@@ -1,0 +1,104 @@
+"""The output folder of a training: which model to take, and which photographs it was made from.
+
+The hosts write ``point_cloud/iteration_N/point_cloud.ply``, ``cameras.json``, and the command's
+arguments as ``cfg_args``: the text of an ``argparse.Namespace``. Nothing of it is executed.
+"""
+
+from __future__ import annotations
+
+import ast
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.datasets.photographs import Photographs, Resolution
+from fragprune_plugins.errors import DatasetError, ModelFileError
+from fragprune_plugins.storage.reading import MEBIBYTE, Door
+
+WIDEST = 1600
+"""Pixels: hosts shrink wider images to this width where no size is asked for (-r -1)."""
+
+ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
+
+_DIVISORS = (1, 2, 4, 8)  # of -r; other numbers are widths
+
+_DOOR = Door(
+    DatasetError,
+    "not the arguments of a training",
+    "Namespace(source_path=..., ...), as a 3DGS host writes it",
+    "Name the photographs with --data.",
+    limit=MEBIBYTE,
+)
+
+log = logging.getLogger(__name__)
+
+
+def newest_model(folder: Path) -> Path:
+    """The PLY of the highest iteration in an output folder.
+
+    Raises:
+        ModelFileError: there is none.
+    """
+    found = [
+        (int(number[1]), path)
+        for path in folder.glob("point_cloud/iteration_*/point_cloud.ply")
+        if (number := re.fullmatch(r"iteration_(\d{1,9})", path.parent.name))
+    ]
+    if not found:
+        raise ModelFileError(
+            str(folder),
+            "a folder without point_cloud/iteration_*/point_cloud.ply",
+            "a model, or the output folder of a training",
+            "Pass the model's file.",
+        )
+    return max(found)[1]
+
+
+def output_folder(model: Path) -> Path | None:
+    """The output folder that a host wrote a model into; None if it lies elsewhere."""
+    folders = model.resolve().parents
+    inside = len(folders) > 2 and folders[1].name == "point_cloud"
+    return folders[2] if inside and folders[0].name.startswith("iteration_") else None
+
+
+def trained_on(model: Path) -> Photographs | None:
+    """The photographs of a model's training, by the arguments in its output folder; else None.
+
+    A training without ``--eval`` held no view out, which is warned of.
+
+    Raises:
+        DatasetError: the arguments cannot be read.
+    """
+    folder = output_folder(model)
+    if folder is None or not (folder / ARGUMENTS).exists():
+        return None
+    with _DOOR.reading(folder / ARGUMENTS) as reading:
+        call = ast.parse(reading.text().strip(), mode="eval").body
+        if not isinstance(call, ast.Call):
+            raise ValueError("no call")
+        values: dict[str, Any] = {}
+        for word in call.keywords:
+            if word.arg in ("source_path", "images", "resolution", "white_background", "eval"):
+                reading.place = word.arg
+                values[word.arg] = ast.literal_eval(word.value)
+        reading.place = ""
+        photographs = Photographs(
+            Path(str(values["source_path"])),
+            _resolution(int(values.get("resolution", -1))),
+            bool(values.get("white_background", False)),
+            str(values.get("images", "images")),
+        )
+    if not values.get("eval", False):
+        log.warning(
+            "%s was trained without --eval: it has seen the held-out views, so figures on them "
+            "flatter it",
+            folder,
+        )
+    return photographs
+
+
+def _resolution(asked: int) -> Resolution:
+    if asked in _DIVISORS:
+        return Resolution(divide=asked)
+    return Resolution(width=WIDEST if asked < 1 else asked, shrink_only=asked < 1)

@@ -1,0 +1,152 @@
+"""A training's output folder in place of a model, and what is known of the training then."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+from dataclasses import replace
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+from PIL import Image
+
+from fragprune_plugins.datasets.photographs import Photographs, Resolution
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.hosts.graphdeco.output import trained_on
+from fragprune_plugins.storage.ply import write_ply
+
+
+def write_output(folder, data, model, **arguments):
+    """What a 3DGS host leaves: models of two iterations, its arguments and its cameras."""
+    for iteration in (900, 10_000):
+        place = folder / "point_cloud" / f"iteration_{iteration}"
+        place.mkdir(parents=True)
+        write_ply(place / "point_cloud.ply", model)
+    known = {"sh_degree": 1, "source_path": str(data), "images": "images", "resolution": -1}
+    known |= {"white_background": False, "eval": True, "data_device": "cuda"} | arguments
+    (folder / "cfg_args").write_text(str(Namespace(**known)))
+    camera = tiny.cameras()[0]
+    entry = {
+        "id": 0,
+        "img_name": "one",
+        "width": camera.width,
+        "height": camera.height,
+        "position": (-camera.rotation.T @ camera.translation).tolist(),
+        "rotation": camera.rotation.T.tolist(),
+        "fx": camera.fx,
+        "fy": camera.fy,
+    }
+    (folder / "cameras.json").write_text(json.dumps([entry]))
+    return folder
+
+
+@pytest.fixture
+def output(tmp_path):
+    data, _, model = tiny.scene(tmp_path)
+    return write_output(tmp_path / "out", data, model)
+
+
+def test_profile_takes_the_newest_model_and_the_trainings_photographs(output, tmp_path):
+    result = run("profile", output)
+    assert result.exit_code == 0
+    assert "iteration_10000" in result.stderr
+    assert f"Photographs: {tmp_path / 'data'}" in result.stderr
+    assert run_json("profile", output)["views"] == 2
+
+
+def test_options_override_the_training(output):
+    assert run_json("profile", output, "--resolution", 2)["views"] == 2
+    smaller = run("profile", output, "--images", "images_2")
+    assert smaller.exit_code == 1
+    assert "images_2" in smaller.stderr
+
+
+def test_render_takes_the_trainings_cameras(output, tmp_path):
+    report = run_json("render", output, "--out", tmp_path / "pictures")
+    (file,) = report["files"]
+    with Image.open(file) as picture:
+        assert picture.size == (tiny.SIDE, tiny.SIDE)
+
+
+def test_finetune_learns_from_the_trainings_photographs(output, tmp_path):
+    out = tmp_path / "pruned.ply"
+    report = run_json("finetune", output, "--out", out, "--iters", 3, "--train", "opacity")
+    assert out.exists()
+    assert report["before"]["views"] == 2
+
+
+def test_compare_takes_the_trainings_photographs(output):
+    models = sorted(output.glob("point_cloud/*/point_cloud.ply"))
+    assert run_json("compare", *models)["psnr_change"] == 0
+
+
+@pytest.mark.parametrize("command", ["profile", "render", "finetune", "export"])
+def test_a_folder_without_a_model_is_a_usage_error(command, tmp_path):
+    result = run(command, tmp_path, "--out", tmp_path / "x.ply")
+    assert result.exit_code == 2
+    assert "a folder without point_cloud/iteration_*/point_cloud.ply" in result.stderr
+
+
+def test_a_model_elsewhere_needs_data(tmp_path):
+    _, path, _ = tiny.scene(tmp_path)
+    result = run("profile", path)
+    assert result.exit_code == 2
+    assert "no cfg_args" in result.stderr
+
+
+def test_a_training_that_held_nothing_out_is_warned_of(tmp_path, caplog):
+    data, _, model = tiny.scene(tmp_path)
+    output = write_output(tmp_path / "out", data, model, eval=False)
+    assert run("profile", output).exit_code == 0
+    assert "trained without --eval" in caplog.text
+
+
+SIZES = {
+    -1: Resolution(width=1600, shrink_only=True),
+    1: Resolution(divide=1),
+    4: Resolution(divide=4),
+    500: Resolution(width=500),
+}
+
+
+@pytest.mark.parametrize("asked", SIZES)
+def test_the_size_of_photographs_is_the_hosts(tmp_path, asked):
+    data, _, model = tiny.scene(tmp_path)
+    output = write_output(
+        tmp_path / "out", data, model, resolution=asked, white_background=True, images="images_8"
+    )
+    model_file = output / "point_cloud" / "iteration_900" / "point_cloud.ply"
+    assert trained_on(model_file) == Photographs(data, SIZES[asked], True, "images_8")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "Namespace(",
+        "Namespace(images='a')",
+        "Namespace(source_path=print(1))",
+        "Namespace(source_path='a', resolution='x')",
+        "[1]",
+        "(" * 5000,
+        "\x00",
+    ],
+)
+def test_arguments_that_are_none_are_refused_and_not_executed(output, text, capsys):
+    (output / "cfg_args").write_text(text)
+    with pytest.raises(DatasetError, match="cfg_args"):
+        trained_on(output / "point_cloud" / "iteration_900" / "point_cloud.ply")
+    assert capsys.readouterr().out == ""
+
+
+def test_models_of_different_things_are_told_apart(tmp_path):
+    data, path, model = tiny.scene(tmp_path)
+    other = tmp_path / "other.ply"
+    write_ply(other, replace(model, f_dc=-3 * model.f_dc, xyz=model.xyz + 0.5))
+    (warning,) = run_json("compare", path, other, "--data", data)["warnings"]
+    assert warning.startswith("B hardly shows these photographs")
+    near = tmp_path / "near.ply"
+    write_ply(near, model, torch.full((len(model),), 0.2))
+    assert run_json("compare", path, near, "--data", data)["warnings"] == []
