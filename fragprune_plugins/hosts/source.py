@@ -42,7 +42,7 @@ _REFERENCE = re.compile(r"ref: (refs/(?!.*\.\.)[\w./+@-]+)")
 
 
 @lru_cache(maxsize=256)
-def _parsed(text: str) -> ast.Module | None:
+def parsed(text: str) -> ast.Module | None:
     """The syntax tree of a text, cached and never changed; None if it is not Python."""
     try:
         with warnings.catch_warnings():
@@ -121,7 +121,7 @@ class HostRepo:
         """The module's syntax tree, or None when it is absent or not Python."""
         if module not in self._trees:
             path = self.path(module)
-            self._trees[module] = _parsed(self._read(path)) if path else None
+            self._trees[module] = parsed(self._read(path)) if path else None
         return self._trees[module]
 
     def function(self, module: str, attribute: str) -> Function | None:

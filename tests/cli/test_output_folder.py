@@ -131,14 +131,16 @@ def test_the_size_of_photographs_is_the_hosts(tmp_path, asked):
         "Namespace(source_path='a', resolution='x')",
         "[1]",
         "(" * 5000,
+        "Namespace(source_path='a', images=" + '{"a":' * 500,
         "\x00",
     ],
 )
 def test_arguments_that_are_none_are_refused_and_not_executed(output, text, capsys):
     (output / "cfg_args").write_text(text)
-    with pytest.raises(DatasetError, match="cfg_args"):
+    with pytest.raises(DatasetError, match="cfg_args: not the arguments of a training") as stated:
         trained_on(output / "point_cloud" / "iteration_900" / "point_cloud.ply")
     assert capsys.readouterr().out == ""
+    assert "memory" not in stated.value.found
 
 
 def test_models_of_different_things_are_told_apart(tmp_path):

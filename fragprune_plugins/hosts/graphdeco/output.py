@@ -14,6 +14,7 @@ from typing import Any
 
 from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.errors import DatasetError, ModelFileError
+from fragprune_plugins.hosts.source import parsed
 from fragprune_plugins.storage.reading import MEBIBYTE, Door
 
 WIDEST = 1600
@@ -74,9 +75,7 @@ def trained_on(model: Path) -> Photographs | None:
     if folder is None or not (folder / ARGUMENTS).exists():
         return None
     with _DOOR.reading(folder / ARGUMENTS) as reading:
-        call = ast.parse(reading.text().strip(), mode="eval").body
-        if not isinstance(call, ast.Call):
-            raise ValueError("no call")
+        call = _call(reading.text())
         values: dict[str, Any] = {}
         for word in call.keywords:
             if word.arg in ("source_path", "images", "resolution", "white_background", "eval"):
@@ -96,6 +95,15 @@ def trained_on(model: Path) -> Photographs | None:
             folder,
         )
     return photographs
+
+
+def _call(text: str) -> ast.Call:
+    """The one call that a text is."""
+    tree = parsed(text.strip())
+    match tree.body if tree else []:
+        case [ast.Expr(value=ast.Call() as call)]:
+            return call
+    raise ValueError("no call")
 
 
 def _resolution(asked: int) -> Resolution:
