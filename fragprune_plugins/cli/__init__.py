@@ -24,6 +24,7 @@ _COMMANDS = {
     "bench": "bench",
     "experiment": "experiment",
     "doctor": "doctor",
+    "completion": "completion",
 }
 """Modules of this package by command name, in the order of --help; each defines ``command``."""
 

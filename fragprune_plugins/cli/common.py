@@ -6,6 +6,7 @@ import contextlib
 import functools
 import json
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -81,6 +82,92 @@ class ModelFile(click.Path):
 
 
 MODEL = ModelFile()
+
+
+def _logs(
+    ctx: click.Context, param: click.Parameter, words: tuple[str, ...]
+) -> tuple[tuple[str, str], ...]:
+    """Kind and place of each log."""
+    places = []
+    for word in words:
+        kind, _, place = word.partition(":")
+        if kind not in ("csv", "tensorboard", "wandb") or not place:
+            wanted = "csv:FILE, tensorboard:FOLDER or wandb:PROJECT"
+            raise click.BadParameter(f"'{word}' is not {wanted}.", ctx, param)
+        places.append((kind, place))
+    return tuple(places)
+
+
+def log_option(function: Function) -> Function:
+    """The option ``--log``: the steps that the command takes are written there."""
+
+    @click.option(
+        "--log",
+        "logs",
+        metavar="KIND:PLACE",
+        callback=_logs,
+        multiple=True,
+        help="Write every step's loss, fragments, pressure and threshold to csv:FILE, "
+        "tensorboard:FOLDER or wandb:PROJECT. May be given several times.",
+    )
+    @functools.wraps(function)
+    def logged(*args: Any, logs: tuple[tuple[str, str], ...], **kwargs: Any) -> Any:
+        if not logs:
+            return function(*args, **kwargs)
+        from fragprune_plugins.plugins.logs import logging_steps
+
+        with logging_steps(logs):
+            return function(*args, **kwargs)
+
+    return logged  # type: ignore[return-value]
+
+
+def _read_config(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
+    """Make a TOML file's values the defaults of the command's options."""
+    if value is None:
+        return None
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+
+    from fragprune_plugins.storage.reading import MEBIBYTE, Door
+
+    remedy = "Write one option a line, such as target-speedup = 2."
+    door = Door(UsageError, "not readable as TOML", "a TOML file", remedy, limit=MEBIBYTE)
+    try:
+        with door.reading(value) as reading:
+            values = tomllib.loads(reading.text())
+    except UsageError as error:
+        raise click.BadParameter(str(error), ctx, param) from error
+    options = {
+        word.lstrip("-"): each.name
+        for each in ctx.command.params
+        if isinstance(each, click.Option) and each is not param
+        for word in each.opts
+        if word.startswith("--")
+    }
+    names: dict[str, Any] = {}
+    for key, setting in values.items():
+        word = key.replace("_", "-")
+        if word not in options:
+            raise click.BadParameter(
+                f"{value}: {key!r} is no option of {ctx.command_path}.", ctx, param
+            )
+        names[str(options[word])] = setting
+    ctx.default_map = {**(ctx.default_map or {}), **names}
+    return value
+
+
+config_option = click.option(
+    "--config",
+    type=FILE,
+    is_eager=True,
+    expose_value=False,
+    callback=_read_config,
+    help="TOML file with options of this command, such as target-speedup = 2; those on the command "
+    "line go before.",
+)
 
 
 def require_place(out: Path, model: Path) -> None:

@@ -16,9 +16,11 @@ from fragprune_plugins.cli.common import (
     Command,
     OutFile,
     Report,
+    config_option,
     dropping,
     engine_options,
     image_options,
+    log_option,
     open_engine,
     photographs_for,
     require_place,
@@ -79,6 +81,8 @@ def _share(
 )
 @image_options
 @learning_options
+@log_option
+@config_option
 @click.option(
     "--keep",
     metavar="SHARE|auto",

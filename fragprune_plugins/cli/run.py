@@ -15,8 +15,10 @@ from fragprune_plugins.cli.common import (
     Command,
     Report,
     bound_threads,
+    config_option,
     device_option,
     engine_option,
+    log_option,
     open_engine,
     threads_option,
 )
@@ -62,6 +64,8 @@ _CONTROL = (
     "--alternate", type=click.IntRange(min=1), help="joint: learn N iterations, hold N, and so on."
 )
 @learning_options
+@log_option
+@config_option
 @engine_option("Engine that rasterizes with thresholds, or if the host's own rasterizer is missing")
 @device_option("Device of the host; cpu runs a CUDA-only host without a GPU.")
 @threads_option
@@ -133,6 +137,7 @@ def command(
 
     from fragprune_plugins.injection.launch import RunOptions, run
     from fragprune_plugins.injection.process import current_gpu
+    from fragprune_plugins.plugins.logs import logging_steps
 
     bound_threads(threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
@@ -149,7 +154,8 @@ def command(
     # A host prints to stdout; with --json, stdout gets only our object.
     to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None
     with to_stderr or contextlib.nullcontext():
-        summary = run(list(host_command), options)
+        with logging_steps([("bar", str(settings.iterations))]):
+            summary = run(list(host_command), options)
         photographs = _photographs(summary)
         not_compared: FragpruneError | None = summary.not_compared
         before = after = None

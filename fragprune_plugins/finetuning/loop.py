@@ -31,7 +31,9 @@ from fragprune_plugins.learning.pressure import CALIBRATION_VIEWS, FEWEST
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2, evenly
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
+from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage import models
 from fragprune_plugins.storage.models import Model
@@ -247,7 +249,7 @@ class _Run:
             schedule,
             truncate=thresholds_for if rule is None else self._ruled,
             views=again,
-            watch=self.curves.append,
+            watch=self._watched,
             parameters=lambda: {name: getattr(self.model, name) for name in self.rates},
             clock=clock,
         )
@@ -426,6 +428,11 @@ class _Run:
         self.stage.close()
         if self.rule is not None:
             self._follow(self.rule, torch.sigmoid(self.model.opacity[:, 0].detach()))
+
+    def _watched(self, stats: StepStats) -> None:
+        """Keep a finished step for the curves, and tell observers."""
+        self.curves.append(stats)
+        installed().tell(hookspecs.fragprune_step, stats=stats)
 
     def _follow(self, rule: Callable[[Tensor], Tensor], opacities: Tensor) -> None:
         """Put what the rule gives for these opacities (N,) into the store."""

@@ -111,6 +111,10 @@ class Plugins:
             _take(self, adapter)
         self.adapters.sort(key=lambda adapter: adapter.name)
 
+    def remove(self, name: str) -> None:
+        """Take back a plugin that was registered under a name."""
+        self._manager.unregister(name=name)
+
     def ask(self, hook: Hook, wrong: Callable[[Any], Wrong | None], **given: Any) -> Any:
         """Ask a hook; returns the first answer that is not None, or None if no plugin answers.
 

@@ -1,0 +1,205 @@
+"""Where the steps of learning are written while they happen: CSV, TensorBoard, Weights & Biases.
+
+A log is a plugin like any other: it implements ``fragprune_step``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, Protocol
+
+from fragprune_plugins.errors import OutputError, UsageError
+from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import Plugins, installed
+
+COLUMNS = tuple(each.name for each in fields(StepStats))
+
+
+class Log(Protocol):
+    """A place for steps."""
+
+    def write(self, stats: StepStats) -> None:
+        """Write a step."""
+
+    def close(self) -> None:
+        """No further step comes."""
+
+
+class CsvLog:
+    """A row a step. A fine-tuning that goes on after a kill appends; another one begins anew.
+
+    Args:
+        path: the file.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path = Path(path)
+        try:
+            self._file = open(self._path, "a", newline="", encoding="utf-8")  # noqa: SIM115
+        except OSError as error:
+            why = error.strerror or str(error)
+            raise OutputError(path, why, "a file for --log", "Choose another place.") from error
+        self._rows = csv.writer(self._file)
+        self._begun = False
+
+    def write(self, stats: StepStats) -> None:
+        """Append a row; the first step of all begins the file."""
+        if not self._begun:
+            self._begun = True
+            if stats.step == 1:
+                self._file.seek(0)
+                self._file.truncate()
+            if self._file.tell() == 0:
+                self._rows.writerow(COLUMNS)
+        self._rows.writerow(asdict(stats).values())
+        self._file.flush()  # whoever follows the file sees the step
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class TensorBoardLog:
+    """Scalars under ``fragprune/`` in an event file.
+
+    Args:
+        folder: TensorBoard's log folder.
+
+    Raises:
+        UsageError: TensorBoard is not installed.
+    """
+
+    def __init__(self, folder: str) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise _missing("tensorboard") from error
+        self._writer = SummaryWriter(folder)
+
+    def write(self, stats: StepStats) -> None:
+        """Add a point to every curve."""
+        for name, value in _values(stats).items():
+            self._writer.add_scalar(name, value, stats.step)
+
+    def close(self) -> None:
+        """Write what is pending."""
+        self._writer.close()
+
+
+class WandbLog:
+    """A run of Weights & Biases. It uses the network, unless WANDB_MODE=offline.
+
+    Args:
+        project: name of the project.
+
+    Raises:
+        UsageError: wandb is not installed.
+    """
+
+    def __init__(self, project: str) -> None:
+        try:
+            import wandb
+        except ImportError as error:
+            raise _missing("wandb") from error
+        self._run: Any = wandb.init(project=project)
+
+    def write(self, stats: StepStats) -> None:
+        """Log a step."""
+        self._run.log(_values(stats), step=stats.step)
+
+    def close(self) -> None:
+        """End the run."""
+        self._run.finish()
+
+
+class Bar:
+    """A bar on stderr below the host's own, if stderr is a terminal.
+
+    Args:
+        total: number of steps.
+    """
+
+    def __init__(self, total: str) -> None:
+        self._total = int(total)
+        self._bar: Any = None
+
+    def write(self, stats: StepStats) -> None:
+        """Go on by a step."""
+        from tqdm import tqdm
+
+        if self._bar is None:
+            self._bar = tqdm(
+                total=self._total, disable=None, desc="fragprune", unit="it", position=1
+            )
+        self._bar.set_postfix(
+            fragments=f"{stats.fragments_per_pixel:.1f}/px", loss=f"{stats.loss:.4f}", refresh=False
+        )
+        self._bar.update()
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+LOGS: dict[str, Callable[[str], Log]] = {
+    "csv": CsvLog,
+    "tensorboard": TensorBoardLog,
+    "wandb": WandbLog,
+    "bar": Bar,
+}
+"""By kind; ``--log`` offers all but the bar, which ``run`` shows."""
+
+
+class _Observer:
+    def __init__(self, log: Log) -> None:
+        self._log = log
+
+    @hookimpl
+    def fragprune_step(self, stats: StepStats) -> None:
+        self._log.write(stats)
+
+
+@contextlib.contextmanager
+def logging_steps(
+    asked: Sequence[tuple[str, str]], plugins: Plugins | None = None
+) -> Iterator[None]:
+    """Write the steps that are taken in a block.
+
+    Args:
+        asked: kind (a key of ``LOGS``) and place of each log.
+        plugins: the plugins to join; None for those of the process.
+
+    Raises:
+        UsageError: a library is missing.
+        OutputError: a file cannot be written.
+    """
+    plugins = plugins or installed()
+    with contextlib.ExitStack() as stack:
+        for number, (kind, place) in enumerate(asked):
+            log, name = LOGS[kind](place), f"log-{number}-{kind}"
+            stack.callback(log.close)
+            plugins.register(_Observer(log), name)
+            stack.callback(plugins.remove, name)
+        yield
+
+
+def _values(stats: StepStats) -> dict[str, float]:
+    return {f"fragprune/{name}": value for name, value in asdict(stats).items() if name != "step"}
+
+
+def _missing(library: str) -> UsageError:
+    return UsageError(
+        "--log",
+        f"{library} is not installed",
+        f"the package {library}",
+        f"pip install 'fragprune-plugins[{library}]'",
+    )

@@ -1,0 +1,186 @@
+"""--log, --config and completion."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.plugins.hookspecs import fragprune_step
+from fragprune_plugins.plugins.loading import Plugins, installed
+from fragprune_plugins.plugins.logs import COLUMNS, logging_steps
+
+WORDS = ("--iters", 6, "--train", "opacity")
+
+
+def stats(step):
+    return StepStats(step, 20.0 / step, 1e-4, 0.1, 0.5)
+
+
+def rows(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def tell(plugins, steps):
+    for step in steps:
+        plugins.tell(fragprune_step, stats=stats(step))
+
+
+def test_finetune_writes_a_row_a_step(tmp_path):
+    data, model, _ = tiny.scene(tmp_path)
+    log = tmp_path / "steps.csv"
+    report = run_json(
+        "finetune",
+        model,
+        "--data",
+        data,
+        "--out",
+        tmp_path / "p.ply",
+        *WORDS,
+        "--log",
+        f"csv:{log}",
+    )
+    written = rows(log)
+    assert [int(row["step"]) for row in written] == [1, 2, 3, 4, 5, 6]
+    assert set(written[0]) == set(COLUMNS)
+    assert float(written[-1]["fragments_per_pixel"]) > 0
+    assert report["iterations"] == 6
+    assert installed().answering(fragprune_step) == []  # nobody is left behind
+
+
+def test_a_new_run_begins_the_file_anew_and_a_resumed_one_appends(tmp_path):
+    log = tmp_path / "steps.csv"
+    for steps in ((1, 2, 3), (1, 2), (3, 4)):
+        plugins = Plugins()
+        with logging_steps([("csv", str(log))], plugins):
+            tell(plugins, steps)
+    assert [int(row["step"]) for row in rows(log)] == [1, 2, 3, 4]
+
+
+def test_a_file_can_be_followed_while_it_grows(tmp_path):
+    plugins, log = Plugins(), tmp_path / "steps.csv"
+    with logging_steps([("csv", str(log))], plugins):
+        tell(plugins, [1])
+        assert len(rows(log)) == 1
+
+
+def test_tensorboard_has_every_curve(tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    plugins = Plugins()
+    with logging_steps([("tensorboard", str(tmp_path / "runs"))], plugins):
+        tell(plugins, [1, 2, 4])
+    events = EventAccumulator(str(tmp_path / "runs"))
+    events.Reload()
+    assert set(events.Tags()["scalars"]) == {f"fragprune/{name}" for name in COLUMNS[1:]}
+    points = events.Scalars("fragprune/fragments_per_pixel")
+    assert [(point.step, point.value) for point in points] == [(1, 20.0), (2, 10.0), (4, 5.0)]
+
+
+def test_wandb_gets_every_step(monkeypatch):
+    """The package is a stand-in: what we call of it, with which names."""
+    seen = []
+    begun = SimpleNamespace(
+        log=lambda values, step: seen.append((step, values)), finish=lambda: seen.append("end")
+    )
+    stand_in = SimpleNamespace(init=lambda project: seen.append(project) or begun)
+    monkeypatch.setitem(sys.modules, "wandb", stand_in)
+    plugins = Plugins()
+    with logging_steps([("wandb", "pruning")], plugins):
+        tell(plugins, [1, 2])
+    assert seen[0] == "pruning"
+    assert [step for step, _ in seen[1:3]] == [1, 2]
+    assert seen[1][1]["fragprune/fragments_per_pixel"] == 20.0
+    assert seen[3] == "end"
+
+
+def test_a_missing_library_is_a_usage_error_that_says_what_to_install(tmp_path, monkeypatch):
+    data, model, _ = tiny.scene(tmp_path)
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    out = tmp_path / "p.ply"
+    result = run("finetune", model, "--data", data, "--out", out, *WORDS, "--log", "wandb:x")
+    assert result.exit_code == 2
+    assert "fragprune-plugins[wandb]" in result.stderr
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("word", ["csv", "csv:", "paper:x", ":x", "bar:3"])
+def test_a_log_of_no_kind_is_a_usage_error(tmp_path, word):
+    assert run("finetune", "a.ply", "--out", tmp_path / "b.ply", "--log", word).exit_code == 2
+
+
+def test_a_log_that_fails_later_does_not_stop_learning(tmp_path, caplog):
+    data, model, _ = tiny.scene(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        result = run(
+            *("finetune", model, "--data", data, "--out", tmp_path / "p.ply", *WORDS),
+            *("--log", "csv:/dev/full"),
+        )
+    assert result.exit_code == 0
+    assert "log-0-csv, fragprune_step: OSError" in caplog.text
+
+
+def test_a_config_file_gives_the_options(tmp_path):
+    data, model, _ = tiny.scene(tmp_path)
+    config = tmp_path / "quick.toml"
+    config.write_text(f"data = '{data}'\niters = 4\ntrain = 'opacity'\nno_truncation = true\n")
+    words = ("finetune", model, "--config", config)
+    report = run_json(*words, "--out", tmp_path / "a.ply")
+    assert report["iterations"] == 4
+    assert report["settings"]["train"] == "opacity"
+    other = run_json(*words, "--out", tmp_path / "b.ply", "--iters", 2)  # the line goes before
+    assert other["iterations"] == 2
+
+
+CONFIGS = {
+    "unknown = 1": "'unknown' is no option of",
+    "iters = 'x'": "not a valid integer",
+    "iters": "not readable as TOML",
+    "config = 'a.toml'": "'config' is no option of",
+    "train = 'paper'": "is not one of",
+}
+
+
+@pytest.mark.parametrize("text", CONFIGS)
+def test_a_config_file_that_is_wrong_is_a_usage_error(tmp_path, text):
+    (tmp_path / "a.toml").write_text(text)
+    result = run("finetune", "a.ply", "--out", "b.ply", "--config", tmp_path / "a.toml")
+    assert result.exit_code == 2
+    assert CONFIGS[text] in " ".join(result.stderr.split())
+
+
+def test_a_config_file_that_is_missing_is_a_usage_error(tmp_path):
+    result = run("run", "--config", tmp_path / "a.toml", "--", "python", "train.py")
+    assert result.exit_code == 2
+    assert "no such file" in result.stderr
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_prints_a_script_for_the_shell(shell):
+    result = run("completion", shell)
+    assert result.exit_code == 0
+    assert "_FRAGPRUNE_COMPLETE" in result.stdout
+
+
+def test_bash_completes_commands():
+    """What the script asks the program when the tab key is pressed."""
+    command = [sys.executable, "-c", "from fragprune_plugins.cli import main; main()"]
+    asked = {
+        "_FRAGPRUNE_COMPLETE": "bash_complete",
+        "COMP_WORDS": "fragprune fine",
+        "COMP_CWORD": "1",
+    }
+    found = subprocess.run(
+        command, env=os.environ | asked, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert found.stdout.strip() == "plain,finetune"
