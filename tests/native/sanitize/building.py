@@ -7,6 +7,7 @@ import runpy
 import shlex
 import shutil
 import subprocess
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +18,7 @@ from fragprune_plugins.engines.cpu import binding
 
 ROOT = Path(__file__).parents[3]
 TESTS = ROOT / "tests" / "native"
-PLAIN = ["-O1", "-g1", "-fno-omit-frame-pointer"]
+PLAIN = ("-O1", "-g1", "-fno-omit-frame-pointer")
 MEMORY = (
     "-fsanitize=address,undefined,float-cast-overflow",
     "-fno-sanitize-recover=all",
@@ -55,10 +56,12 @@ class Toolchain:
     Attributes:
         compiler: the command and its first arguments.
         folder: where objects and programs go.
+        plain: flags of everything.
     """
 
     compiler: list[str]
     folder: Path
+    plain: Sequence[str] = PLAIN
     _objects: dict[tuple[str, ...], Future[Path]] = field(default_factory=dict)
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
 
@@ -90,7 +93,7 @@ class Toolchain:
 
     def _compile(self, *arguments: str, gives: Path | None = None) -> Path | None:
         done = subprocess.run(
-            [*self.compiler, *PLAIN, *arguments], capture_output=True, text=True, timeout=240
+            [*self.compiler, *self.plain, *arguments], capture_output=True, text=True, timeout=240
         )
         assert done.returncode == 0, done.stderr[-4000:]
         return gives
