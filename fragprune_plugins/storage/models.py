@@ -31,10 +31,10 @@ def load(
     filtered: bool = False,
     device: torch.device | str = "cpu",
 ) -> Model:
-    """Read a model and its thresholds: the sidecar's, else the file's own column, else None.
+    """Read a model and its thresholds: the sidecar's, else the file's own, else None.
 
     Args:
-        path: of the PLY.
+        path: of the model, in any format of ``storage/formats``. Only a PLY has a sidecar.
         truncation: False ignores thresholds.
         filtered: accept a Mip-Splatting model that has its 3D filter; the caller draws it by
             Mip-Splatting's rules.
@@ -46,16 +46,16 @@ def load(
     """
     from fragprune_plugins.errors import SidecarError
     from fragprune_plugins.learning.thresholds import ThresholdStore
-    from fragprune_plugins.storage import sidecar
-    from fragprune_plugins.storage.ply import read_ply
+    from fragprune_plugins.storage import formats, sidecar
 
     path = Path(path)
+    paired = truncation and formats.found(path).paired
     while True:  # until nobody replaced the pair meanwhile
         before = _versions(path)
         try:
-            splat = read_ply(path, filtered=filtered).to(device)
+            splat = formats.read(path, filtered=filtered).to(device)
             store = ThresholdStore(len(splat), device)
-            if truncation and sidecar.lies_beside(path):
+            if paired and sidecar.lies_beside(path):
                 store, _ = sidecar.load(path, len(splat), device)
             elif truncation and splat.thresholds is not None:
                 store = ThresholdStore.from_falloff(splat.thresholds)
@@ -84,16 +84,22 @@ def _versions(path: Path) -> list[tuple[int, ...] | None]:
 def save_plain(path: str | Path, splat: SplatFile) -> None:
     """Write a model that has no thresholds, for any viewer: no sidecar, no mark in the file.
 
-    The sidecar of an earlier model of this name goes with that model.
+    The sidecar of an earlier PLY of this name goes with that model.
 
     Raises:
-        OutputError: the place cannot be written; existing files stay as they were.
+        OutputError: the place cannot be written, or its name is no model's; existing files stay as
+            they were.
     """
-    from fragprune_plugins.storage import sidecar
-    from fragprune_plugins.storage.atomic import staging
+    from fragprune_plugins.storage import formats, sidecar
+    from fragprune_plugins.storage.atomic import replacing, staging
     from fragprune_plugins.storage.ply import write_ply
 
     path = Path(path)
+    form = formats.named(path)
+    if not form.paired:
+        with replacing(path, durable=True) as new:
+            formats.write(form, new, splat, None)
+        return
     with staging(path) as folder:
         whole = folder / path.name
         write_ply(whole, splat)
@@ -101,32 +107,33 @@ def save_plain(path: str | Path, splat: SplatFile) -> None:
 
 
 def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = None) -> Path:
-    """Write a model and its sidecar, both complete or neither, as ``fragprune finetune`` does.
+    """Write a model with its thresholds, whole or not at all, as ``fragprune finetune`` does.
 
     Args:
-        path: of the PLY; the sidecar goes beside it, into ``NAME.fragprune.safetensors``.
+        path: of the model; its suffix names the format. A PLY gets a sidecar beside it,
+            ``NAME.fragprune.safetensors``; other formats hold thresholds themselves.
         model: what to write.
         settings: recorded in the sidecar, such as ``Settings.as_dict`` gives.
 
     Returns:
-        The sidecar's path.
+        The path of the file that holds the thresholds: the sidecar's, or the model's.
 
     Raises:
-        OutputError: the place cannot be written, or is not named as a PLY is; existing files stay
-            as they were.
+        OutputError: the place cannot be written, its name is no model's, or the format cannot hold
+            thresholds; existing files stay as they were.
         AlignmentError: splat and thresholds differ in length.
         DivergedError: learned values are not finite.
     """
-    from fragprune_plugins.errors import AlignmentError, OutputError
+    from fragprune_plugins.errors import AlignmentError
+    from fragprune_plugins.learning.finite import expect_finite
     from fragprune_plugins.learning.thresholds import ThresholdStore
-    from fragprune_plugins.storage import sidecar
-    from fragprune_plugins.storage.atomic import staging
+    from fragprune_plugins.storage import formats, sidecar
+    from fragprune_plugins.storage.atomic import replacing, staging
     from fragprune_plugins.storage.ply import write_ply
 
     path, (splat, store) = Path(path), model
     store = ThresholdStore(len(splat)) if store is None else store
-    if path.suffix.lower() != ".ply":
-        raise OutputError(str(path), "not the name of a PLY", "a name in .ply", "Rename it.")
+    form = formats.named(path)
     if len(store) != len(splat):
         raise AlignmentError(
             str(path),
@@ -134,6 +141,11 @@ def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = No
             f"{len(splat)}, one per Gaussian",
             "Pass the store of this very model.",
         )
+    if not form.paired:
+        expect_finite(store.numbers, str(path))
+        with replacing(path, durable=True) as new:
+            formats.write(form, new, splat, None if store.neutral else store.values.detach())
+        return path
     with staging(path) as folder:
         whole = folder / path.name
         write_ply(whole, splat, marked=not store.neutral)

@@ -232,7 +232,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
         ),
         filter_3d=column(_FILTER) if _FILTER in names else None,
     )
-    _require_shapes(path, splat)
+    expect_drawable(path, splat)
     return splat
 
 
@@ -297,7 +297,8 @@ def is_marked(path: Path) -> bool:
 def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, Any]) -> None:
     bad = ~np.isfinite(data)
     if bad.any():
-        where = ", ".join(n for n, b in zip(names, bad.any(axis=0), strict=True) if b)
+        columns = bad.any(axis=0) if len(names) == bad.shape[1] else [True]
+        where = ", ".join(n for n, b in zip(names, columns, strict=True) if b)
         raise ModelFileError(
             str(path),
             f"NaN or infinity in {_rows(torch.from_numpy(bad.any(axis=1)), where)}",
@@ -306,8 +307,18 @@ def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, An
         )
 
 
-def _require_shapes(path: Path, splat: SplatFile) -> None:
-    """Raise ModelFileError if a Gaussian's scales or rotation cannot be drawn as they are."""
+def expect_drawable(path: Path, splat: SplatFile) -> None:
+    """Check values that were read from a file.
+
+    Raises:
+        ModelFileError: a value is not finite, or a Gaussian's scales or rotation cannot be drawn as
+            they are.
+    """
+    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
+        values = getattr(splat, name)
+        _require_finite(path, (name,), values.reshape(len(splat), -1).numpy())
+    if splat.thresholds is not None:
+        _checked_thresholds(path, splat.thresholds)
     vast = (splat.scaling > LOG_SCALE_MAX).any(dim=1)
     if splat.filter_3d is not None:
         vast |= splat.filter_3d[:, 0].abs() > math.exp(LOG_SCALE_MAX)
@@ -336,7 +347,7 @@ def _rows(wrong: Tensor, columns: str = "") -> str:
 
 
 def _checked_thresholds(path: Path, values: Tensor) -> Tensor:
-    outside = (values <= 0) | (values >= 1)
+    outside = ~((values > 0) & (values < 1))
     if outside.any():
         raise ModelFileError(
             str(path),

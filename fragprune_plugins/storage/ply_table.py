@@ -80,28 +80,46 @@ def read_vertices(reading: Reading) -> Columns:
         ValueError: the file is no PLY, or not one of plain numbers.
         EOFError: the file is shorter than its header says.
     """
+    return read_elements(reading, ("vertex",))["vertex"]
+
+
+def read_elements(reading: Reading, wanted: tuple[str, ...]) -> dict[str, Columns]:
+    """The columns of elements by name, as ``read_vertices`` reads them; "vertex" has to be there.
+
+    A PLY in text gives the element "vertex" only.
+    """
     lines, start = header_lines(reading.file.read(HEADER_MAX))
     order, elements = _parse(reading, lines)
     reading.place = ""
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise KeyError("vertex")
-    *before, vertex = elements[: names.index("vertex") + 1]
     reading.file.seek(start)
     if order == "":
-        return _text(reading, before, vertex)
-    for element in before:
-        reading.skip(element.count * element.dtype(order).itemsize)
-    kind = vertex.dtype(order)
-    if vertex.count * kind.itemsize > reading.left:
+        *before, vertex = elements[: names.index("vertex") + 1]
+        return {"vertex": _text(reading, before, vertex)}
+    last = max(index for index, name in enumerate(names) if name in wanted)
+    found: dict[str, Columns] = {}
+    for element in elements[: last + 1]:
+        if element.name in wanted and element.name not in found:
+            found[element.name] = _binary(reading, element, order)
+        else:
+            reading.skip(element.count * element.dtype(order).itemsize)
+    return found
+
+
+def _binary(reading: Reading, element: _Element, order: str) -> Columns:
+    """The columns of a binary element, from where the file is."""
+    kind = element.dtype(order)
+    if element.count * kind.itemsize > reading.left:
         raise EOFError(
-            f"cut off in row {reading.left // kind.itemsize} of {vertex.count}, "
+            f"cut off in row {reading.left // kind.itemsize} of {element.count}, "
             f"{kind.itemsize} bytes each"
         )
-    rows = np.fromfile(reading.file, dtype=kind, count=vertex.count)
-    if len(rows) != vertex.count:
-        raise EOFError(f"cut off in row {len(rows)} of {vertex.count}")
-    return {name: rows[name] for name, _ in vertex.columns}
+    rows = np.fromfile(reading.file, dtype=kind, count=element.count)
+    if len(rows) != element.count:
+        raise EOFError(f"cut off in row {len(rows)} of {element.count}")
+    return {name: rows[name] for name, _ in element.columns}
 
 
 def _text(reading: Reading, before: list[_Element], vertex: _Element) -> Columns:
