@@ -17,9 +17,12 @@ _DEPTH = 16  # a palette has at most 2^16 entries
 def codebook(values: npt.NDArray[Any], size: int = 256) -> Floats:
     """(size,) ascending values with a small mean squared distance to values of any shape.
 
-    Lloyd's algorithm in one dimension, from the spacing that is best for many levels: the cube root
+    Values that are few enough stay as they are. Else Lloyd's algorithm in one dimension, from the spacing that is best for many levels: the cube root
     of the density (Panter and Dite).
     """
+    few = np.unique(values)
+    if len(few) <= size:
+        return np.pad(few, (0, size - len(few)), mode="edge").astype(np.float32)
     ordered = np.sort(values.astype(np.float64), axis=None)
     counts, edges = np.histogram(ordered, _BINS)
     share = np.concatenate([[0], np.cumsum(np.cbrt(counts))])

@@ -1,0 +1,82 @@
+"""The conformance files, and our own engine against them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from fragprune_plugins import load
+from fragprune_plugins.datasets.cameras import load_cameras
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.measure.metrics import psnr
+from fragprune_plugins.storage.cutoffs import encode
+from fragprune_plugins.testing import cutoffs
+from fragprune_plugins.types import RasterInputs
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("conformance")
+    cutoffs.write(out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def said(folder):
+    content = json.loads((folder / "cutoffs.json").read_text())
+    listed = folder / "cameras.json"
+    listed.write_text(json.dumps(content["cameras"]))
+    return content | {"views": dict(load_cameras(listed))}
+
+
+def expected(path):
+    return torch.from_numpy(np.asarray(Image.open(path)) / np.float32(255)).permute(2, 0, 1)
+
+
+def drawn(path, view):
+    splat, store = load(path)
+    inputs = RasterInputs(view, splat.splats(), planes=())
+    with torch.no_grad():
+        out = create_engine("cpu").rasterize(inputs, None if store is None else store.values)
+    return out.image.clamp(0, 1), float(out.fragments_per_pixel)
+
+
+@pytest.mark.parametrize("scene", cutoffs.SCENES)
+def test_our_engine_draws_every_carrier_as_expected(folder, said, scene):
+    for name in said["scenes"][scene]["files"]:
+        for view, of in said["scenes"][scene]["views"].items():
+            image, fragments = drawn(folder / name, said["views"][view])
+            assert psnr(image, expected(folder / of["picture"])) > cutoffs.PSNR_MIN, (name, view)
+            assert fragments == pytest.approx(of["fragments_per_pixel"], rel=cutoffs.FRAGMENTS)
+
+
+@pytest.mark.parametrize("scene", cutoffs.SCENES)
+def test_a_renderer_that_ignores_cutoffs_fails(folder, said, scene):
+    for view, of in said["scenes"][scene]["views"].items():
+        plain = folder / said["scenes"][scene]["file_without_cutoffs"]
+        image, fragments = drawn(plain, said["views"][view])
+        assert psnr(image, expected(folder / of["picture"])) < cutoffs.PSNR_MIN - 10
+        assert fragments > (1 + 5 * cutoffs.FRAGMENTS) * of["fragments_per_pixel"]
+        ignored = of["without_cutoffs"]
+        assert psnr(image, expected(folder / ignored["picture"])) > cutoffs.PSNR_MIN
+        assert fragments == pytest.approx(ignored["fragments_per_pixel"], rel=cutoffs.FRAGMENTS)
+
+
+@pytest.mark.parametrize("scene", cutoffs.SCENES)
+def test_codes_are_listed_in_the_order_of_rows(folder, said, scene):
+    codes = said["scenes"][scene]["codes"]
+    for suffix in (".ply", ".spz", ".glb"):
+        store = load(folder / f"{scene}{suffix}").thresholds
+        assert encode(store.values.detach()).tolist() == codes
+
+
+def test_the_same_files_come_out_again(folder, tmp_path):
+    cutoffs.write(tmp_path)
+    files = sorted(path.name for path in tmp_path.iterdir())
+    assert len(files) == 3 * (5 + 4) + 1
+    for name in files:
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
