@@ -42,21 +42,21 @@ FILE = click.Path(path_type=Path)
 
 
 class OutFile(click.Path):
-    """Type of an option for a file to write; refuses a name without the suffix before any work.
+    """Type of an option for a file to write; refuses a name without a suffix before any work.
 
     Args:
-        suffix: required suffix, such as ".ply"; upper and lower case are equal.
+        suffixes: one is required, such as ".ply"; upper and lower case are equal.
     """
 
-    def __init__(self, suffix: str) -> None:
+    def __init__(self, *suffixes: str) -> None:
         super().__init__(path_type=Path)
-        self.suffix = suffix
+        self.suffixes = suffixes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """The option's value as a path; a usage error if it lacks the suffix."""
         path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
-        if path.suffix.lower() != self.suffix:
-            self.fail(f"'{path}' does not end with {self.suffix}.", param, ctx)
+        if path.suffix.lower() not in self.suffixes:
+            self.fail(f"'{path}' does not end with {' or '.join(self.suffixes)}.", param, ctx)
         return path
 
 
@@ -170,22 +170,50 @@ config_option = click.option(
 )
 
 
-def require_place(out: Path, model: Path) -> None:
+def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
     """Check, before any work, that ``out`` can be written and is not ``model``.
 
+    Args:
+        out: the model to write, of any format.
+        model: the model to read.
+        thresholds: whether ``out`` is to have thresholds.
+
     Raises:
-        UsageError: ``out`` and ``model`` have the same name, and so the same sidecar.
-        OutputError: ``out`` cannot be written.
+        UsageError: ``out`` and ``model`` have the same name, or of two PLYs the same sidecar.
+        OutputError: ``out`` cannot be written, or its format cannot hold thresholds.
     """
+    from fragprune_plugins.storage import formats
     from fragprune_plugins.storage.atomic import writable_folder
 
-    if out.resolve().with_suffix("") == model.resolve().with_suffix(""):
+    form = formats.named(out)
+    if thresholds:
+        formats.expect_carrier(form, out)
+    own, other = out.resolve(), model.resolve()
+    if form.paired and other.suffix.lower() == ".ply":
+        own, other = own.with_suffix(""), other.with_suffix("")
+    if own == other:
         raise UsageError(
             "--out", f"{out}, the model's name", "another name", "Choose another name."
         )
     writable_folder(out.parent)
     if out.is_dir():
-        raise OutputError(str(out), "a folder", "a .ply file", "Name a file in the folder.")
+        raise OutputError(
+            str(out), "a folder", f"a {form.suffix} file", "Name a file in the folder."
+        )
+
+
+def describe_written(out: Path, held: str = "") -> str:
+    """What a model was written into, and what its format does not keep.
+
+    Args:
+        out: the file.
+        held: how it holds thresholds, as words; "" where there are none.
+    """
+    from fragprune_plugins.storage import formats
+
+    form = formats.named(out)
+    kept = f" {form.name} keeps {form.keeps}." if form.keeps else ""
+    return f"Wrote {out}{held}.{kept}"
 
 
 JSON = "fragprune.json"

@@ -1,4 +1,4 @@
-"""``fragprune export``: writes a PLY with a column of thresholds, for other tools."""
+"""``fragprune export``: writes a model with its thresholds into one file, of any format."""
 
 from __future__ import annotations
 
@@ -12,71 +12,103 @@ from fragprune_plugins.cli.common import (
     OutFile,
     Report,
     describe_dropped,
+    describe_written,
     dropping,
     require_place,
+    truncation_option,
 )
 from fragprune_plugins.errors import SidecarError
-from fragprune_plugins.storage import models
+from fragprune_plugins.storage import formats, models
 
 
 @click.command("export", cls=Command)
 @click.argument("model", type=MODEL)
-@click.option("--out", type=OutFile(".ply"), required=True, help="PLY to write.")
+@click.option(
+    "--out",
+    type=OutFile(*formats.ENDINGS),
+    required=True,
+    help="File to write; its suffix names the format: " + ", ".join(formats.SUFFIXES) + ".",
+)
 @click.option(
     "--drop-invisible",
     "drop",
     is_flag=True,
     help="Leave out Gaussians that no view can draw, with an opacity below 1/255.",
 )
-def command(model: Path, out: Path, drop: bool) -> Report:
-    """Write MODEL with a further column for its thresholds.
+@truncation_option
+def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
+    """Write MODEL with its thresholds into one file.
 
-    The column trunc_threshold holds the threshold, a falloff in (0, 1). A renderer gets the same
+    A .ply gets a further column, trunc_threshold: a falloff in (0, 1). A renderer gets the same
     picture as fragprune if it draws a fragment only where exp(-q/2) >= trunc_threshold, with q the
     squared Mahalanobis distance. Tools that read columns by name ignore a column that they do not
-    know.
+    know. .spz, .sog and .glb hold thresholds as extensions, which other readers skip.
+
+    .splat and .compressed.ply cannot hold thresholds: they are written with --no-truncation only.
+    What a format does not keep is said when it is written.
 
     \b
-    Example:
+    Examples:
       fragprune export pruned.ply --out for_viewer.ply
+      fragprune export pruned.ply --out pruned.spz
+      fragprune export model.spz --out model.ply --no-truncation
     """
     from fragprune_plugins.measure.visibility import visible
     from fragprune_plugins.storage import sidecar
-    from fragprune_plugins.storage.atomic import staging
+    from fragprune_plugins.storage.atomic import put, staging
     from fragprune_plugins.storage.ply import THRESHOLD_COLUMN, write_ply
 
-    require_place(out, model)
-    splat, store = models.load(model)
-    if store is None:
-        raise SidecarError(
-            str(sidecar.path_beside(model)),
-            "no thresholds for this model",
-            "a sidecar beside it, written by fragprune",
-            "Run fragprune finetune first.",
-        )
-    thresholds = splat.thresholds  # a column keeps its bits
-    if thresholds is None or sidecar.find(model):
-        thresholds = store.values.detach()
+    form = formats.named(out)
+    require_place(out, model, thresholds=not no_truncation)
+    splat, store = models.load(model, truncation=not no_truncation)
+    thresholds = None
+    if not no_truncation:
+        if store is None:
+            raise SidecarError(
+                str(sidecar.path_beside(model)),
+                "no thresholds for this model",
+                "a sidecar beside it, written by fragprune, or a file that holds them",
+                "Run fragprune finetune first; --no-truncation writes a model without thresholds.",
+            )
+        thresholds = splat.thresholds  # a column keeps its bits
+        if thresholds is None or (formats.found(model).paired and sidecar.find(model)):
+            thresholds = store.values.detach()
+
+    def write(new: Path) -> None:
+        if form.paired:
+            write_ply(new, splat, thresholds)
+        else:
+            formats.write(form, new, splat, thresholds)
+
     dropped, lines, count = None, [], len(splat)
     with staging(out) as folder:
         new = folder / out.name
-        write_ply(new, splat, thresholds)
+        write(new)
         size = new.stat().st_size
         if drop:
             kept = visible(splat, thresholds)
             splat = splat.keep(kept)
-            write_ply(new, splat, thresholds[kept])
-        sidecar.replace_pair(out, new, None)  # removes that of an earlier model under this name
+            thresholds = None if thresholds is None else thresholds[kept]
+            write(new)
+        if form.paired:  # removes the sidecar of an earlier model under this name
+            sidecar.replace_pair(out, new, None)
+        else:
+            put(new, out)
     if drop:
         dropped = dropping(out, size, count, len(splat))
         lines.append(describe_dropped(dropped, "too faint for any view"))
-    lines.append(f"Wrote {out}: {len(splat)} Gaussians with {THRESHOLD_COLUMN}.")
+    held = "thresholds" if thresholds is not None else "no thresholds"
+    column = THRESHOLD_COLUMN if form.paired and thresholds is not None else None
+    lines.append(describe_written(out, f": {len(splat)} Gaussians with {column or held}"))
     return Report(
         {
             "model": str(model),
             "out": str(out),
+            "format": form.name,
+            "keeps": form.keeps or None,
             "gaussians": len(splat),
-            "column": THRESHOLD_COLUMN,
+            "thresholds": thresholds is not None,
+            "column": column,
             "dropped": dropped,
         },
         "\n".join(lines),

@@ -29,7 +29,7 @@ from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage import models
+from fragprune_plugins.storage import formats, models
 from fragprune_plugins.storage.atomic import locked
 
 if TYPE_CHECKING:
@@ -59,7 +59,11 @@ def _share(
 @click.command("finetune", cls=Command)
 @click.argument("model", type=MODEL)
 @click.option(
-    "--out", type=OutFile(".ply"), required=True, help="New .ply; its sidecar goes beside it."
+    "--out",
+    type=OutFile(*formats.ENDINGS),
+    required=True,
+    help="New model: .ply, whose sidecar goes beside it, or .spz, .sog, .glb, which hold the "
+    "thresholds themselves. .splat and .compressed.ply cannot hold any.",
 )
 @click.option(
     "--data",
@@ -142,9 +146,10 @@ def command(
 
     Thresholds and all other parameters adapt to each other on the photographs in --data. With
     --train opacity, positions, shapes and colours stay bit for bit. OUT has the columns of
-    MODEL, and the thresholds go beside it into OUT.fragprune.safetensors. The table compares both
-    models on held-out views. A line below it measures OUT without its thresholds, as other viewers
-    draw it. Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
+    MODEL, and the thresholds go beside it into OUT.fragprune.safetensors; a .spz, .sog or .glb
+    holds them itself. The table compares both models on held-out views. A line below it measures
+    OUT without its thresholds, as other viewers draw it. Ctrl-C (exit code 130) and SIGTERM (143)
+    save what was learned so far.
 
     The same command goes on where it was interrupted or killed. If OUT is finished already, it says
     so and does nothing; --again begins anew.
@@ -166,10 +171,11 @@ def command(
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
       fragprune finetune point_cloud.ply --data scene --out light.ply --portable
       fragprune finetune statue.ply --self --out pruned.ply
+      fragprune finetune statue.spz --self --out pruned.spz
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
     _require_sense(data, itself, cameras, settings, max_drop, keep)
-    require_place(out, model)
+    require_place(out, model, thresholds=settings.truncate and not settings.portable)
     click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
     from copy import deepcopy

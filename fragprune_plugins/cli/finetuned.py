@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fragprune_plugins.cli.common import Report, describe_dropped
+from fragprune_plugins.cli.common import Report, describe_dropped, describe_written
 from fragprune_plugins.errors import RecordError, SidecarError
 from fragprune_plugins.learning.interruption import EXIT_CODE
-from fragprune_plugins.storage import records
+from fragprune_plugins.storage import formats, records
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from torch import Tensor
 
@@ -156,13 +156,19 @@ class Finetuned:
         plain = data["untruncated"]
         if plain is not None:
             lines.append(describe_untruncated(before, plain))
+        form = formats.named(self.out)
         if settings.portable:
+            held = ", which needs no sidecar: every viewer draws it as it is"
+            lines.append(describe_written(self.out, held))
+        elif not form.paired:
             lines.append(
-                f"Wrote {self.out}, which needs no sidecar: every viewer draws it as it is."
+                describe_written(self.out, ", which holds the thresholds" if plain else "")
             )
         else:
             together = " Keep the two together." if plain is not None else ""
             lines.append(f"Wrote {self.out} and {sidecar.path_beside(self.out).name}.{together}")
+        if form.keeps:
+            lines.append("The figures above are of the model as it was learned, before rounding.")
         return "\n".join(lines)
 
 
@@ -174,12 +180,19 @@ def finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report | 
         return None
     try:
         record = records.beside(out)
-        plain = asked["portable"]
-        alone = sidecar.find(out) is None if plain else sidecar.belongs(out)
-        done = record is not None and record.command == "finetune" and alone
+        if not formats.named(out).paired:
+            whole = True  # the file holds its thresholds itself
+        elif asked["portable"]:
+            whole = sidecar.find(out) is None
+        else:
+            whole = sidecar.belongs(out)
+        done = record is not None and record.command == "finetune" and whole
     except (RecordError, SidecarError):
         return None
+    written = None if record is None else Path(str(record.data.get("out"))).name
     if record is None or not done or record.data.get("configuration") != asked:
+        return None
+    if written != out.name:  # a model of the same name in another format
         return None
     data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
     if curves is not None:
@@ -207,7 +220,8 @@ def terminated(model: Path, out: Path, result: FinetuneResult, found: Bounded | 
         "engine": result.engine,
         "settings": asked.as_dict(),
     }
-    wrote = f"{out}" if asked.portable else f"{out} and its sidecar"
+    alone = asked.portable or not formats.named(out).paired
+    wrote = f"{out}" if alone else f"{out} and its sidecar"
     at = f"SIGTERM at {done.steps} of {asked.iterations} iterations."
     text = f"{at} Wrote {wrote}. {_goes_on(found)}"
     return Report(data, text, exit_code=EXIT_CODE)

@@ -14,7 +14,7 @@ from fragprune_plugins.datasets.dataset import Dataset
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.measure import Candidate
-from fragprune_plugins.storage import models, sidecar
+from fragprune_plugins.storage import formats, models, sidecar
 from fragprune_plugins.storage.atomic import digest
 
 
@@ -43,7 +43,7 @@ def load_columns(
         if store is not None:
             values = store.values.detach().cpu().numpy().tobytes()
             said[label]["thresholds"] = hashlib.sha256(values).hexdigest()
-        if sidecar.lies_beside(path):
+        if formats.found(path).paired and sidecar.lies_beside(path):
             said[label]["learned"] = sidecar.load(path)[1].settings
         if store is not None and len(paths) == 1:
             columns[f"{label}, untruncated"] = Candidate(splat)

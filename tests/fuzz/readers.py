@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -54,6 +55,22 @@ def _ply(file: Path) -> None:
         thresholds = None if store is None else store.values
         drawn = _engine().rasterize(RasterInputs(_view(), splat.splats(), planes=()), thresholds)
     _sound("a picture that is not finite", bool(drawn.image.isfinite().all()))
+
+
+def _format(suffix: str) -> Callable[[Path], None]:
+    """A file of a model under its suffix."""
+
+    def read(file: Path) -> None:
+        _ply(file.rename(file.with_name(f"m{suffix}")))
+
+    return read
+
+
+def _sog_beside(file: Path) -> None:
+    """``meta.json`` of a SOG; the images beside it are good."""
+    with zipfile.ZipFile(next((seeds.CORPUS / "sog").glob("degree1.*"))) as archive:
+        archive.extractall(file.parent)
+    _ply(file.replace(file.with_name("meta.json")))
 
 
 def _sidecar(file: Path) -> None:
@@ -195,6 +212,9 @@ class Reader:
 
 READERS = [
     Reader("ply", _ply),
+    *(Reader(name, _format(f".{name}")) for name in ("compressed.ply", "spz", "sog", "glb")),
+    Reader("splat", _format(".splat")),
+    Reader("sog.json", _sog_beside),
     Reader("sidecar", _sidecar),
     *(Reader(name, _colmap(name)) for name in ("cameras.bin", "images.bin")),
     *(Reader(name, _colmap(name)) for name in ("cameras.txt", "images.txt")),

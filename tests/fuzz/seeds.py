@@ -6,9 +6,12 @@ reader; nothing here makes or removes them.
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
+import struct
 import tempfile
+import zipfile
 from itertools import chain
 from pathlib import Path
 
@@ -20,7 +23,8 @@ from plyfile import PlyData
 
 from fragprune_plugins.engines.cost import UNITS, Cost
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import checkpoints, records, sidecar
+from fragprune_plugins.storage import checkpoints, formats, records, sidecar
+from fragprune_plugins.storage.formats.spz import zstd
 from fragprune_plugins.storage.ply import write_ply
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -77,6 +81,39 @@ def model(degree: int = 0, count: int = GAUSSIANS) -> bytes:
         path = Path(folder) / "m.ply"
         write_ply(path, tiny.random_model(count, degree), torch.full((count,), 0.2))
         return path.read_bytes()
+
+
+def _formats(folder: Path) -> dict[str, dict[str, bytes]]:
+    """Small models in each other format, with and without SH and thresholds."""
+    made: dict[str, dict[str, bytes]] = {}
+    for form in formats.FORMATS:
+        if form is formats.PLY:
+            continue
+        files = made.setdefault(form.suffix[1:], {})
+        for degree in (0, 1):
+            path = folder / f"degree{degree}{form.suffix}"
+            thresholds = torch.full((GAUSSIANS,), 0.2) if form.carries else None
+            splat = tiny.random_model(GAUSSIANS, degree)
+            formats.write(form, path, splat, thresholds)
+            files[path.name] = path.read_bytes()
+    header, parts = _spz_parts(made["spz"]["degree1.spz"])
+    made["spz"]["version3.spz"] = gzip.compress(
+        header[:4] + b"\3" + header[5:14] + b"\0\0" + b"".join(parts), mtime=0
+    )
+    with zipfile.ZipFile(io.BytesIO(made["sog"]["degree1.sog"])) as archive:
+        made["sog.json"] = {"a.json": archive.read("meta.json")}
+    return made
+
+
+def _spz_parts(content: bytes) -> tuple[bytes, list[bytes]]:
+    """The header of an SPZ of version 4, and its decompressed streams."""
+    number, (start,) = content[15], struct.unpack_from("<I", content, 16)
+    at, parts = start + 16 * number, []
+    for index in range(number):
+        (size,) = struct.unpack_from("<Q", content, start + 16 * index)
+        parts.append(zstd.decompress(content[at : at + size]))
+        at += size
+    return content[:16], parts
 
 
 def _as(content: bytes, **how: object) -> bytes:
@@ -209,6 +246,7 @@ def make() -> dict[str, dict[str, bytes]]:
                 "text.ply": _as(model(), text=True),
                 "big-endian.ply": _as(model(), byte_order=">"),
             },
+            **_formats(folder),
             "sidecar": {"a.safetensors": _sidecar(folder)},
             "cameras.bin": {"a.bin": binary["cameras.bin"]},
             "images.bin": {"a.bin": binary["images.bin"]},

@@ -85,7 +85,11 @@ FORMATS = (
     Format("GLB", ".glb", "glb", carries=True, keeps="all values and thresholds as float32"),
 )
 
-SUFFIXES = tuple(each.suffix for each in FORMATS)
+SUFFIXES = (".ply", *(each.suffix for each in FORMATS if each is not PLY))
+"""The end of the name of every file that is read and written."""
+
+ENDINGS = tuple(each for each in SUFFIXES if each != COMPRESSED_PLY.suffix)
+"""The last suffixes of such names; that of a compressed PLY is .ply."""
 
 _DOOR = Door(
     ModelFileError,
@@ -155,15 +159,8 @@ def write(form: Format, new: Path, splat: SplatFile, thresholds: Tensor | None) 
     Raises:
         OutputError: the format cannot hold the model or its thresholds.
     """
-    if thresholds is not None and not form.carries:
-        raise OutputError(
-            new.name,
-            f"a {form.name} file, which cannot hold thresholds: the picture would be worse and "
-            "heavier than the pruned one",
-            "a file that holds them (" + ", ".join(e.suffix for e in FORMATS if e.carries) + ")",
-            "Choose another suffix. fragprune export --no-truncation writes the model without "
-            "thresholds; finetune --portable learns one that needs none.",
-        )
+    if thresholds is not None:
+        expect_carrier(form, new)
     if splat.filter_3d is not None:
         raise OutputError(
             new.name,
@@ -180,6 +177,19 @@ def write(form: Format, new: Path, splat: SplatFile, thresholds: Tensor | None) 
             raise OutputError(
                 new.name, found, "another format", "Choose another suffix."
             ) from error
+
+
+def expect_carrier(form: Format, path: Path) -> None:
+    """Raise OutputError if files of a format cannot hold thresholds."""
+    if not form.carries:
+        raise OutputError(
+            str(path),
+            f"a {form.name} file, which cannot hold thresholds: its picture would be worse and "
+            "heavier than that of the pruned model",
+            "a file that holds them: " + ", ".join(e.suffix for e in FORMATS if e.carries),
+            "Choose another suffix. fragprune export --no-truncation writes the model without its "
+            "thresholds; fragprune finetune --portable learns a model that needs none.",
+        )
 
 
 def _module(form: Format) -> Any:

@@ -42,16 +42,14 @@ _VERTEX = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 def lies_at(path: Path) -> bool:
     """Whether a file is a PLY of this kind."""
-    if not path.is_file():
-        return False
-    with open(path, "rb") as file:
-        if file.read(3) != b"ply":
-            return False
-        file.seek(0)
-        head = file.read(HEADER_MAX)
     try:
+        if not path.is_file():
+            return False
+        with open(path, "rb") as file:
+            head = file.read(3)
+            head += file.read(HEADER_MAX) if head == b"ply" else b""
         lines = header_lines(head)[0]
-    except ValueError:
+    except (OSError, ValueError):  # whoever reads it states what is wrong
         return False
     return any(line.strip().endswith(b" packed_position") for line in lines)
 

@@ -17,8 +17,8 @@ _DEPTH = 16  # a palette has at most 2^16 entries
 def codebook(values: npt.NDArray[Any], size: int = 256) -> Floats:
     """(size,) ascending values with a small mean squared distance to values of any shape.
 
-    Values that are few enough stay as they are. Else Lloyd's algorithm in one dimension, from the spacing that is best for many levels: the cube root
-    of the density (Panter and Dite).
+    Values that are few enough stay as they are. Else it is Lloyd's algorithm in one dimension, from
+    the spacing that is best for many levels: the cube root of the density (Panter and Dite).
     """
     few = np.unique(values)
     if len(few) <= size:

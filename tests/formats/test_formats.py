@@ -1,0 +1,302 @@
+"""Every format: what is written comes back within its own quantisation."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+from formats.scenes import apart, random_splat, splats
+from hypothesis import HealthCheck, given, settings
+
+from fragprune_plugins import Model, ThresholdStore, load, save
+from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
+from fragprune_plugins.storage import cutoffs, formats, sidecar
+from fragprune_plugins.storage.formats.values import morton_order, turned
+from fragprune_plugins.storage.ply import read_ply, write_ply
+
+# Half a step of each format's own quantisation, with the values that ``random_splat`` has.
+# xyz lie within 8 (16 across), colours within 0.5 +- 0.43, log scales within -7 to 1.
+BOUNDS = {
+    ".spz": {
+        "xyz": 0.5 / 4096,
+        "colour": 0.28209479 * 0.5 / 255 / 0.15,
+        "rest": 8.5 / 128,  # rounded to one of 256 levels, then to every 16th
+        "opacity": 0.5 / 255,
+        "scaling": 1 / 32,
+        "shape": 0.13,  # scales differ by 3 % each, so variances by 6 %
+    },
+    ".glb": {
+        "xyz": 0,
+        "colour": 0,
+        "rest": 0,
+        "opacity": 1e-6,
+        "scaling": 1e-5,
+        "shape": 1e-4,
+    },
+    ".sog": {
+        "xyz": 9 * 2 * math.log(9) / 65535 / 2 * 1.01,  # d x / d log(1 + x) is at most 9
+        "colour": 1e-6,  # so few values have a codebook of their own, but for the rest
+        "rest": 0.02,
+        "opacity": 0.5 / 255,
+        "scaling": 1e-6,
+        "shape": 0.02,
+    },
+    ".compressed.ply": {
+        "xyz": 16 / 1023 / 2,
+        "colour": 0.86 / 255 / 2,
+        "rest": 8 / 256 * 1.01,
+        "opacity": 0.5 / 255,
+        "scaling": 8 / 1023 / 2,
+        "shape": 0.03,
+    },
+    ".splat": {
+        "xyz": 0,
+        "colour": 0.51 / 255,
+        "rest": 0,
+        "opacity": 0.51 / 255,
+        "scaling": 1e-5,
+        "shape": 0.03,
+    },
+}
+SORTED = (".sog", ".compressed.ply")
+CARRIERS = (".spz", ".sog", ".glb")
+few = settings(
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def through(suffix, model):
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"model{suffix}"
+        save(path, model)
+        return load(path)
+
+
+@pytest.mark.parametrize("suffix", BOUNDS)
+@few
+@given(splat=splats)
+def test_what_is_written_comes_back(suffix, splat):
+    back = through(suffix, Model(splat)).splat
+    if suffix in SORTED:
+        splat = splat.keep(morton_order(splat))
+    if suffix == ".splat":
+        splat = type(splat)(**{**vars(splat), "f_rest": splat.f_rest[:, :0]})
+    found, bounds = apart(splat, back), BOUNDS[suffix]
+    assert all(found[name] <= bounds[name] + 2e-6 for name in found), (found, bounds)  # float32
+
+
+@pytest.mark.parametrize("suffix", CARRIERS)
+@few
+@given(splat=splats)
+def test_thresholds_come_back_with_their_rows(suffix, splat):
+    tau = torch.linspace(0.004, 0.97, len(splat))
+    store = ThresholdStore.from_falloff(tau)
+    back = through(suffix, Model(splat, store)).thresholds
+    wanted = cutoffs.encode(tau if suffix not in SORTED else tau[morton_order(splat)])
+    if back is None:  # a row alone may have been rounded to 1/255
+        assert not wanted.any()
+    else:
+        assert cutoffs.encode(back.values.detach()).tolist() == wanted.tolist()
+
+
+@pytest.mark.parametrize("suffix", CARRIERS)
+def test_neutral_rows_stay_neutral_and_a_neutral_store_is_not_written(suffix, tmp_path):
+    splat = random_splat(9, 0, 3)
+    store = ThresholdStore(9)
+    path = tmp_path / f"a{suffix}"
+    save(path, Model(splat, store))
+    without = path.read_bytes()
+    save(path, Model(splat))
+    assert path.read_bytes() == without
+    assert load(path).thresholds is None
+    with torch.no_grad():
+        store.logits[4] = 0.0
+    save(path, Model(splat, store))
+    values = load(path).thresholds.values.detach()
+    assert sorted((values < 1e-9).tolist()) == [False] + [True] * 8
+    assert load(path, truncation=False).thresholds is None
+
+
+@pytest.mark.parametrize("suffix", BOUNDS)
+def test_the_same_model_gives_the_same_bytes(suffix, tmp_path):
+    one, other = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    for path in (one, other):
+        save(path, Model(random_splat(40, 2, 1)))
+    assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".compressed.ply"])
+def test_a_format_without_thresholds_refuses_them(suffix, tmp_path):
+    path = tmp_path / f"a{suffix}"
+    store = ThresholdStore.from_falloff(torch.full((5,), 0.4))
+    with pytest.raises(OutputError, match="cannot hold thresholds"):
+        save(path, Model(random_splat(5, 0, 0), store))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plain_ply_beside_other_formats_keeps_its_sidecar(tmp_path):
+    splat, store = random_splat(5, 0, 0), ThresholdStore.from_falloff(torch.full((5,), 0.4))
+    save(tmp_path / "a.ply", Model(splat, store))
+    for suffix in BOUNDS:
+        save(tmp_path / f"a{suffix}", Model(splat))
+        assert load(tmp_path / f"a{suffix}").thresholds is None
+    assert torch.equal(load(tmp_path / "a.ply").thresholds.logits, store.logits)
+
+
+def test_axes_that_turn_twice_are_as_they_were():
+    splat = random_splat(7, 3, 5)
+    for signs in ((-1, -1, 1), (1, -1, -1)):
+        once = turned(splat, signs)
+        assert not torch.equal(once.f_rest, splat.f_rest)
+        assert apart(turned(once, signs), splat)["shape"] < 1e-6
+        assert torch.equal(turned(once, signs).f_rest, splat.f_rest)
+
+
+def test_a_turned_scene_looks_the_same_from_a_turned_camera():
+    """The SH signs, against an evaluation of the basis at turned directions."""
+    from fragprune_plugins import rasterize
+    from fragprune_plugins.datasets.pinhole import Camera
+    from fragprune_plugins.types import RasterInputs
+
+    splat, camera = tiny.random_model(degree=3), tiny.cameras(9)[2]
+    signs = (-1, -1, 1)
+    flip = torch.diag(torch.tensor(signs, dtype=torch.float64))
+    lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    moved = Camera(camera.rotation @ flip, camera.translation, *lens)
+    with torch.no_grad():
+        one = rasterize(RasterInputs(camera.view(), splat.splats())).image
+        other = rasterize(RasterInputs(moved.view(), turned(splat, signs).splats())).image
+    assert float((one - other).abs().max()) < 1e-4
+
+
+def test_sog_beside_its_images(tmp_path):
+    import zipfile
+
+    splat = random_splat(60, 1, 0)
+    store = ThresholdStore.from_falloff(torch.linspace(0.01, 0.9, 60))
+    save(tmp_path / "a.sog", Model(splat, store))
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path / "folder")
+    one, other = load(tmp_path / "a.sog"), load(tmp_path / "folder" / "meta.json")
+    assert max(apart(one.splat, other.splat).values()) == 0
+    assert torch.equal(one.thresholds.logits, other.thresholds.logits)
+    meta = tmp_path / "folder" / "meta.json"
+    meta.write_text(meta.read_text().replace("quats.webp", "../a.sog"))
+    with pytest.raises(ModelFileError, match=r"an image at '\.\./a\.sog'"):
+        load(meta)
+
+
+def test_spz_names_its_axes(tmp_path):
+    """The record that says RUB turns y and z; one that exchanges axes is refused."""
+    import struct
+
+    path = tmp_path / "a.spz"
+    splat = random_splat(5, 1, 0)
+    save(path, Model(splat))
+    content = path.read_bytes()
+
+    def axes(system):
+        record = struct.pack("<III", 0xADBE0003, 4, system)
+        head = content[:14] + b"\x02" + content[15:16] + struct.pack("<I", 32 + len(record))
+        path.write_bytes(head + content[20:32] + record + content[32:])
+        return load(path).splat
+
+    path.write_bytes(content)
+    plain = load(path).splat
+    assert torch.equal(axes(6).xyz, plain.xyz)
+    assert torch.equal(axes(4).xyz, plain.xyz * torch.tensor([1.0, -1.0, -1.0]))
+    with pytest.raises(ModelFileError, match="coordinate system 12"):
+        axes(12)
+
+
+def test_spz_of_a_scene_wider_than_its_usual_bits(tmp_path):
+    splat = random_splat(5, 0, 0)
+    wide = type(splat)(**{**vars(splat), "xyz": splat.xyz * 5000})
+    save(tmp_path / "a.spz", Model(wide))
+    assert float((load(tmp_path / "a.spz").splat.xyz - wide.xyz).abs().max()) <= 1 / 128
+    far = type(splat)(**{**vars(splat), "xyz": splat.xyz * 1e7})
+    with pytest.raises(OutputError, match="24 bits"):
+        save(tmp_path / "b.spz", Model(far))
+    assert not (tmp_path / "b.spz").exists()
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".glb", ".splat"])
+@pytest.mark.parametrize("content", [b"", b"\0" * 7, b"NGSP", b"PK\x03\x04", b"glTF\x02", b"ply\n"])
+def test_what_is_no_such_file_is_one_error(suffix, content, tmp_path):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(ModelFileError) as caught:
+        load(path)
+    assert caught.value.where == str(path)
+
+
+def test_a_missing_file_names_what_is_read(tmp_path):
+    with pytest.raises(ModelFileError, match=r"\.sog"):
+        load(tmp_path / "a.spz")
+
+
+def test_every_suffix_has_a_format_and_others_none():
+    for suffix in formats.SUFFIXES:
+        assert formats.named(Path(f"a{suffix.upper()}")).suffix == suffix
+    with pytest.raises(OutputError):
+        formats.named(Path("a.obj"))
+
+
+@pytest.mark.parametrize("suffix", formats.SUFFIXES)
+def test_commands_convert(suffix, tmp_path):
+    _, path, model = tiny.scene(tmp_path)
+    write_ply(path, model, torch.linspace(0.1, 0.9, len(model)))
+    form = formats.named(tmp_path / f"out{suffix}")
+    out, back = tmp_path / f"out{suffix}", tmp_path / "back.ply"
+    flag = () if form.carries else ("--no-truncation",)
+    report = run_json("export", path, "--out", out, *flag)
+    assert (report["format"], report["thresholds"]) == (form.name, form.carries)
+    assert report["keeps"] == (form.keeps or None)
+    text = run("export", path, "--out", out, *flag).stdout
+    assert form.keeps in text
+    run_json("export", out, "--out", back, *flag)
+    assert len(read_ply(back)) == len(model)
+    assert (read_ply(back).thresholds is None) == (not form.carries)
+
+
+def test_export_says_why_it_refuses(tmp_path):
+    _, path, model = tiny.scene(tmp_path)
+    write_ply(path, model, torch.linspace(0.1, 0.9, len(model)))
+    result = run("export", path, "--out", tmp_path / "a.splat")
+    assert result.exit_code == 1
+    assert "cannot hold thresholds" in result.stderr
+    assert "--no-truncation" in result.stderr
+    assert not (tmp_path / "a.splat").exists()
+
+
+def test_finetune_reads_and_writes_spz(tmp_path):
+    data, _, model = tiny.scene(tmp_path)
+    start, out = tmp_path / "start.spz", tmp_path / "pruned.spz"
+    save(start, Model(model))
+    words = ("finetune", start, "--data", data, "--out", out, "--iters", 10)
+    report = run_json(*words)
+    assert report["out"] == str(out)
+    assert load(out).thresholds is not None
+    assert not sidecar.path_beside(out).exists()
+    assert run_json(*words)["already_finished"]
+    ply = (*words[:-3], tmp_path / "pruned.ply", *words[-2:])
+    assert not run_json(*ply)["already_finished"]  # its record has the same name
+    refused = run(*words[:-3], tmp_path / "pruned.splat", *words[-2:])
+    assert refused.exit_code == 1
+    assert "cannot hold thresholds" in refused.stderr
+
+
+@pytest.mark.parametrize("wrong", ["positions", "no file"])
+def test_values_that_cannot_be_drawn_are_refused(wrong, tmp_path):
+    path = tmp_path / "a.splat"
+    save(path, Model(random_splat(3, 0, 0)))
+    content = bytearray(path.read_bytes())
+    content[0:4] = b"\xff\xff\xff\x7f"  # NaN
+    path.write_bytes(content if wrong == "positions" else content[:40])
+    with pytest.raises(FragpruneError, match="NaN" if wrong == "positions" else "multiple"):
+        load(path)
