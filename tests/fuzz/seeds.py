@@ -96,7 +96,7 @@ def _formats(folder: Path) -> dict[str, dict[str, bytes]]:
             splat = tiny.random_model(GAUSSIANS, degree)
             formats.write(form, path, splat, thresholds)
             files[path.name] = path.read_bytes()
-    header, parts = _spz_parts(made["spz"]["degree1.spz"])
+    header, parts = spz_parts(made["spz"]["degree1.spz"])
     made["spz"]["version3.spz"] = gzip.compress(
         header[:4] + b"\3" + header[5:14] + b"\0\0" + b"".join(parts), mtime=0
     )
@@ -105,7 +105,7 @@ def _formats(folder: Path) -> dict[str, dict[str, bytes]]:
     return made
 
 
-def _spz_parts(content: bytes) -> tuple[bytes, list[bytes]]:
+def spz_parts(content: bytes) -> tuple[bytes, list[bytes]]:
     """The header of an SPZ of version 4, and its decompressed streams."""
     number, (start,) = content[15], struct.unpack_from("<I", content, 16)
     at, parts = start + 16 * number, []
