@@ -47,7 +47,7 @@ def _size(text: str) -> tuple[int, int]:
     show_default=True,
     help="Number of Gaussians in the generated scene; may be given several times.",
 )
-@click.option("--model", type=MODEL, help="Time this .ply with its own thresholds instead.")
+@click.option("--model", type=MODEL, help="Time this model with its own thresholds instead.")
 @click.option("--cameras", type=FILE, help="With --model: file of cameras; the first one draws.")
 @click.option(
     "--repeats",

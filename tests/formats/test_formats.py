@@ -214,6 +214,37 @@ def test_spz_names_its_axes(tmp_path):
         axes(12)
 
 
+def test_what_is_not_followed_is_named(tmp_path, caplog):
+    import struct
+
+    path = tmp_path / "a.spz"
+    save(path, Model(random_splat(5, 1, 0)))
+    content = path.read_bytes()
+    assert load(path)
+    assert not caplog.messages
+    record = struct.pack("<II", 0xADBE0002, 12) + bytes(12)
+    head = content[:14] + b"\x03" + content[15:16] + struct.pack("<I", 32 + len(record))
+    path.write_bytes(head + content[20:32] + record + content[32:])
+    assert load(path)
+    assert "antialiasing" in caplog.messages[0]
+    assert "0xadbe0002" in caplog.messages[1]
+
+
+def test_more_gaussians_than_a_file_can_hold_are_not_allocated(tmp_path):
+    import struct
+
+    from fragprune_plugins.storage.formats.spz import zstd
+
+    path, count = tmp_path / "a.spz", 100_000_000
+    save(path, Model(random_splat(5, 0, 0)))
+    bomb = zstd.compress(bytes(9 * 1000))
+    head = struct.pack("<IIIBBBBI", 0x5053474E, 4, count, 0, 12, 0, 5, 32) + bytes(12)
+    table = b"".join(struct.pack("<QQ", len(bomb), count * width) for width in (9, 1, 3, 3, 4))
+    path.write_bytes(head + table + 5 * bomb)
+    with pytest.raises(ModelFileError, match="100000000 Gaussians in"):
+        load(path)
+
+
 def test_spz_of_a_scene_wider_than_its_usual_bits(tmp_path):
     splat = random_splat(5, 0, 0)
     wide = type(splat)(**{**vars(splat), "xyz": splat.xyz * 5000})

@@ -28,6 +28,7 @@ from fragprune_plugins.storage.formats.values import (
     byte,
     codes_of,
     expect_plausible,
+    log,
     morton_order,
     of_codes,
     opacities_of,
@@ -47,7 +48,6 @@ _SIDE_MAX = 16383  # of a WebP
 _COEFFICIENTS = (0, 3, 8, 15)
 _PALETTE = 64  # entries in a row of the image of SH
 _SQRT2 = 2**0.5
-_FLAT = 64  # times more than other streams a WebP may stand for: it may be of one colour
 _DOOR = Door(ModelFileError, "not readable as WebP", "an image of a SOG", "Copy the model again.")
 
 Load = Callable[[str], bytes]
@@ -83,7 +83,6 @@ def _beside(reading: Reading) -> Load:
         if Path(name).name != name:
             raise ValueError(f"an image at {name[:80]!r}")
         with _DOOR.reading(reading.path.parent / name) as image:
-            reading.size += image.size
             return image.take(image.size)
 
     return load
@@ -93,13 +92,14 @@ def _read(meta: dict[str, Any], load: Load) -> SplatFile:
     if meta.get("version") != 2:
         raise ValueError(f"version {meta.get('version')!r} of SOG")
     count = meta["count"]
-    if not isinstance(count, int) or not 0 < count <= _SIDE_MAX**2:
+    if not isinstance(count, int):
         raise ValueError(f"{count!r} Gaussians")
+    expect_plausible(count, len(load(meta["means"]["files"][0])))
+    if (kind := meta.get("model", "default")) != "default":
+        log.warning("SOG: its training model is %.40r, and is drawn as 3DGS draws", kind)
 
     def image(part: dict[str, Any], index: int = 0) -> Bytes:
-        data = load(part["files"][index])
-        expect_plausible(count, _FLAT * len(data))
-        return _pixels(data, count).reshape(-1, 4)[:count]
+        return _pixels(load(part["files"][index]), count).reshape(-1, 4)[:count]
 
     means, scales, base = meta["means"], meta["scales"], meta["sh0"]
     low, high = (np.array(means[end], np.float64).reshape(3) for end in ("mins", "maxs"))

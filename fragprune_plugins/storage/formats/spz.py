@@ -24,6 +24,7 @@ from fragprune_plugins.storage.formats.values import (
     byte,
     codes_of,
     expect_plausible,
+    log,
     of_codes,
     opacities_of,
     quaternions_of,
@@ -50,7 +51,7 @@ _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, points, SH degree, fraction bits, flags, n
 _RECORD = struct.Struct("<II")
 _ENTRY = struct.Struct("<QQ")
-_EXTENDED = 0x2  # a bit of the flags
+_ANTIALIASED, _EXTENDED = 0x1, 0x2  # bits of the flags
 _FRACTION_BITS = 12
 _COLOUR_SCALE = 0.15
 _LEVEL = 12  # of zstd, as Niantic's writer has it
@@ -80,6 +81,10 @@ def read(reading: Reading) -> SplatFile:
         zone = reading.take(start - 32)
         records = _records(zone) if header.extended else {}
         parts = _streams(reading, header)
+    if header.antialiased:
+        log.warning("SPZ: it was trained with antialiasing, and is drawn as 3DGS draws, without")
+    if unknown := records.keys() - {CUTOFFS, _COORDINATES}:
+        log.warning("SPZ: skipped extension(s) %s", ", ".join(f"{each:#010x}" for each in unknown))
     splat = _splat(header, parts, records.get(CUTOFFS))
     return turned(splat, _axes(records.get(_COORDINATES)))
 
@@ -96,7 +101,7 @@ class _Header:
             raise ValueError(f"SH degree {degree}, where we draw up to 3")
         if self.bits > 23:
             raise ValueError(f"{self.bits} bits of fraction in 24")
-        self.extended = bool(flags & _EXTENDED)
+        self.extended, self.antialiased = bool(flags & _EXTENDED), bool(flags & _ANTIALIASED)
         widths = (9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * _COEFFICIENTS[degree])
         self.sizes = [self.count * width for width in widths]
 

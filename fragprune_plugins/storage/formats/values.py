@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,10 @@ SH_C0 = 0.28209479177387814
 
 _ALPHA_EDGE = 1e-6  # an 8-bit opacity of 0 or 255 has no finite logit
 
-COMPRESSION_MAX = 1024
-"""Most bytes that a byte of a compressed file may stand for, as the library of SPZ has it."""
+PER_BYTE = 16
+"""Most Gaussians that a byte of a compressed file may stand for; of scenes it is a tenth of one."""
+
+log = logging.getLogger("fragprune")
 
 
 def splat_of(
@@ -160,8 +163,8 @@ def take(stream: Any, count: int) -> bytes:
 
 
 def expect_plausible(count: int, size: int) -> None:
-    """Raise ValueError if a file of so many bytes cannot hold so many Gaussians."""
-    if not 0 < count <= size * COMPRESSION_MAX:
+    """Raise ValueError if so many bytes cannot hold the positions of so many Gaussians."""
+    if not 0 < count <= size * PER_BYTE:
         raise ValueError(f"{count} Gaussians in {size} bytes")
 
 
