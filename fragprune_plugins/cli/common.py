@@ -212,7 +212,7 @@ def describe_written(out: Path, held: str = "") -> str:
     from fragprune_plugins.storage import formats
 
     form = formats.named(out)
-    kept = f" {form.name} keeps {form.keeps}." if form.keeps else ""
+    kept = f" A {form.suffix} file keeps {form.keeps}." if form.keeps else ""
     return f"Wrote {out}{held}.{kept}"
 
 
