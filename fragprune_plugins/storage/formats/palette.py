@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float32]
 
-_BINS = 4096
+_BINS = 256  # wide enough that the tails, whose levels matter, are not noise
 _ROUNDS = 20
-_DEPTH = 16  # a palette has at most 2^16 entries
+_EVEN = 1e-9  # squared error of a cell that need not be cut: rounding
 
 
 def codebook(values: npt.NDArray[Any], size: int = 256) -> Floats:
@@ -43,34 +43,48 @@ def nearest(book: Floats, values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     return np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)
 
 
-def median_cut(rows: Floats) -> tuple[Floats, npt.NDArray[np.int64]]:
-    """A palette of at most 65,536 rows for (N, D) rows, and (N,) the entry of each.
+def palette(
+    rows: Floats, size: int = 1 << 16
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """A palette of at most ``size`` rows for (N, D) rows, and (N,) the entry of each.
 
-    Cells are halved, sixteen times, at the median of the coordinate that varies most in them; an
-    entry is its cell's mean. Rows that are few enough have an entry each.
+    An entry is the mean of its cell. Cells with a large squared error are cut at the mean of the
+    coordinate that varies most in them, half of all cells at a time, until there are enough.
     """
     count = len(rows)
     cells = np.zeros(count, np.int64)
-    if count <= 1 << _DEPTH:
+    if count <= size:
         return rows, np.arange(count)
-    for _ in range(_DEPTH):
-        means, held = _means(rows, cells)
-        spread = _means(rows**2, cells)[0] - means**2
-        value = rows[np.arange(count), spread.argmax(axis=1)[cells]]
-        order = np.lexsort((value, cells))
-        starts = np.concatenate([[0], np.cumsum(held)[:-1]])
-        rank = np.arange(count) - starts[cells[order]]
-        upper = np.empty(count, np.int64)
-        upper[order] = rank >= (held[cells[order]] + 1) // 2
-        cells = np.unique(2 * cells + upper, return_inverse=True)[1]
-    return _means(rows, cells)[0].astype(np.float32), cells
+    error, axis, place = np.zeros(size), np.zeros(size, np.int64), np.zeros(size)
+    used, inside = 1, np.arange(count)  # the rows of cells that are new
+    while True:
+        names, held, means = _means(rows[inside], cells[inside])
+        squares = _means(rows[inside].astype(np.float64) ** 2, cells[inside])[2]
+        spread = held[:, None] * (squares - means**2)
+        axis[names] = spread.argmax(axis=1)
+        place[names] = means[np.arange(len(names)), axis[names]]
+        error[names] = np.where(held > 1, spread.sum(axis=1), 0)
+        uneven = np.flatnonzero(error[:used] > _EVEN)
+        cut = min(size - used, -(-len(uneven) // 2))
+        if cut == 0:
+            break
+        chosen = uneven[np.argpartition(-error[uneven], cut - 1)[:cut]]
+        upper = np.full(size, -1)
+        upper[chosen] = used + np.arange(cut)
+        used += cut
+        inside = np.flatnonzero(upper[cells] >= 0)
+        of = cells[inside]
+        above = rows[inside, axis[of]] > place[of]
+        cells[inside[above]] = upper[of[above]]
+    cells = np.unique(cells, return_inverse=True)[1]
+    return _means(rows, cells)[2].astype(np.float32), cells
 
 
 def _means(
     rows: npt.NDArray[Any], cells: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
-    """The mean of the rows of each cell, and their number."""
-    held = np.bincount(cells)
-    starts = np.concatenate([[0], np.cumsum(held)[:-1]])
-    sums = np.add.reduceat(rows[np.argsort(cells, kind="stable")], starts, axis=0)
-    return sums / held[:, None], held
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """The names of cells, the number of their rows, and the means of these."""
+    order = np.argsort(cells, kind="stable")
+    names, starts, held = np.unique(cells[order], return_index=True, return_counts=True)
+    sums = np.add.reduceat(rows[order].astype(np.float64), starts, axis=0)
+    return names, held, sums / held[:, None]

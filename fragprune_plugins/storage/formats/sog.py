@@ -21,7 +21,7 @@ from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import ModelFileError
-from fragprune_plugins.storage.formats.palette import codebook, median_cut, nearest
+from fragprune_plugins.storage.formats.palette import codebook, nearest, palette
 from fragprune_plugins.storage.formats.values import (
     Bytes,
     array,
@@ -220,7 +220,7 @@ def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
     }
     if splat.sh_degree:
         rest = array(splat.f_rest)
-        entries, labels = median_cut(rest.reshape(count, -1))
+        entries, labels = palette(rest.reshape(count, -1))
         book, wide = codebook(entries), rest.shape[1]
         tall = -(-len(entries) // _PALETTE)
         texels = np.full((tall * _PALETTE, wide, 4), 255, np.uint8)
