@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.datasets.dataset import Shot
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.measure.extents import covered
 from fragprune_plugins.measure.metrics import psnr, ssim
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.reprs import one_line
@@ -149,12 +148,9 @@ def covered_per_pixel(engine: Engine, inputs: RasterInputs) -> float:
         engine: counts them.
         inputs: of one rasterization of ``Splats``.
     """
-    # Alpha capped at its least hides nothing; see ``visible``. A threshold then ends each ellipse.
     assert isinstance(inputs.splats, Splats)
-    opaque = replace(inputs.splats, opacities=torch.ones_like(inputs.splats.opacities))
-    inputs = replace(inputs, splats=opaque, compensation="none", alpha_max=ALPHA_MIN)
-    ends = torch.full_like(opaque.opacities, math.exp(-SQUARED_RADIUS / 2))
-    return float(engine.rasterize(inputs, ends).fragments_per_pixel)
+    squared = torch.full_like(inputs.splats.opacities, SQUARED_RADIUS)
+    return float(covered(engine, inputs, squared).fragments_per_pixel)
 
 
 @torch.no_grad()
