@@ -57,7 +57,7 @@ def sentence(figures: Mapping[str, Any]) -> str:
         f"viewer of fixed √8 sigma quads shades {quads:.1f} pixels per pixel. "
         f"{idle['alone']:.0%} of the fragments are each invisible alone, and "
         f"{idle['together']:.0%} could all go at once without moving any pixel by half an 8-bit "
-        f"level ({figures['views']} {_FROM[cameras['kind']]})."
+        f"level ({figures['views']} {_from(cameras['kind'], figures['views'])})."
     )
 
 
@@ -230,6 +230,10 @@ def _kinds(idle: Mapping[str, Any]) -> Table:
     return ["Gaussians", *(f"radius {name}" for name in radii)], rows, _KINDS_SAID, 1
 
 
+def _from(kind: str, count: int) -> str:
+    return _FROM[kind].format("view" if count == 1 else "views")
+
+
 def _part(some: float, every: float) -> str:
     return f"{some / every:.0%}" if every else ""
 
@@ -239,9 +243,9 @@ def _decibels(value: float | None) -> str:
 
 
 _FROM = {
-    "orbit": "generated views from all around",
-    "inside": "generated views from inside",
-    "given": "given views",
+    "orbit": "generated {} from all around",
+    "inside": "generated {} from inside",
+    "given": "given {}",
 }
 
 _SIDES = {

@@ -125,7 +125,10 @@ def shaded(engine: Engine, inputs: RasterInputs, viewer: Viewer) -> float:
     size = means2d.new_tensor([inputs.view.width, inputs.view.height])
     grid = (size / TILE).ceil()
     first = ((means2d - half) / TILE).floor().clamp_min(0).minimum(grid)
-    last = ((means2d + half) / TILE).ceil().clamp_min(0).minimum(grid)
+    # 3DGS adds 15 pixels and rounds down (``getRect``), gsplat rounds up.
+    end = (means2d + half) / TILE
+    last = (end + 1 - 1 / TILE).floor() if viewer.shape == "square" else end.ceil()
+    last = last.clamp_min(0).minimum(grid)
     tiles = (last - first).clamp_min(0).prod(1)
     pairs = float(torch.where(visible & (squared >= 0), tiles, 0.0).double().sum())
     return pairs * TILE * TILE / float(size.prod())
