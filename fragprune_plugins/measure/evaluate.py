@@ -17,7 +17,7 @@ from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.measure.extents import covered
-from fragprune_plugins.measure.metrics import psnr, ssim
+from fragprune_plugins.measure.metrics import lpips, psnr, ssim
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage.ply import SplatFile
@@ -89,7 +89,7 @@ def measure(
 
     Returns:
         One dict a candidate: target ("photographs", or "itself" for a model's own pictures), psnr
-        (dB; infinite against itself), ssim, lpips (None), fragments_per_pixel,
+        (dB; infinite against itself), ssim, lpips (None where not installed), fragments_per_pixel,
         evaluated_per_pixel, entries_per_pixel (NaN from an engine that does not count them),
         area_per_pixel (``covered_per_pixel``), gaussians, frame_ms (median over views and repeats),
         frame_ms_se (standard error over repeats of the median over views), engine, device, views.
@@ -101,10 +101,11 @@ def measure(
     drawn = [candidate.model.splats() for candidate in candidates]
     reports: list[dict[str, Any]] = []
     for candidate, splats in zip(candidates, drawn, strict=True):
-        rows = []
+        rows, distances = [], []
         for shot in shots:
             outputs = candidate.draw(engine, shot.view, splats)
             seen = shot.looked_at(outputs.image)
+            distances.append(lpips(seen, shot.image))
             rows.append(
                 (
                     psnr(seen, shot.image),
@@ -122,7 +123,7 @@ def measure(
                 "target": shots[0].target,
                 "psnr": quality,
                 "ssim": likeness,
-                "lpips": None,
+                "lpips": _mean(distances),
                 "fragments_per_pixel": fragments,
                 "evaluated_per_pixel": evaluated,
                 "entries_per_pixel": entries,
@@ -135,6 +136,11 @@ def measure(
     for report, frame in zip(reports, frames, strict=True):
         report |= frame | {"engine": engine.name, "device": str(device), "views": len(shots)}
     return reports
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if len(known) == len(values) else None
 
 
 @torch.no_grad()
