@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -79,7 +79,9 @@ def place(
         return Placed(
             around(splat, count, width=pixels, height=pixels), side, "As asked for.", math.nan
         )
-    places, shares = _air(splat, engine)
+    splats, near = splat.splats(), _NEAR * bounds(splat)[1]
+    places = _clear(splat, near / _NEAR)
+    shares = [enclosed(engine, splats, at, near) for at in places]
     best = max(shares)
     if side == "auto" and best <= ENCLOSED:
         why = (
@@ -98,19 +100,19 @@ def place(
             f"not close by; outside of an object it would be {ENCLOSED:.0%} at most. A closed "
             "hollow object looks the same: --orbit looks from outside."
         )
-    return Placed(within(eyes, count, width=pixels, height=pixels), "inside", why, best)
+    views = within(eyes, 2 * count, width=pixels, height=pixels)
+    seen = [float(_met(engine, splats, _small(view), near).mean()) for _, view in views]
+    half = sorted(seen, reverse=True)[count - 1]  # doors and open sides show nothing
+    chosen = [view for view, share in zip(views, seen, strict=True) if share >= half]
+    return Placed(chosen[:count], "inside", why, best)
 
 
-def _air(splat: SplatFile, engine: Engine) -> tuple[list[Tensor], list[float]]:
-    """Places far from any surface, the farthest first, and each one's share of directions."""
-    splats, (_, radius) = splat.splats(), bounds(splat)
-    candidates = _clear(splat, radius)
-    shares = [enclosed(engine, splats, place, _NEAR * radius) for place in candidates]
-    return candidates, shares
+def _small(view: View) -> View:
+    return replace(view, width=_PIXELS, height=_PIXELS)
 
 
 def _clear(splat: SplatFile, radius: float) -> list[Tensor]:
-    """Places of a grid farthest from Gaussians that are not faint, and from each other."""
+    """Places of a grid far from all but faint Gaussians and from each other, farthest first."""
     from scipy.spatial import cKDTree
 
     means = splat.xyz.detach().cpu()
@@ -142,15 +144,15 @@ def enclosed(engine: Engine, splats: Splats, place: Tensor, near: float) -> floa
         place: (3,).
         near: the distance, world units.
     """
-    met: list[Tensor] = []
-    weights: list[Tensor] = []
-    for view in _faces(place):
-        out = engine.rasterize(RasterInputs(view.to(splats.device), splats), None)
-        far = out.alpha > near * out.invdepth
-        met.append(((out.alpha > _OPAQUE) & far).flatten().cpu())
-        weights.append(_solid_angles())
-    share = (torch.cat(met) * torch.cat(weights)).sum() / torch.cat(weights).sum()
-    return float(share)
+    angles = _solid_angles()
+    met = [float((_met(engine, splats, view, near) * angles).sum()) for view in _faces(place)]
+    return sum(met) / (len(met) * float(angles.sum()))
+
+
+def _met(engine: Engine, splats: Splats, view: View, near: float) -> Tensor:
+    """(P,) 1 where a pixel shows something opaque beyond a distance, else 0; on the CPU."""
+    out = engine.rasterize(RasterInputs(view.to(splats.device), splats), None)
+    return ((out.alpha > _OPAQUE) & (out.alpha > near * out.invdepth)).flatten().float().cpu()
 
 
 def _faces(place: Tensor) -> Sequence[View]:

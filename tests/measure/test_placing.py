@@ -72,6 +72,16 @@ def test_an_object_is_looked_at_from_outside(seed):
         assert view.campos.norm() > 2
 
 
+def test_nobody_looks_out_of_the_open_side():
+    whole = room()
+    model = whole.keep(whole.xyz[:, 0] < 2.9)
+    placed = place(model, 6, ENGINE, side="inside", divide=10)
+    for _, view in placed.views:
+        ahead = view.viewmatrix[:3, 2]
+        assert float(ahead[0]) < 0.8
+    assert len(placed.views) == 6
+
+
 def test_thin_haze_all_around_is_no_air():
     """Large faint Gaussians before every wall: no place is open, so cameras stay outside."""
     walls = room()
