@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 LARGER = 3
 """How many times as wide and high the page's pictures are as the photographs of the training."""
 
+_REPEATS = 20  # timed frames for each view
+
 BANNER = "banner.jpg"
 """The picture that shows all of it at a glance: pictures and maps side by side."""
 
@@ -59,7 +61,7 @@ def write_page(
 
     Args:
         out: the demo's folder.
-        report: the measurements.
+        report: the measurements; "larger" is added, frame times of pictures as large as the page's.
         scene: folder of the photographs.
         settings: of the photographs.
         curves: the run's learning curves, one dict per step.
@@ -69,8 +71,8 @@ def write_page(
     Returns:
         The files as paths relative to ``out``.
     """
-    from fragprune_plugins.measure import Candidate, page, report_page
-    from fragprune_plugins.measure.wording import outcome
+    from fragprune_plugins.measure import Candidate, frame_times, page, report_page
+    from fragprune_plugins.measure.wording import frames, outcome
     from fragprune_plugins.plugins.hooks import engine_for
     from fragprune_plugins.storage import models
 
@@ -79,6 +81,11 @@ def write_page(
     (one, _), (other, store) = (models.load(path, device=device) for path in paths)
     before, after = Candidate(one), Candidate(other, store)
     shots, rasterizer = _larger(load_dataset(scene).test, settings), engine_for(engine, device)
+    larger = frame_times(
+        [before, after], [shot.view.to(device) for shot in shots], rasterizer, repeats=_REPEATS
+    )
+    size = f"{shots[0].view.width}x{shots[0].view.height}"
+    report["larger"] = {"size": size} | dict(zip(("before", "after"), larger, strict=True))
     drawn = report_page.draw_views(pictures, before, after, shots, rasterizer)
     report_page.save_banner(pictures / BANNER, before, after, shots[0], rasterizer)
     files = [*drawn.files, BANNER]
@@ -95,6 +102,7 @@ def write_page(
         parts=[
             page.paragraph(_INTRODUCTION.format(larger=LARGER)),
             report_page.figures({"before": report["before"], "after": report["after"]}),
+            page.paragraph(f"Of pictures as large as those below, {size}: {frames(*larger)}."),
             *report_page.views(drawn, lambda file: f"pictures/{file}"),
             *learning,
             page.heading("Your own"),

@@ -123,7 +123,7 @@ def gain(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for the gain of one measurement over another: fragments, frame times, PSNR."""
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
-        f"{_frames(before, after)}, {_quality(before, after)} on {after['views']} views"
+        f"{frames(before, after)}, {_quality(before, after)} on {after['views']} views"
     )
 
 
@@ -219,7 +219,7 @@ def fewer(before: float, after: float) -> str:
     return f"{change} fragments ({before:.1f} -> {after:.1f} per pixel)"
 
 
-def _frames(before: dict[str, Any], after: dict[str, Any]) -> str:
+def frames(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for frame times, with their ratio only if it exceeds the standard errors."""
     was, now = before["frame_ms"], after["frame_ms"]
     ratio = was / max(now, 1e-9)

@@ -85,6 +85,8 @@ def test_pictures_and_page_are_there(demo):
     page = (out / "index.html").read_text()
     for file in report["files"]:
         assert file in page or file in ("index.html", f"pictures/{BANNER}")
+    assert report["larger"]["size"] == "144x108"
+    assert f"{report['larger']['before']['frame_ms']:.2f} -&gt; " in page
     assert Path(report["model_after"]).exists()
 
 
