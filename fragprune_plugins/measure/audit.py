@@ -223,16 +223,16 @@ def audit(
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in candidates}
     asked: dict[str, list[float]] = {}
     idle, shown, overdraw = Idle(), [], []
-    chosen = _amid([name for name, _ in views])
+    chosen = _amid(len(views))
     with tqdm(total=2 * len(views) + 1, desc="audit", unit="step", disable=not progress) as bar:
-        for name, view in views:
+        for number, (name, view) in enumerate(views):
             itself = None
             for label, candidate in candidates.items():
                 out = candidate.draw(engine, view, splats, counts=itself is None)
                 itself = out if itself is None else itself
                 error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
                 row = {
-                    "timed": name in chosen,
+                    "timed": number in chosen,
                     "work": work_of(out),
                     "mse": float(error),
                     "psnr": psnr(out.image, itself.image),
@@ -251,7 +251,7 @@ def audit(
                 reach = honouring(cut, splats.opacities)
                 quads = 4 / math.pi * float(covered(engine, inputs, reach).fragments_per_pixel)
                 asked.setdefault(HONOURING, []).append(quads)
-            if name in chosen:
+            if number in chosen:
                 assert itself.fragments is not None
                 assert ellipses.fragments is not None
                 shown.append(Shown(name, itself.image, itself.fragments, ellipses.fragments))
@@ -262,7 +262,7 @@ def audit(
                 if len(tile.rows):
                     idle.add(kinds[tile.rows], weigh(tile, view.background))
             bar.update()
-        timed: list[View] = [view for name, view in views if name in chosen]
+        timed: list[View] = [views[number][1] for number in chosen]
         frames = frame_times(list(candidates.values()), timed, engine, repeats=repeats)
         bar.update()
     cost = _prices(engine, splat)
@@ -291,10 +291,10 @@ def audit(
     return figures, shown
 
 
-def _amid(names: Sequence[str]) -> list[str]:
-    """Some evenly spread names, the middle ones of as many parts: an orbit begins at a pole."""
-    parts = min(SHOWN, len(names))
-    return [names[(2 * part + 1) * len(names) // (2 * parts)] for part in range(parts)]
+def _amid(count: int) -> list[int]:
+    """Some evenly spread numbers, the middle ones of as many parts: an orbit begins at a pole."""
+    parts = min(SHOWN, count)
+    return [(2 * part + 1) * count // (2 * parts) for part in range(parts)]
 
 
 HONOURING = "a viewer that knows its thresholds"

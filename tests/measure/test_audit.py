@@ -124,7 +124,7 @@ def test_alone_is_what_pictures_without_one_gaussian_show():
 
 @pytest.fixture(scope="module")
 def figures():
-    views = [(f"view{at}", camera.view()) for at, camera in enumerate(tiny.cameras(4))]
+    views = [("the same", camera.view()) for camera in tiny.cameras(4)]
     found, shown = audit(Model(tiny.random_model()), views, engine=ENGINE, repeats=1)
     return found, shown
 
@@ -151,7 +151,7 @@ def test_cuts_are_compared_with_the_model_as_it_is(figures):
         assert cut["worst_psnr"] <= cut["psnr"] < 100
     by_alpha = [cut["psnr"] for cut in cuts if cut["name"].startswith("alpha")]
     assert by_alpha == sorted(by_alpha, reverse=True)
-    assert len({view.name for view in shown}) == 3
+    assert len({float(view.image.sum()) for view in shown}) == len(shown) == 3
     for view in shown:
         assert view.fragments.shape == view.overdraw.shape == view.image.shape[1:]
     assert HONOURING not in [each["viewers"] for each in found["viewers"]]
