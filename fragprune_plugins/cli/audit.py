@@ -11,10 +11,11 @@ import click
 
 from fragprune_plugins.cli.common import (
     FILE,
+    MODEL,
     Command,
     Report,
+    cameras_of,
     engine_options,
-    image_options,
     open_engine,
     truncation_option,
 )
@@ -26,13 +27,21 @@ if TYPE_CHECKING:
 
 PAGE, FIGURES = "audit.html", "audit.json"
 
+LARGEST = 1600
+"""Pixels of a picture's longer side, as hosts have it: a frame of more takes long."""
+
 
 @click.command("audit", cls=Command)
-@click.argument("model", type=FILE)
-@click.option("--cameras", type=FILE, help="cameras.json of a 3DGS model, or transforms_*.json.")
+@click.argument("model", type=MODEL)
+@click.option(
+    "--cameras",
+    type=FILE,
+    help="cameras.json of a 3DGS model, transforms*.json, or nerfstudio's camera_path.json. "
+    "Default: the cameras.json that the training of MODEL wrote, if there is one.",
+)
 @click.option("--data", type=FILE, help="Scene folder whose cameras look; no image is needed.")
-@click.option("--orbit", "side", flag_value="orbit", help="Look from all around it.")
-@click.option("--inside", "side", flag_value="inside", help="Look around from inside of it.")
+@click.option("--orbit", "side", flag_value="orbit", help="Generate cameras all around it.")
+@click.option("--inside", "side", flag_value="inside", help="Generate cameras inside of it.")
 @click.option(
     "--views",
     type=click.IntRange(1, 1000),
@@ -41,7 +50,12 @@ PAGE, FIGURES = "audit.html", "audit.json"
     help="Cameras to generate, or to take evenly from the given ones, at most.",
 )
 @click.option("--out", type=FILE, required=True, help=f"Folder for {PAGE}, {FIGURES} and maps.")
-@image_options
+@click.option(
+    "--resolution",
+    type=click.IntRange(1, 16),
+    help=f"Divide the pictures' sides by this; default: until they have {LARGEST} pixels or less.",
+)
+@click.option("--white-background", is_flag=True, help="Draw over white, with given cameras.")
 @truncation_option
 @engine_options
 def command(
@@ -51,7 +65,7 @@ def command(
     side: Side | None,
     views: int,
     out: Path,
-    resolution: int,
+    resolution: int | None,
     white_background: bool,
     no_truncation: bool,
     engine: str,
@@ -61,8 +75,10 @@ def command(
     """Measure what MODEL costs to draw, and how much of that changes nothing. No photograph needed.
 
     It counts fragments and overdraw with maps, weighs single fragments, tries cuts that need no
-    training, and says what viewers with other rules pay. Cameras are generated from outside or from
-    inside, whichever suits the model, unless some are given. The page is one file.
+    training, and says what viewers with other rules pay. The page is one file.
+
+    Without given cameras, and without those of the training of MODEL, some are generated: from
+    outside or from inside, whichever suits the model. The output says which, and why.
 
     Views and tiles are samples, so that the time is bounded: about a minute for 125,000 Gaussians
     on two cores, some minutes for a million.
@@ -88,10 +104,12 @@ def command(
     rasterizer, where = open_engine(engine, device, threads)
     writable_folder(out)
     loaded = models.load(model, truncation=not no_truncation, device=where)
+    if cameras is None and data is None and side is None:
+        cameras = cameras_of(model)
     if cameras is None and data is None:
         from fragprune_plugins.measure.placing import place
 
-        placed = place(loaded.splat, views, rasterizer, side=side or "auto", divide=resolution)
+        placed = place(loaded.splat, views, rasterizer, side=side or "auto", divide=resolution or 1)
     else:
         placed = _given(cameras, data, views, resolution, white_background)
     named = [(name, view.to(where)) for name, view in placed.views]
@@ -119,7 +137,7 @@ def command(
 
 
 def _given(
-    cameras: Path | None, data: Path | None, count: int, divide: int, white_background: bool
+    cameras: Path | None, data: Path | None, count: int, divide: int | None, white_background: bool
 ) -> Placed:
     """Cameras of a file or a scene folder, so many at most, evenly spread."""
     from fragprune_plugins.datasets.cameras import divided, load_cameras, load_scene_cameras
@@ -133,6 +151,8 @@ def _given(
         train, test = load_scene_cameras(data, white_background=white_background)
         named = sorted([*train, *test], key=lambda each: each[0])
     every = len(named)
-    chosen = divided(list(evenly(named, count)), divide)
+    chosen = list(evenly(named, count))
+    longest = max(max(view.width, view.height) for _, view in chosen)
+    chosen = divided(chosen, divide or -(-longest // LARGEST))
     why = f"{len(chosen)} of the {every} cameras of {cameras or data}, evenly spread."
     return Placed(chosen, "given", why, math.nan)

@@ -83,7 +83,8 @@ def draw_views(
                 out = each.draw(engine, shot.view, splats, counts=True)
             assert out.fragments is not None
             save_image(folder / f"{name}_{model}.png", out.image)
-            error = (out.image.clamp(0, 1) - shot.image.clamp(0, 1)).abs().amax(dim=0)
+            seen = shot.looked_at(out.image)
+            error = (seen.clamp(0, 1) - shot.image.clamp(0, 1)).abs().amax(dim=0)
             maps["fragments"][f"{name}_{model}"] = out.fragments
             maps["error"][f"{name}_{model}"] = 255 * error
             per_pixel.append(float(out.fragments_per_pixel))

@@ -96,6 +96,22 @@ def test_given_cameras_need_no_photographs(model, tmp_path):
     assert {view["width"] for view in report["maps"]["views"]} == {tiny.SIDE}
 
 
+def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(model, tmp_path):
+    path = tmp_path / "run" / "point_cloud" / "iteration_5" / "point_cloud.ply"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(model.read_bytes())
+    (tmp_path / "run" / "cfg_args").write_text("Namespace(source_path='scene')")
+    camera = {"id": 0, "img_name": "a", "width": 3300, "height": 33, "fx": 3000.0, "fy": 3000.0}
+    pose = {"position": [0.0, 0.0, -3.0], "rotation": torch.eye(3).tolist()}
+    (tmp_path / "run" / "cameras.json").write_text(json.dumps([camera | pose]))
+    out = ("--out", tmp_path / "out")
+    report = run_json("audit", tmp_path / "run", *out)
+    assert (report["cameras"]["kind"], report["model"]) == ("given", str(path))
+    assert report["maps"]["views"][0]["width"] == 1100  # of 3300: thrice less, not to be too large
+    asked = run_json("audit", path, "--orbit", "--views", 1, "--resolution", 16, *out)
+    assert asked["cameras"]["kind"] == "orbit"
+
+
 def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
     path = tmp_path / "pruned.ply"
     write_ply(path, tiny.random_model(), torch.full((60,), 0.3))
