@@ -106,11 +106,7 @@ def command(
                 page.paragraph(missing),
                 *(report_page.views(drawn, source) if drawn else ()),
                 *(block for record in others for block in _block(record, files)),
-                *(
-                    page.heading(name)
-                    + page.picture(source(file), "", width=1, alt=name, wide=True)
-                    for name, file in more
-                ),
+                *(page.heading(name) + page.wide(source(file), name) for name, file in more),
                 page.heading("Settings"),
                 page.table(["", ""], _facts(main), words=2),
             ],

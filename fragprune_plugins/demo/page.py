@@ -95,7 +95,7 @@ def write_page(
         files.append(report_page.LEARNING)
         source = f"pictures/{report_page.LEARNING}"
         said = "How it learned"
-        learning = [page.heading(said), page.picture(source, "", width=1, alt=said, wide=True)]
+        learning = [page.heading(said), page.wide(source, said)]
     text = page.compose(
         title="The same picture from fewer fragments",
         quote=outcome("run", report, report["control"]),

@@ -29,8 +29,8 @@ def draw(folder: Path, shown: Sequence[Shown]) -> dict[str, Any]:
         shown: the views.
 
     Returns:
-        limit: the count at the top of the scale of all maps; views: name, width and files (picture,
-        fragments, overdraw) of each.
+        limit: the count at the top of the scale of all maps; views: name, width, height and
+        files (picture, fragments, overdraw) of each.
     """
     limit = shared_limit([each for view in shown for each in (view.fragments, view.overdraw)])
     views = []
@@ -39,11 +39,12 @@ def draw(folder: Path, shown: Sequence[Shown]) -> dict[str, Any]:
         save_image(folder / files[0], view.image)
         save_map(folder / files[1], view.fragments, limit)
         save_map(folder / files[2], view.overdraw, limit)
+        height, width = view.fragments.shape
         means = {
             "fragments_per_pixel": float(view.fragments.float().mean()),
             "overdraw": float(view.overdraw.float().mean()),
         }
-        views.append(means | {"name": view.name, "width": view.image.shape[2], "files": files})
+        views.append(means | {"name": view.name, "width": width, "height": height, "files": files})
     return {"limit": limit, "views": views}
 
 
@@ -129,6 +130,7 @@ def compose(figures: Mapping[str, Any], folder: Path) -> str:
 
 
 def _view(view: Mapping[str, Any], folder: Path) -> str:
+    size = (view["width"], view["height"])
     drawn, fragments, overdraw = (page.embedded(folder / file) for file in view["files"])
     return page.section(
         view["name"],
@@ -136,15 +138,15 @@ def _view(view: Mapping[str, Any], folder: Path) -> str:
             drawn,
             fragments,
             f"{view['fragments_per_pixel']:.1f} fragments per pixel",
-            width=view["width"],
-            names=("picture", "fragments"),
+            size,
+            ("picture", "fragments"),
         ),
         page.split(
             fragments,
             overdraw,
             f"{view['overdraw']:.1f} ellipses of √8 sigma over a pixel",
-            width=view["width"],
-            names=("fragments", "overdraw"),
+            size,
+            ("fragments", "overdraw"),
         ),
     )
 

@@ -14,8 +14,11 @@ from string import Template
 
 from fragprune_plugins.measure.pictures import colour_stops
 
-_SHOWN = 480
-"""Pixels of the page that a small picture fills at least half of, in whole steps."""
+Size = tuple[int, int]
+"""Width and height, pixels."""
+
+_ROOM = (490, 640)
+"""Pixels of the page up to which small pictures grow, in whole steps."""
 
 
 def compose(*, title: str, quote: str, parts: Sequence[str]) -> str:
@@ -78,24 +81,33 @@ def table(
     )
 
 
-def picture(source: str, caption: str, *, width: int, alt: str = "", wide: bool = False) -> str:
+def wide(source: str, alt: str) -> str:
+    """A picture as wide as the page, such as a plot.
+
+    Args:
+        source: its ``src``.
+        alt: what it shows, for who cannot see it.
+    """
+    return (
+        f'<figure class="wide"><img src="{html.escape(source)}" alt="{html.escape(alt)}"></figure>'
+    )
+
+
+def picture(source: str, caption: str, size: Size) -> str:
     """A picture with a caption.
 
     Args:
         source: its ``src``.
         caption: below it.
-        width: of the picture, pixels; it is shown at this width or a multiple.
-        alt: what it shows, for who cannot see it; the caption if empty.
-        wide: it fills the page instead.
+        size: of the picture.
     """
-    kind = ' class="wide"' if wide else _sized(width)
     return (
-        f'<figure{kind}><img src="{html.escape(source)}" alt="{html.escape(alt or caption)}">'
+        f'<figure{_sized(size)}><img src="{html.escape(source)}" alt="{html.escape(caption)}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     )
 
 
-def split(before: str, after: str, caption: str, *, width: int, names: tuple[str, str]) -> str:
+def split(before: str, after: str, caption: str, size: Size, names: tuple[str, str]) -> str:
     """Two pictures of one size under a divider that can be dragged.
 
     All dividers of one ``section`` move together.
@@ -104,7 +116,7 @@ def split(before: str, after: str, caption: str, *, width: int, names: tuple[str
         before: ``src`` of the picture left of the divider.
         after: ``src`` of the one right of it.
         caption: below them.
-        width: as in ``picture``.
+        size: of each.
         names: of the two pictures.
     """
     left, right = map(html.escape, names)
@@ -112,7 +124,7 @@ def split(before: str, after: str, caption: str, *, width: int, names: tuple[str
         before=html.escape(before),
         after=html.escape(after),
         caption=html.escape(caption),
-        sized=_sized(width),
+        sized=_sized(size),
         left=left,
         right=right,
     )
@@ -141,16 +153,16 @@ def embedded(file: Path) -> str:
     return f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
 
 
-def shown_width(width: int) -> int:
-    """CSS pixels at which a picture is shown: its own width, or a whole multiple if it is small."""
-    return width * max(1, _SHOWN // width)
+def zoom(size: Size) -> int:
+    """How many times as large a picture is shown at most: more than once if it is small."""
+    return max(1, min(room // side for room, side in zip(_ROOM, size, strict=True)))
 
 
-def _sized(width: int) -> str:
-    """Attributes of a figure: its width, and whether single pixels are to be seen."""
-    shown = shown_width(width)
-    pixels = ' class="pixels"' if shown > width else ""
-    return f'{pixels} style="--width:{shown}px"'
+def _sized(size: Size) -> str:
+    """Attributes of a figure: its width and shape, and whether single pixels are to be seen."""
+    width, height = size
+    pixels = ' class="pixels"' if zoom(size) > 1 else ""
+    return f'{pixels} style="--width:{width * zoom(size)}px;--shape:{width / height:.4g}"'
 
 
 _SPLIT = Template("""<figure$sized><div class="pair">
@@ -193,7 +205,7 @@ thead th { font-weight: 600; vertical-align: bottom }
 tbody tr:hover { background: var(--card) }
 section { margin: 1.2rem 0 2rem; --cut: 50% }
 .grid { display: flex; flex-wrap: wrap; gap: 1.2rem }
-figure { margin: 0; width: var(--width); max-width: 100% }
+figure { margin: 0; width: min(var(--width), 90vh * var(--shape)); max-width: 100% }
 .wide { width: 100% }
 .grid img, .wide img { display: block; width: 100%; border-radius: .35rem }
 .pixels img { image-rendering: pixelated }

@@ -30,14 +30,14 @@ class Drawn:
 
     Attributes:
         names: of the views: how their files begin.
-        widths: of their pictures, pixels.
+        sizes: of their pictures: width and height, pixels.
         fragments: of each view, drawn per pixel before and after.
         most_fragments: per pixel, at the top of the scale.
         most_error: difference to the photograph at the top of the scale, 8-bit levels.
     """
 
     names: Sequence[str]
-    widths: Sequence[int]
+    sizes: Sequence[page.Size]
     fragments: Sequence[tuple[float, float]]
     most_fragments: float
     most_error: float
@@ -94,8 +94,8 @@ def draw_views(
         limits[kind] = shared_limit(list(values.values()))
         for stem, each_map in values.items():
             save_map(folder / f"{stem}_{kind}.png", each_map, limits[kind])
-    widths = [shot.view.width for shot in chosen]
-    return Drawn(names, widths, counted, limits["fragments"], limits["error"])
+    sizes = [(shot.view.width, shot.view.height) for shot in chosen]
+    return Drawn(names, sizes, counted, limits["fragments"], limits["error"])
 
 
 def save_banner(
@@ -146,24 +146,24 @@ def views(drawn: Drawn, source: Callable[[str], str]) -> list[str]:
     if not drawn.names:
         return []
     parts = []
-    for name, width, (was, now) in zip(drawn.names, drawn.widths, drawn.fragments, strict=True):
+    for name, size, (was, now) in zip(drawn.names, drawn.sizes, drawn.fragments, strict=True):
 
-        def both(kind: str, caption: str, name: str = name, width: int = width) -> str:
+        def both(kind: str, caption: str, name: str = name, size: page.Size = size) -> str:
             left, right = (source(f"{name}_{model}{kind}.png") for model in _MODELS)
-            return page.split(left, right, caption, width=width, names=_MODELS)
+            return page.split(left, right, caption, size, _MODELS)
 
         photograph = source(f"{name}_photograph.png")
         parts.append(
             page.section(
                 name,
                 both("", "Drawn before and after"),
-                page.picture(photograph, "Photograph", width=width),
+                page.picture(photograph, "Photograph", size),
                 both("_fragments", f"Fragments per pixel: {was:.1f} before, {now:.1f} after"),
                 both("_error", "Difference to the photograph"),
             )
         )
-    zoom = {page.shown_width(width) // width for width in drawn.widths}
-    shown = f" Pixels are shown {max(zoom)} times as large." if max(zoom) > 1 else ""
+    zoom = max(map(page.zoom, drawn.sizes))
+    shown = f" Pixels are shown {zoom} times as large." if zoom > 1 else ""
     return [
         page.heading("Before and after"),
         page.paragraph(f"{_DIVIDERS}{shown}"),

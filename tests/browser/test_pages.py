@@ -20,7 +20,7 @@ def address(tmp_path):
     for name, level in (("before", 1.0), ("after", 0.0)):
         save_image(tmp_path / f"{name}.png", torch.full((3, 60, 160), level))
         save_map(tmp_path / f"{name}_map.png", torch.full((60, 160), level), 1.0)
-    both = {"width": 160, "names": ("before", "after")}
+    both = ((160, 60), ("before", "after"))
     sources = {each.stem: page.embedded(each) for each in tmp_path.glob("*.png")}
     text = page.compose(
         title="A page",
@@ -28,8 +28,8 @@ def address(tmp_path):
         parts=[
             page.section(
                 "view",
-                page.split(sources["before"], sources["after"], "pictures", **both),
-                page.split(sources["before_map"], sources["after_map"], "maps", **both),
+                page.split(sources["before"], sources["after"], "pictures", *both),
+                page.split(sources["before_map"], sources["after_map"], "maps", *both),
             ),
             page.legend("fragments", 50),
             page.table(["viewer", *"abcdefgh"], [[WORDS, *("1,234.56 ± 7.89",) * 8]], WORDS * 4),
@@ -69,6 +69,16 @@ def test_nothing_is_wider_than_the_window(browser, address, width):
         widths = tab.run("[...document.querySelectorAll('figure')].map(f => f.offsetWidth)")
         assert max(widths) <= min(width, 480)
         assert min(widths) > 250  # not tiny either
+
+
+def test_a_portrait_fits_the_window(browser, tmp_path):
+    save_image(tmp_path / "tall.png", torch.zeros(3, 1920, 1080))
+    figure = page.picture(page.embedded(tmp_path / "tall.png"), "tall", (1080, 1920))
+    text = page.compose(title="t", quote="q", parts=[page.section("v", figure)])
+    (tmp_path / "page.html").write_text(text + '<link rel="icon" href="data:,">')
+    with served(tmp_path) as at, opened(browser, at + "page.html") as tab:
+        assert tab.run("document.querySelector('img').offsetHeight") <= 720
+        assert tab.run("document.querySelector('img').offsetWidth") > 300
 
 
 def test_it_is_dark_where_the_reader_wants_that(browser, address):

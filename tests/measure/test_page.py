@@ -55,8 +55,8 @@ def test_all_words_are_shown_as_they_are_written(words):
             page.paragraph(words),
             page.code(words),
             page.table([words, words], [[words, words]], words),
-            page.section(words, page.picture("a.png", words, width=10)),
-            page.section(words, page.split("a", "b", words, width=10, names=(words, words))),
+            page.section(words, page.picture("a.png", words, (10, 9))),
+            page.section(words, page.split("a", "b", words, (10, 9), (words, words))),
             page.legend(words, 3.0),
         ],
     )
@@ -77,11 +77,16 @@ def test_nothing_is_left_of_what_is_empty():
 
 
 @pytest.mark.parametrize(
-    ("width", "shown"), [(90, 450), (160, 480), (256, 256), (480, 480), (800, 800), (1, 480)]
+    ("size", "times"),
+    [((90, 160), 4), ((180, 320), 2), ((160, 120), 3), ((256, 256), 1), ((800, 600), 1)],
 )
-def test_small_pictures_grow_by_whole_steps(width, shown):
-    assert page.shown_width(width) == shown
-    assert ("pixels" in page.picture("a", "b", width=width)) == (shown > width)
+def test_small_pictures_grow_by_whole_steps_and_portraits_become_no_towers(size, times):
+    assert page.zoom(size) == times
+    width, height = size
+    assert times == 1 or (width * times <= 490 and height * times <= 640)
+    shown = page.picture("a", "b", size)
+    assert ("pixels" in shown) == (times > 1)
+    assert f"--width:{width * times}px" in shown
 
 
 def test_columns_of_words_are_told_from_numbers():
