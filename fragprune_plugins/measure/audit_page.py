@@ -11,6 +11,7 @@ from fragprune_plugins.measure import page
 from fragprune_plugins.measure.audit import DARK, SHOWN, Shown
 from fragprune_plugins.measure.pictures import save_image, save_map, stems
 from fragprune_plugins.measure.report_page import shared_limit
+from fragprune_plugins.measure.wording import fewer, frames
 
 MEASURED = (
     "On four splats, with their own cameras, it left 1.6x to 2.0x fewer fragments at 48 to 50 dB "
@@ -71,12 +72,11 @@ def pruning(figures: Mapping[str, Any]) -> str:
             "It needs no photographs."
         )
     with_, without = figures["cuts"][0], figures["cuts"][-1]
-    ratio = without["fragments_per_pixel"] / max(with_["fragments_per_pixel"], 1e-9)
+    fragments = fewer(without["fragments_per_pixel"], with_["fragments_per_pixel"])
     return (
-        f"This model has thresholds: they leave {ratio:.2f}x fewer fragments "
-        f"({without['fragments_per_pixel']:.1f} -> {with_['fragments_per_pixel']:.1f} per pixel), "
-        f"frames {without['frame_ms']:.2f} -> {with_['frame_ms']:.2f} ms. All cuts come on top of "
-        f"them. A viewer that ignores them differs by {_decibels(without['psnr'])}."
+        f"This model has thresholds. With them it draws {fragments}, {frames(without, with_)}. All "
+        "cuts come on top of them. A viewer that ignores them shows another picture: "
+        f"{_decibels(without['psnr'])} PSNR against this one."
     )
 
 

@@ -118,7 +118,9 @@ def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
     words = ("--views", 1, "--resolution", 16)
     report = run_json("audit", path, "--out", tmp_path / "out", *words)
     assert report["truncated"] is True
-    assert re.search(r"thresholds: they leave \d\.\d\dx fewer fragments", report["pruning"])
+    assert re.search(
+        r"has thresholds. With them it draws \d\.\d\dx fewer fragments", report["pruning"]
+    )
     plain = run_json("audit", path, "--out", tmp_path / "out", "--no-truncation", *words)
     assert plain["truncated"] is False
     assert plain["fragments_per_pixel"] == report["cuts"][-1]["fragments_per_pixel"]
