@@ -143,7 +143,7 @@ def blended(
     front = rows_in_front(camera, gaussians.means, options.near)
     footprints = project(camera, gaussians.take(front), options)
     tau = None if thresholds is None else thresholds[front]
-    for block in cut_world(camera, footprints, options)[1][::every]:
+    for block in cut_world(camera, footprints, options, every)[1]:
         here = footprints.take(block.rows)
         points = sample_points(block, options, here.mean2d)
         found = fragments(here, points, None if tau is None else tau[block.rows], options)
@@ -224,17 +224,22 @@ def collect(
 
 
 def cut_world(
-    camera: Camera, footprints: Footprints, options: Options
+    camera: Camera, footprints: Footprints, options: Options, every: int = 1
 ) -> tuple[Tensor, list[Block]]:
     """Which of K projected Gaussians touch the image, (K,) bool, and the blocks of ``cut``."""
     rects = tile_rects(camera, footprints)
     touching = (footprints.radius > 0) & ((rects[:, 2:] - rects[:, :2]) > 0).all(dim=1)
     drawable = touching if options.tiles else footprints.radius > 0
-    return touching, list(cut(camera, footprints, rects, drawable, options))
+    return touching, list(cut(camera, footprints, rects, drawable, options, every))
 
 
 def cut(
-    camera: Camera, footprints: Footprints, rects: Tensor, drawable: Tensor, options: Options
+    camera: Camera,
+    footprints: Footprints,
+    rects: Tensor,
+    drawable: Tensor,
+    options: Options,
+    every: int = 1,
 ) -> Iterator[Block]:
     """Cut the image into tiles, row by row, or take all of it as one block.
 
@@ -244,6 +249,7 @@ def cut(
         rects: (K, 4) tiles of each.
         drawable: (K,) bool.
         options: ``tiles`` decides.
+        every: 1 for all tiles, 2 for every second one, and so on.
     """
     order = footprints.depth.detach().argsort(stable=True)
     order = order[drawable[order]]
@@ -252,12 +258,12 @@ def cut(
         return
     x0, y0, x1, y1 = rects[order].unbind(1)
     across, down = tile_grid(camera)
-    for j in range(down):
-        for i in range(across):
-            covers = (x0 <= i) & (i < x1) & (y0 <= j) & (j < y1)
-            columns = range(i * TILE, min((i + 1) * TILE, camera.width))
-            rows = range(j * TILE, min((j + 1) * TILE, camera.height))
-            yield Block(columns, rows, order[covers])
+    for number in range(0, across * down, every):
+        j, i = divmod(number, across)
+        covers = (x0 <= i) & (i < x1) & (y0 <= j) & (j < y1)
+        columns = range(i * TILE, min((i + 1) * TILE, camera.width))
+        rows = range(j * TILE, min((j + 1) * TILE, camera.height))
+        yield Block(columns, rows, order[covers])
 
 
 def draw(

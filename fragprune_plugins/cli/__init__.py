@@ -16,6 +16,7 @@ _COMMANDS = {
     "finetune": "finetune",
     "render": "render",
     "profile": "profile",
+    "audit": "audit",
     "compare": "compare",
     "export": "export",
     "report": "report",
@@ -55,6 +56,7 @@ def cli() -> None:
     I have a training repository   fragprune run -- python train.py -s scene -m out
     I have a trained .ply          fragprune finetune point_cloud.ply --data scene --out pruned.ply
     What did I gain?               fragprune compare point_cloud.ply pruned.ply --data scene
+    What does it cost to draw?     fragprune audit point_cloud.ply --out audit
     Show me, no GPU needed         fragprune demo
 
     Every command takes --json (one object on stdout, progress on stderr) and --help.

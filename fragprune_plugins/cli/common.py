@@ -441,6 +441,15 @@ views_option = click.option(
 )
 
 
+def cameras_of(model: Path) -> Path | None:
+    """The cameras that a host wrote beside a model, if its output folder has them."""
+    from fragprune_plugins.hosts.graphdeco.output import CAMERAS, output_folder
+
+    folder = output_folder(model)
+    found = None if folder is None else folder / CAMERAS
+    return found if found is not None and found.is_file() else None
+
+
 def photographs_for(
     model: Path,
     data: Path | None,

@@ -52,16 +52,18 @@ def command(
     # torch reads this when it loads. Idle threads sleep, and leave the CPU to other programs.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from fragprune_plugins.demo.demo import DemoSettings, run_demo
-    from fragprune_plugins.measure.wording import describe, outcome
+    from fragprune_plugins.measure.wording import describe, frames, outcome
 
     _, where = open_engine(engine, device, threads)
     settings = DemoSettings(
         iterations=iters, finetune=iters // 2, seed=seed, engine=engine, device=str(where)
     )
     report = run_demo(out, settings, lambda line: click.echo(line, err=True))
+    larger = report["larger"]
     table = describe({"before": report["before"], "after": report["after"]})
     text = (
         f"\n{table}\n\n{outcome('run', report, report['control'])}\n"
+        f"Of larger pictures, {larger['size']}: {frames(larger['before'], larger['after'])}.\n"
         f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures."
     )
     return Report(report, text)

@@ -11,6 +11,7 @@ from fragprune_plugins.cli.common import (
     MODEL,
     Command,
     Report,
+    cameras_of,
     engine_options,
     image_options,
     load_shots,
@@ -66,7 +67,14 @@ def command(
     if cameras is not None and data is not None:
         raise UsageError("options", "both of --cameras and --data", "one of them", "Pass one.")
     if cameras is None and data is None:
-        cameras = _of_training(model)
+        cameras = cameras_of(model)
+        if cameras is None:
+            raise UsageError(
+                "options",
+                "neither --cameras nor --data, and no cameras.json of a training around MODEL",
+                "cameras to draw from",
+                "Pass --cameras FILE or --data FOLDER.",
+            )
 
     import torch
 
@@ -124,18 +132,3 @@ def command(
             ]
         ),
     )
-
-
-def _of_training(model: Path) -> Path:
-    """The cameras that a host wrote beside a model."""
-    from fragprune_plugins.hosts.graphdeco.output import CAMERAS, output_folder
-
-    folder = output_folder(model)
-    if folder is None or not (folder / CAMERAS).is_file():
-        raise UsageError(
-            "options",
-            f"neither --cameras nor --data, and no {CAMERAS} of a training around {model}",
-            "cameras to draw from",
-            "Pass --cameras FILE or --data FOLDER.",
-        )
-    return folder / CAMERAS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 from collections.abc import Callable
 from functools import partial
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     import torch
 
     from fragprune_plugins.engines import Engine
+    from fragprune_plugins.measure.report_page import Drawn
     from fragprune_plugins.storage.records import Record
 
 PAGE = "report.html"
@@ -45,9 +45,6 @@ _ONLY_CONTROLS = (
     "This folder holds only controls, and no run or fine-tuning that truncates. "
     "Run the same command without --control, then report again."
 )
-
-_SLIDERS = """Held-out views. Drag the sliders: the model before is left of the handle, the model
-after is right of it. The photograph is beside them. The fragments of each pixel are below."""
 
 
 @click.command("report", cls=Command)
@@ -76,7 +73,7 @@ def command(
     Example:
       fragprune report out --data scene
     """
-    from fragprune_plugins.measure import report_page
+    from fragprune_plugins.measure import page, report_page
     from fragprune_plugins.storage.atomic import replacing
     from fragprune_plugins.storage.records import find
 
@@ -92,23 +89,27 @@ def command(
     line = _sentence(main, files)
     with TemporaryDirectory() as name:
         pictures = Path(name)
-        views, learning, missing = _draw(
+        drawn, learning, missing = _draw(
             main, folder, pictures, data, partial(open_engine, engine, device, threads)
         )
         more = [*learning, *_files(records, folder, pictures)]
-        text = report_page.compose(
+
+        def source(file: str) -> str:
+            return page.embedded(pictures / file)
+
+        text = page.compose(
             title=f"fragprune report: {folder.resolve().name}",
             quote=line,
-            text=[
-                report_page.preformatted(_table(main)),
-                *([report_page.paragraph(_ONLY_CONTROLS)] if control else []),
-                report_page.paragraph(missing or (_SLIDERS if views else "")),
+            parts=[
+                _table(main),
+                page.paragraph(_ONLY_CONTROLS if control else ""),
+                page.paragraph(missing),
+                *(report_page.views(drawn, source) if drawn else ()),
                 *(block for record in others for block in _block(record, files)),
+                *(page.heading(name) + page.wide(source(file), name) for name, file in more),
+                page.heading("Settings"),
+                page.table(["", ""], _facts(main), words=2),
             ],
-            views=views,
-            pictures=more,
-            source=lambda file: _embedded(pictures / file),
-            ending=["<h2>Settings</h2>", report_page.preformatted(_facts(main))],
         )
     target = out or folder / PAGE
     with replacing(target) as path:
@@ -119,8 +120,8 @@ def command(
         "command": main.command,
         "control": control,
         "record": str(main.path),
-        "views": views,
-        "pictures": len(views) * 4 + len(more),
+        "views": list(drawn.names) if drawn else [],
+        "pictures": (len(drawn.files) if drawn else 0) + len(more),
     }
     report |= {key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")}
     report["notes"] = notes = [
@@ -153,14 +154,14 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
 
 
 def _table(record: Record) -> str:
-    """A table of the measurements, else of the figures on training views."""
-    from fragprune_plugins.measure.wording import describe
+    """A table of the measurements, else of the figures on training views, as HTML."""
+    from fragprune_plugins.measure import page, report_page
 
     columns = _columns(record)
     if columns:
-        return describe(columns)
-    seen = record.data["training_views"]
-    return "\n".join(f"{key:<30}{_number(value)}" for key, value in seen.items())
+        return report_page.figures(columns)
+    seen = record.data["training_views"].items()
+    return page.table(["", "training views"], [[key, _number(value)] for key, value in seen])
 
 
 def _number(value: float | None) -> str:
@@ -176,7 +177,8 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     name = data.get("adapter") or ""
     of = f"{name}, {data['iterations']:,} iterations: " if name else ""
     if len(columns) > 1 and record.command in ("run", "finetune"):
-        return of + outcome(record.command, data, control_of(data, among))
+        control = data.get("control") or control_of(data, among)
+        return of + outcome(record.command, data, control)
     if len(columns) > 1:
         return f"{gain(columns[0], columns[-1])}."
     if columns:
@@ -194,24 +196,25 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
 
 def _block(record: Record, among: Sequence[Path]) -> list[str]:
     """A record as HTML: heading, sentence and table."""
-    from html import escape
+    from fragprune_plugins.measure import page
 
-    from fragprune_plugins.measure import report_page
-
-    where = escape(f"{record.command}: {record.path.name}")
     return [
-        f"<h2>{where}</h2>",
-        report_page.paragraph(_sentence(record, among)),
-        report_page.preformatted(_table(record)),
+        page.heading(f"{record.command}: {record.path.name}"),
+        page.paragraph(_sentence(record, among)),
+        _table(record),
     ]
 
 
-def _facts(record: Record) -> str:
-    """The settings and files of a record, one a line."""
+def _facts(record: Record) -> list[list[str]]:
+    """The settings and files of a record, one a row."""
     keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
     facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
     facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
-    return "\n".join(f"{key:<16}{value}" for key, value in facts.items() if value is not None)
+    return [
+        [key, f"{value:.4g}" if isinstance(value, float) else str(value)]
+        for key, value in facts.items()
+        if value is not None
+    ]
 
 
 def _draw(
@@ -220,7 +223,7 @@ def _draw(
     folder: Path,
     data: Path | None,
     opened: Callable[[], tuple[Engine, torch.device]],
-) -> tuple[list[str], list[tuple[str, str]], str]:
+) -> tuple[Drawn | None, list[tuple[str, str]], str]:
     """Draw held-out views and learning curves into a folder.
 
     Args:
@@ -231,8 +234,8 @@ def _draw(
         opened: opens the engine; called only if there is something to draw.
 
     Returns:
-        Names of the views, (heading, file) of further pictures, and a sentence that tells why
-        views are missing ("" if none are).
+        The views, if any were drawn, (heading, file) of further pictures, and a sentence that
+        tells why views are missing ("" if none are).
     """
     from dataclasses import replace
 
@@ -243,7 +246,7 @@ def _draw(
 
     drawn, curves = recorded(record), record.data.get("curves")
     if drawn is None:
-        return [], [], ""
+        return None, [], ""
     scene = drawn.photographs if data is None else replace(drawn.photographs, folder=data)
     allowed = [each for each in drawn.models if data is not None or lies_in(each, inside)]
     learning: list[tuple[str, str]] = []
@@ -258,17 +261,21 @@ def _draw(
                 report_page.save_learning(folder / report_page.LEARNING, curves, values)
             learning = [("How it learned", report_page.LEARNING)]
         if len(drawn.models) == 1:  # of joint learning, which leaves no model of before
-            return [], learning, ""
+            return None, learning, ""
         if data is None and not (len(allowed) == 2 and lies_in(scene.folder, inside)):
-            return [], learning, f"No views are shown: they need files outside of {inside}. {_HOW}"
+            return (
+                None,
+                learning,
+                f"No views are shown: they need files outside of {inside}. {_HOW}",
+            )
         dataset = load_photographs(scene)
     except (DatasetError, ModelFileError, SidecarError) as error:
         if data is not None:  # the user asked for the views
             raise
-        return [], learning, f"No views are shown: {error}"
+        return None, learning, f"No views are shown: {error}"
     before, after = (Candidate(*each, drawn.drawing) for each in loaded)
     views = report_page.draw_views(folder, before, after, dataset.test, engine)
-    return list(views), learning, ""
+    return views, learning, ""
 
 
 def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
@@ -289,7 +296,3 @@ def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str,
                     (folder / copy).write_bytes(content)
                     found.append((f"{record.command}: {file.stem}", copy))
     return found
-
-
-def _embedded(file: Path) -> str:
-    return f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"

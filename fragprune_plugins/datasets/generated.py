@@ -1,7 +1,7 @@
-"""Cameras that nobody took a photograph with: around a splat, and between given ones.
+"""Cameras that nobody took a photograph with: around a splat, inside of it, and between given ones.
 
-Both are the same for the same seed. Cameras around a splat suit an object. A scene that was
-photographed from within needs its own cameras: a splat does not say where its air is.
+They are the same for the same seed. Cameras around a splat suit an object. Inside of one they need
+to be told where its air is, which a splat does not say: ``measure.placing`` estimates it.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ ORBIT_VIEWS = 96
 _SHOWN = 0.9  # share of the Gaussians that an orbit goes around: some float far out
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 _NEARER = (0.6, 1.0)  # of the distance that shows them all: viewers zoom
+_LEVEL = 0.5  # sine of the steepest look from inside: 30 degrees
 _NEIGHBOURS = 4
 _BETWEEN = (0.1, 0.9)  # of the way; nearer to a camera is its own picture again
 
@@ -87,6 +88,38 @@ def around(
             eye, centre, width=width, height=height, fov_y=fov_y, background=background
         )
         views.append((f"around{number:03d}", view))
+    return views
+
+
+def within(
+    places: Sequence[Tensor],
+    count: int,
+    *,
+    width: int = 800,
+    height: int = 800,
+    fov_y: float = 75.0,
+    background: Tensor | None = None,
+) -> Named:
+    """Cameras that look around from places inside a splat, to all sides and a little up and down.
+
+    Args:
+        places: (3,) each, taken in turns.
+        count: cameras.
+        width: pixels.
+        height: pixels.
+        fov_y: vertical field of view, degrees; rooms are looked at with wide lenses.
+        background: (3,) RGB; black when None.
+    """
+    views = []
+    for number in range(count):
+        rise, turn = _LEVEL * (1 - (2 * number + 1) / count), number * _GOLDEN_ANGLE
+        level = math.sqrt(1 - rise * rise)
+        ahead = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
+        eye = places[number % len(places)].detach().float().cpu()
+        view = View.look_at(
+            eye, eye + ahead, width=width, height=height, fov_y=fov_y, background=background
+        )
+        views.append((f"within{number:03d}", view))
     return views
 
 

@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -129,11 +129,13 @@ def run_demo(
     with clock.part("measure"):
         say("4/5  Measuring on the held-out views")
         report = _measure(scene, summary, control, settings)
-    with clock.part("pictures"), claiming(out, "pictures", "index.html"):
+    with clock.part("pictures"), claiming(out, "pictures", "index.html", "model"):
         say("5/5  Drawing the pictures")
+        made = replace(settings.scene, seed=settings.seed)
         report["files"] = write_page(
-            out, report, scene, summary.curves, settings.engine, settings.device
+            out, report, scene, made, summary.curves, settings.engine, settings.device
         )
+        _record(report, scene, summary)
     report["seconds_by_part"] = clock.seconds
     report["seconds"] = sum(clock.seconds.values())
     with claiming(out, REPORT), replacing(out / REPORT) as path:
@@ -142,8 +144,6 @@ def run_demo(
 
 
 def _photograph(folder: Path, settings: DemoSettings) -> None:
-    from dataclasses import replace
-
     from tqdm import tqdm
 
     with tqdm(total=settings.scene.views, desc="Photographs", unit="view") as bar:
@@ -215,6 +215,19 @@ def _measure(
         "model_after": str(summary.model_after),
         "settings": summary.settings,
     }
+
+
+def _record(report: dict[str, Any], scene: Path, summary: RunSummary) -> None:
+    """Leave what ``fragprune run`` leaves beside its model, for ``fragprune report``."""
+    from fragprune_plugins.datasets.photographs import Photographs
+    from fragprune_plugins.storage import records
+
+    models = [str(path.resolve()) for path in (summary.model_before, summary.model_after) if path]
+    photographs = {"models": models, "filtered": True, "drawing": summary.drawing}
+    photographs = Photographs(scene.resolve()).as_dict() | photographs
+    assert summary.model_after is not None
+    more = {"curves": summary.curves, "photographs": photographs}
+    records.leave(summary.model_after, "run", report | more)
 
 
 class _Clock:

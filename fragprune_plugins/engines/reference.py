@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
@@ -117,13 +118,16 @@ def fragments(
     assert isinstance(inputs.splats, Splats)
     inputs.check_thresholds(thresholds)
     view = inputs.view
-    count = -(-view.width // TILE) * -(-view.height // TILE)
+    across, down = -(-view.width // TILE), -(-view.height // TILE)
+    every = 1 if tiles is None else -(-across * down // tiles)
+    while math.gcd(every, across) > 1:  # else the same columns of every row
+        every += 1
     return blended(
         camera_of(inputs),
         gaussians_of(inputs.splats),
         thresholds,
         options=options_of(inputs),
-        every=1 if tiles is None else -(-count // tiles),
+        every=every,
     )
 
 

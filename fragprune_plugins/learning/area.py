@@ -35,7 +35,7 @@ def ellipse_areas(inputs: RasterInputs) -> Tensor:
     """
     view, splats = inputs.view, inputs.splats
     if isinstance(splats, Splats):
-        cov2d, means2d, visible = _project(inputs, splats)
+        cov2d, means2d, visible = project(inputs, splats)
     else:
         cov2d, means2d, visible = _invert(splats)
     xx, xy, yy = cov2d
@@ -68,7 +68,7 @@ def _invert(footprints: Footprints) -> tuple[tuple[Tensor, Tensor, Tensor], Tens
     return cov2d, footprints.means2d.detach(), drawn  # type: ignore[return-value]
 
 
-def _project(
+def project(
     inputs: RasterInputs, splats: Splats
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
     """Covariances and means on the image, and whether the Gaussians lie in front of the camera."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,13 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.datasets.dataset import Shot
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.measure.metrics import psnr, ssim
+from fragprune_plugins.measure.extents import covered
+from fragprune_plugins.measure.metrics import lpips, psnr, ssim
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage.ply import SplatFile
@@ -90,7 +89,7 @@ def measure(
 
     Returns:
         One dict a candidate: target ("photographs", or "itself" for a model's own pictures), psnr
-        (dB; infinite against itself), ssim, lpips (None), fragments_per_pixel,
+        (dB; infinite against itself), ssim, lpips (None where not installed), fragments_per_pixel,
         evaluated_per_pixel, entries_per_pixel (NaN from an engine that does not count them),
         area_per_pixel (``covered_per_pixel``), gaussians, frame_ms (median over views and repeats),
         frame_ms_se (standard error over repeats of the median over views), engine, device, views.
@@ -102,10 +101,11 @@ def measure(
     drawn = [candidate.model.splats() for candidate in candidates]
     reports: list[dict[str, Any]] = []
     for candidate, splats in zip(candidates, drawn, strict=True):
-        rows = []
+        rows, distances = [], []
         for shot in shots:
             outputs = candidate.draw(engine, shot.view, splats)
             seen = shot.looked_at(outputs.image)
+            distances.append(lpips(seen, shot.image))
             rows.append(
                 (
                     psnr(seen, shot.image),
@@ -123,7 +123,7 @@ def measure(
                 "target": shots[0].target,
                 "psnr": quality,
                 "ssim": likeness,
-                "lpips": None,
+                "lpips": _mean(distances),
                 "fragments_per_pixel": fragments,
                 "evaluated_per_pixel": evaluated,
                 "entries_per_pixel": entries,
@@ -138,6 +138,11 @@ def measure(
     return reports
 
 
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if len(known) == len(values) else None
+
+
 @torch.no_grad()
 def covered_per_pixel(engine: Engine, inputs: RasterInputs) -> float:
     """Pixels in the Gaussians' ellipses of sqrt(8) standard deviations, per pixel of the picture.
@@ -149,12 +154,9 @@ def covered_per_pixel(engine: Engine, inputs: RasterInputs) -> float:
         engine: counts them.
         inputs: of one rasterization of ``Splats``.
     """
-    # Alpha capped at its least hides nothing; see ``visible``. A threshold then ends each ellipse.
     assert isinstance(inputs.splats, Splats)
-    opaque = replace(inputs.splats, opacities=torch.ones_like(inputs.splats.opacities))
-    inputs = replace(inputs, splats=opaque, compensation="none", alpha_max=ALPHA_MIN)
-    ends = torch.full_like(opaque.opacities, math.exp(-SQUARED_RADIUS / 2))
-    return float(engine.rasterize(inputs, ends).fragments_per_pixel)
+    squared = torch.full_like(inputs.splats.opacities, SQUARED_RADIUS)
+    return float(covered(engine, inputs, squared).fragments_per_pixel)
 
 
 @torch.no_grad()

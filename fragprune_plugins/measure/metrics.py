@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning.losses import SIGMA, WINDOW
+
+WEIGHTS = "vgg16-397923af.pth"
+"""torchvision's file of VGG16's weights, in ``checkpoints`` of ``torch.hub.get_dir()``."""
+
+SMALLEST = 16
+"""Pixels of a side of which VGG16's four poolings leave one."""
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -49,9 +61,33 @@ def ssim(image: Tensor, target: Tensor) -> float:
     )
 
 
-def lpips(image: Tensor, target: Tensor) -> None:
-    """Not computed, because LPIPS needs network weights from a download.
+def lpips(image: Tensor, target: Tensor) -> float | None:
+    """Learned perceptual distance with VGG16, 0 for equal images (3, H, W); None if not installed.
 
-    Reports carry ``null``. To compute LPIPS, render both models with ``fragprune render`` and run
-    the ``lpips`` package on the pictures.
+    By the package ``lpips`` (0.1.4), from images scaled to [-1, 1] as it was trained on. The hosts'
+    own figures differ: 3DGS scales to [0, 1]. Nothing is downloaded: the weights of VGG16 must lie
+    in torch's cache (``WEIGHTS``), where the first use of the package puts them.
+
+    Images below 16x16 pixels have no features, and so no distance.
     """
+    network = _network(image.device)
+    if network is None or min(image.shape[-2:]) < SMALLEST:
+        return None
+    with torch.no_grad():
+        pair = (each.detach().float().clamp(0, 1)[None] for each in (image, target))
+        return float(network(*pair, normalize=True))
+
+
+@lru_cache(maxsize=1)
+def _network(device: torch.device) -> Callable[..., Tensor] | None:
+    """The network of ``lpips``; None if package or weights are missing or cannot be used."""
+    if not (Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS).is_file():
+        return None
+    try:
+        from lpips import LPIPS
+    except (ImportError, RuntimeError):  # a torchvision of another torch raises the latter
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it calls torchvision as one did in 2021
+        network: Callable[..., Tensor] = LPIPS(net="vgg", verbose=False).to(device).eval()
+    return network

@@ -20,7 +20,13 @@ if TYPE_CHECKING:
 COLOURS = "inferno"
 LABEL = "drawn fragments per pixel"
 
-BESIDE = tuple(f"_{kind}" for kind in ("fragments", "panel", "photograph", "before", "after"))
+BESIDE = tuple(
+    f"_{kind}"
+    for kind in (
+        *("fragments", "panel", "photograph", "before", "after", "overdraw"),
+        *(f"{model}_{shown}" for model in ("before", "after") for shown in ("fragments", "error")),
+    )
+)
 """What commands add to a view's name for further pictures of it."""
 
 _STEM = 150  # bytes of a picture's name, of 255 that file systems allow
@@ -78,11 +84,37 @@ def save_heatmap(path: Path, fragments: Tensor, limit: float) -> None:
     save_panel(path, [("", fragments)], limit)
 
 
+def save_map(path: Path, values: Tensor, limit: float) -> None:
+    """Write values (H, W) as colours, one pixel for each, without a scale: ``colour_stops`` has it.
+
+    Args:
+        path: the PNG.
+        values: 0 or more.
+        limit: the value at the top of the scale; what is larger looks like it.
+    """
+    from matplotlib import colormaps
+    from PIL import Image
+
+    levels = (255 * values.detach().float().cpu() / max(limit, 1e-9)).clamp(0, 255).round()
+    shown = Image.fromarray(levels.byte().numpy(), mode="P")
+    shown.putpalette(colormaps[COLOURS](range(256), bytes=True)[:, :3].tobytes())
+    with replacing(path) as temporary:
+        shown.save(temporary, format="PNG")
+
+
+def colour_stops(count: int = 9) -> list[str]:
+    """Colours of maps from 0 to their limit, evenly spaced, as ``#rrggbb``."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colormaps[COLOURS](at / (count - 1))) for at in range(count)]
+
+
 def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float) -> None:
     """Write pictures side by side under their titles; counts (H, W) become colours.
 
     Args:
-        path: the PNG.
+        path: the PNG or JPG.
         pictures: (title, picture), where a picture is (3, H, W) RGB or (H, W) counts, of one size.
         limit: the count at the top of the colour scale, which all (H, W) share.
     """
@@ -130,4 +162,5 @@ def _save(path: Path, figure: Figure) -> None:
 
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=130, bbox_inches="tight")
+        kind = path.suffix[1:] or "png"
+        figure.savefig(temporary, format=kind, dpi=130, bbox_inches="tight")

@@ -1,13 +1,13 @@
-"""An HTML page of results: a sentence, a table, sliders over views, learning curves."""
+"""What pages of results show: views before and after under dividers, tables, learning curves."""
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from string import Template
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from fragprune_plugins.measure import page
 from fragprune_plugins.storage.atomic import replacing
 
 if TYPE_CHECKING:
@@ -18,51 +18,169 @@ if TYPE_CHECKING:
     from fragprune_plugins.measure.evaluate import Candidate
 
 LEARNING = "learning.png"
-_SHOWN = 3  # views on the page
+SHOWN = 3
+"""Views on the page."""
+
+_MODELS = ("before", "after")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Views that were drawn for a page, on shared scales.
+
+    Attributes:
+        names: of the views: how their files begin.
+        sizes: of their pictures: width and height, pixels.
+        fragments: of each view, drawn per pixel before and after.
+        most_fragments: per pixel, at the top of the scale.
+        most_error: difference to the photograph at the top of the scale, 8-bit levels.
+    """
+
+    names: Sequence[str]
+    sizes: Sequence[page.Size]
+    fragments: Sequence[tuple[float, float]]
+    most_fragments: float
+    most_error: float
+
+    @property
+    def files(self) -> list[str]:
+        """Names of all pictures."""
+        kinds = ["photograph", *_MODELS]
+        kinds += [f"{model}_{shown}" for model in _MODELS for shown in ("fragments", "error")]
+        return [f"{name}_{kind}.png" for name in self.names for kind in kinds]
 
 
 def draw_views(
     folder: Path, before: Candidate, after: Candidate, shots: Sequence[Shot], engine: Engine
-) -> dict[str, list[str]]:
-    """Draw some evenly spread views: photograph, before, after, fragment densities.
+) -> Drawn:
+    """Draw some evenly spread views: photograph, before, after, and maps of both.
+
+    The maps show the fragments of each pixel, and the largest difference of a channel to the
+    photograph.
 
     Args:
-        folder: for the PNGs.
+        folder: for the PNGs, which ``Drawn.files`` names.
         before: the model before fine-tuning.
         after: the model to compare with ``before``.
         shots: the views; they move to the models' device.
         engine: draws the views.
-
-    Returns:
-        Files by the name of the view: its photograph, before, after, fragments.
     """
     import torch
 
     from fragprune_plugins.learning.stage2 import evenly
-    from fragprune_plugins.measure.pictures import save_image, save_panel, stems
+    from fragprune_plugins.measure.pictures import save_image, save_map, stems
 
-    views = {}
-    models = [("before", before, before.model.splats()), ("after", after, after.model.splats())]
-    chosen = evenly(shots, _SHOWN)
-    for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
-        shot = shot.to(before.model.xyz.device)
-        with torch.no_grad():
-            drawn = {
-                name: each.draw(engine, shot.view, splats, counts=True)
-                for name, each, splats in models
-            }
-        images = {"photograph": shot.image} | {name: out.image for name, out in drawn.items()}
-        for name, image in images.items():
-            save_image(folder / f"{stem}_{name}.png", image)
-        counts = [
-            (f"{name}: {float(out.fragments_per_pixel):.1f} per pixel", out.fragments)
-            for name, out in drawn.items()
-            if out.fragments is not None
-        ]
-        limit = float(torch.cat([c.flatten() for _, c in counts]).float().quantile(0.999))
-        save_panel(folder / f"{stem}_fragments.png", counts, limit)
-        views[stem] = [f"{stem}_{name}.png" for name in (*images, "fragments")]
-    return views
+    models = [(before, before.model.splats()), (after, after.model.splats())]
+    chosen = [shot.to(before.model.xyz.device) for shot in evenly(shots, SHOWN)]
+    names = stems([shot.name for shot in chosen])
+    maps: dict[str, dict[str, Tensor]] = {"fragments": {}, "error": {}}
+    counted = []
+    for name, shot in zip(names, chosen, strict=True):
+        save_image(folder / f"{name}_photograph.png", shot.image)
+        per_pixel = []
+        for model, (each, splats) in zip(_MODELS, models, strict=True):
+            with torch.no_grad():
+                out = each.draw(engine, shot.view, splats, counts=True)
+            assert out.fragments is not None
+            save_image(folder / f"{name}_{model}.png", out.image)
+            seen = shot.looked_at(out.image)
+            error = (seen.clamp(0, 1) - shot.image.clamp(0, 1)).abs().amax(dim=0)
+            maps["fragments"][f"{name}_{model}"] = out.fragments
+            maps["error"][f"{name}_{model}"] = 255 * error
+            per_pixel.append(float(out.fragments_per_pixel))
+        counted.append((per_pixel[0], per_pixel[1]))
+    limits = {}
+    for kind, values in maps.items():
+        limits[kind] = shared_limit(list(values.values()))
+        for stem, each_map in values.items():
+            save_map(folder / f"{stem}_{kind}.png", each_map, limits[kind])
+    sizes = [(shot.view.width, shot.view.height) for shot in chosen]
+    return Drawn(names, sizes, counted, limits["fragments"], limits["error"])
+
+
+def save_banner(
+    path: Path, before: Candidate, after: Candidate, shot: Shot, engine: Engine
+) -> None:
+    """Draw one view before and after, and the fragments of both, side by side.
+
+    Args:
+        path: the PNG or JPG.
+        before: the model before fine-tuning.
+        after: the model after it.
+        shot: the view.
+        engine: draws it.
+    """
+    import torch
+
+    from fragprune_plugins.measure.pictures import save_panel
+
+    with torch.no_grad():
+        was, now = (
+            each.draw(engine, shot.view, each.model.splats(), counts=True)
+            for each in (before, after)
+        )
+    assert was.fragments is not None
+    assert now.fragments is not None
+    panels = [("before", was.image), ("after", now.image)]
+    for name, out, counts in (("before", was, was.fragments), ("after", now, now.fragments)):
+        panels.append((f"{name}: {float(out.fragments_per_pixel):.1f} fragments/pixel", counts))
+    save_panel(path, panels, shared_limit([was.fragments, now.fragments]))
+
+
+def shared_limit(maps: Sequence[Tensor]) -> float:
+    """The value that one pixel in 200 of all maps exceeds: the top of their colour scale."""
+    import torch
+
+    values = torch.cat([each.flatten() for each in maps]).float()
+    at = min(len(values), int(0.995 * len(values)) + 1)
+    return max(1.0, float(values.kthvalue(at).values))
+
+
+def views(drawn: Drawn, source: Callable[[str], str]) -> list[str]:
+    """The drawn views as parts of a page.
+
+    Args:
+        drawn: what ``draw_views`` gave.
+        source: turns a picture's file name into its ``src``, a relative path or a data URL.
+    """
+    if not drawn.names:
+        return []
+    parts = []
+    for name, size, (was, now) in zip(drawn.names, drawn.sizes, drawn.fragments, strict=True):
+
+        def both(kind: str, caption: str, name: str = name, size: page.Size = size) -> str:
+            left, right = (source(f"{name}_{model}{kind}.png") for model in _MODELS)
+            return page.split(left, right, caption, size, _MODELS)
+
+        photograph = source(f"{name}_photograph.png")
+        parts.append(
+            page.section(
+                name,
+                both("", "Drawn before and after"),
+                page.picture(photograph, "Photograph", size),
+                both("_fragments", f"Fragments per pixel: {was:.1f} before, {now:.1f} after"),
+                both("_error", "Difference to the photograph"),
+            )
+        )
+    zoom = max(map(page.zoom, drawn.sizes))
+    shown = f" Pixels are shown {zoom} times as large." if zoom > 1 else ""
+    return [
+        page.heading("Before and after"),
+        page.paragraph(f"{_DIVIDERS}{shown}"),
+        page.legend("fragments drawn in a pixel", drawn.most_fragments),
+        page.legend(
+            "difference to the photograph, 8-bit levels, largest channel", drawn.most_error
+        ),
+        *parts,
+    ]
+
+
+def figures(columns: Mapping[str, dict[str, Any]]) -> str:
+    """A table of measurements by name of the model, with the change between the last two."""
+    from fragprune_plugins.measure.wording import measured_with, tabulate
+
+    head, *rows = tabulate(columns)
+    return page.table(head, rows, measured_with(columns))
 
 
 def save_learning(
@@ -108,89 +226,5 @@ def save_learning(
         figure.savefig(temporary, format="png", dpi=110)
 
 
-def compose(
-    *,
-    title: str,
-    quote: str,
-    text: Sequence[str],
-    views: Sequence[str],
-    pictures: Sequence[tuple[str, str]],
-    source: Callable[[str], str],
-    ending: Sequence[str] = (),
-) -> str:
-    """Compose the page as HTML.
-
-    Args:
-        title: also its heading.
-        quote: the outcome in a sentence, shown large.
-        text: paragraphs and tables, HTML.
-        views: names of views that ``draw_views`` drew; each has a slider.
-        pictures: (heading, file) of further pictures at full width.
-        source: turns a picture's file name into its ``src``, a relative path or a data URL.
-        ending: paragraphs and tables below the pictures, HTML.
-    """
-    sections = [_view(name, source) for name in views]
-    sections += [
-        f'<h2>{html.escape(heading)}</h2>\n<img class="wide" src="{source(file)}" alt="">'
-        for heading, file in pictures
-    ]
-    return _PAGE.substitute(
-        title=html.escape(title),
-        quote=html.escape(quote),
-        body="\n".join([*text, *sections, *ending]),
-    )
-
-
-def preformatted(text: str) -> str:
-    """Preformatted text, such as a table, as HTML."""
-    return f"<pre>{html.escape(text)}</pre>"
-
-
-def paragraph(text: str) -> str:
-    """A paragraph of text as HTML."""
-    return f"<p>{html.escape(text)}</p>"
-
-
-def _view(name: str, source: Callable[[str], str]) -> str:
-    names: Mapping[str, str] = {
-        kind: html.escape(source(f"{name}_{kind}.png"))
-        for kind in ("photograph", "before", "after", "fragments")
-    }
-    return _VIEW.substitute(names)
-
-
-_VIEW = Template("""<section>
-<div class="pair">
-<img src="$after" alt="after">
-<img class="top" src="$before" alt="before">
-<input type="range" min="0" max="100" value="50" aria-label="before or after"
- oninput="this.previousElementSibling.style.clipPath='inset(0 '+(100-this.value)+'% 0 0)'">
-<span class="left">before</span><span class="right">after</span>
-</div>
-<img class="photo" src="$photograph" alt="photograph">
-<img class="wide" src="$fragments" alt="fragments per pixel">
-</section>""")
-
-_PAGE = Template("""<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>$title</title>
-<meta name="viewport" content="width=device-width">
-<style>
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
-  color: #222; background: #fcfbf9 }
-.quote { font-size: 1.35rem; border-left: .3rem solid #d2542c; padding-left: 1rem }
-pre { background: #f0ede8; padding: 1rem; overflow-x: auto; border-radius: .4rem }
-section { display: grid; grid-template-columns: 1fr 1fr; gap: 1rem; margin: 2rem 0 }
-.wide { grid-column: 1 / -1; width: 100% }
-.pair { position: relative }
-.pair img, .photo { width: 100%; display: block; border-radius: .4rem }
-.pair .top { position: absolute; inset: 0; clip-path: inset(0 50% 0 0) }
-.pair input { position: absolute; inset: auto 0 .5rem; width: 100%; margin: 0 }
-.pair span { position: absolute; top: .5rem; padding: 0 .5rem; background: #000a; color: #fff;
-  border-radius: .3rem; font-size: .8rem }
-.left { left: .5rem } .right { right: .5rem }
-</style>
-<h1>$title</h1>
-<p class="quote">$quote</p>
-$body
-</html>
-""")
+_DIVIDERS = """Held-out views. Drag a divider: the model before is left of it, the model after is
+right of it. The dividers of a view move together."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00
@@ -34,6 +34,7 @@ VISIBLE = 35.0
 _ROWS = (
     ("PSNR, dB", "psnr", 2),
     ("SSIM", "ssim", 4),
+    ("LPIPS", "lpips", 4),
     ("fragments/pixel", "fragments_per_pixel", 2),
     ("evaluated/pixel", "evaluated_per_pixel", 2),
     ("list entries/pixel", "entries_per_pixel", 3),
@@ -42,23 +43,45 @@ _ROWS = (
     ("Gaussians", "gaussians", 0),
 )
 
+_DIFFERENCES = ("psnr", "ssim", "lpips")
+"""Figures whose change is a difference; that of others is a ratio."""
 
-def describe(columns: dict[str, dict[str, Any]]) -> str:
+_OPTIONAL = ("lpips", "entries_per_pixel")
+"""Figures that an installation, an engine or an older record may lack."""
+
+
+def describe(columns: Mapping[str, dict[str, Any]]) -> str:
     """A table with a column for each measurement, and the change between the last two."""
+    lines = []
+    for first, *cells in tabulate(columns):
+        change = f"{cells.pop():>12}" if len(columns) > 1 else ""
+        lines.append(f"{first:<20}" + "".join(f"{cell:>16}" for cell in cells) + change)
+    return "\n".join([*lines, measured_with(columns)])
+
+
+def measured_with(columns: Mapping[str, dict[str, Any]]) -> str:
+    """What the last measurement was made with: views, engine, device."""
+    report = list(columns.values())[-1]
+    return f"{report['views']} views, {report['engine']} engine on {report['device']}"
+
+
+def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
+    """Rows of a table, the first one its head: a figure, each measurement's, and the change.
+
+    The change is that between the last two measurements; one alone has none.
+    """
     reports = list(columns.values())
-    head = " " * 20 + "".join(f"{name:>16}" for name in columns)
-    lines = [head + f"{'change':>12}" if len(columns) > 1 else head]
+    change = ["change"] if len(reports) > 1 else []
+    rows = [["", *columns, *change]]
     itself = reports[-1].get("target") == ITSELF
     for label, key, digits in _ROWS:
-        if key == "entries_per_pixel" and not all(_known(each.get(key)) for each in reports):
-            continue  # an engine that does not count them, or a record from before they were
+        if key in _OPTIONAL and not all(_known(each.get(key)) for each in reports):
+            continue
         if any(key not in report for report in reports):  # records of version 0.1 have no area
             continue
         if key == "psnr" and itself:  # before, it is infinite: null in a record
-            cells = [
-                "equal" if report is reports[0] else f"{report[key]:.2f}" for report in reports
-            ]
-            lines.append(f"{'PSNR to itself, dB':<20}" + "".join(f"{cell:>16}" for cell in cells))
+            equal = ["equal" if each is reports[0] else f"{each[key]:.2f}" for each in reports]
+            rows.append(["PSNR to itself, dB", *equal, *([""] if change else [])])
             continue
         cells = [f"{report[key]:.{digits}f}" for report in reports]
         if key == "frame_ms":
@@ -66,19 +89,15 @@ def describe(columns: dict[str, dict[str, Any]]) -> str:
                 f"{cell} ± {report['frame_ms_se']:.{digits}f}"
                 for cell, report in zip(cells, reports, strict=True)
             ]
-        line = f"{label:<20}" + "".join(f"{cell:>16}" for cell in cells)
-        if len(reports) > 1:
+        if change:
             first, last = reports[-2][key], reports[-1][key]
-            change = (
+            cells.append(
                 f"{last - first:+.{digits}f}"
-                if key in ("psnr", "ssim")
+                if key in _DIFFERENCES
                 else f"/ {first / max(last, 1e-9):.2f}"
             )
-            line += f"{change:>12}"
-        lines.append(line)
-    report = reports[-1]
-    lines.append(f"{report['views']} views, {report['engine']} engine on {report['device']}")
-    return "\n".join(lines)
+        rows.append([label, *cells])
+    return rows
 
 
 def nothing_drawn(fragments: Sequence[float]) -> list[str]:
@@ -104,7 +123,7 @@ def gain(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for the gain of one measurement over another: fragments, frame times, PSNR."""
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
-        f"{_frames(before, after)}, {_quality(before, after)} on {after['views']} views"
+        f"{frames(before, after)}, {_quality(before, after)} on {after['views']} views"
     )
 
 
@@ -200,7 +219,7 @@ def fewer(before: float, after: float) -> str:
     return f"{change} fragments ({before:.1f} -> {after:.1f} per pixel)"
 
 
-def _frames(before: dict[str, Any], after: dict[str, Any]) -> str:
+def frames(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for frame times, with their ratio only if it exceeds the standard errors."""
     was, now = before["frame_ms"], after["frame_ms"]
     ratio = was / max(now, 1e-9)

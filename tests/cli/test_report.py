@@ -44,9 +44,9 @@ def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
     assert f"{fewer:.2f}x fewer fragments" in report["result"]
     assert report["result"].replace(">", "&gt;") in page
     assert len(report["views"]) > 0
-    # every picture is in the page itself: four a view and the curves
+    # every picture is in the page itself: seven a view and the curves
     assert page.count('src="data:image/png;base64,') == report["pictures"]
-    assert report["pictures"] == 4 * len(report["views"]) + 1
+    assert report["pictures"] == 7 * len(report["views"]) + 1
     assert page.count("src=") == report["pictures"]
     assert "http" not in page
 
@@ -124,7 +124,7 @@ def test_a_folder_of_controls_alone_is_named_as_one(folder, tmp_path):
     assert "This folder holds only controls" in (zero / "report.html").read_text()
     report = run_json("report", zero)
     assert report["control"] is True
-    assert report["pictures"] == 4 * len(report["views"]) + 1  # what it learned, too
+    assert report["pictures"] == 7 * len(report["views"]) + 1  # what it learned, too
     assert run_json("report", out)["control"] is False
 
 

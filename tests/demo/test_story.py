@@ -8,9 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from cli.commands import run_json
 
 from fragprune_plugins.demo import folder
 from fragprune_plugins.demo.demo import DemoSettings, host_command, run_demo
+from fragprune_plugins.demo.page import BANNER
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.measure.wording import outcome
 
@@ -82,8 +84,21 @@ def test_pictures_and_page_are_there(demo):
         assert (out / file).stat().st_size > 0
     page = (out / "index.html").read_text()
     for file in report["files"]:
-        assert file in page or file == "index.html"
+        assert file in page or file in ("index.html", f"pictures/{BANNER}")
+    assert report["larger"]["size"] == "144x108"
+    assert f"{report['larger']['before']['frame_ms']:.2f} -&gt; " in page
     assert Path(report["model_after"]).exists()
+
+
+def test_report_shows_the_demos_folder(demo, tmp_path):
+    out, demos, _ = demo
+    report = run_json("report", out, "--out", tmp_path / "page.html")
+    assert (report["command"], report["adapter"]) == ("run", "vanilla-3dgs")
+    assert report["after"] == demos["after"]
+    assert report["result"].endswith(outcome("run", demos, demos["control"]))
+    assert len(report["views"]) > 0
+    text = (tmp_path / "page.html").read_text()
+    assert text.count('src="data:image/png;base64,') == report["pictures"] > 7
 
 
 def test_all_of_it_is_the_next_demos_to_delete(demo, tmp_path):

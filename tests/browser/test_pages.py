@@ -1,0 +1,97 @@
+"""Pages of reports and audits, as a real browser shows them: dividers, phones, darkness."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from browser.chromium import opened, served
+
+from fragprune_plugins.measure import page
+from fragprune_plugins.measure.pictures import save_image, save_map
+
+pytestmark = pytest.mark.browser
+
+WORDS = "a rather long name of a rather long viewer"
+
+
+@pytest.fixture
+def address(tmp_path):
+    for name, level in (("before", 1.0), ("after", 0.0)):
+        save_image(tmp_path / f"{name}.png", torch.full((3, 60, 160), level))
+        save_map(tmp_path / f"{name}_map.png", torch.full((60, 160), level), 1.0)
+    both = ((160, 60), ("before", "after"))
+    sources = {each.stem: page.embedded(each) for each in tmp_path.glob("*.png")}
+    text = page.compose(
+        title="A page",
+        quote="Fewer fragments. " * 10,
+        parts=[
+            page.section(
+                "view",
+                page.split(sources["before"], sources["after"], "pictures", *both),
+                page.split(sources["before_map"], sources["after_map"], "maps", *both),
+            ),
+            page.legend("fragments", 50),
+            page.table(["viewer", *"abcdefgh"], [[WORDS, *("1,234.56 ± 7.89",) * 8]], WORDS * 4),
+            page.code("fragprune finetune point_cloud.ply --self --out pruned.ply " * 3),
+        ],
+    )
+    (tmp_path / "page.html").write_text(text + '<link rel="icon" href="data:,">')
+    with served(tmp_path) as at:
+        yield at + "page.html"
+
+
+def split_at(picture):
+    """Share of the columns in which a white picture, left of a black one, is seen."""
+    row = picture[len(picture) // 4].mean(axis=-1)  # above the handle, below the names
+    return float((row > 128).mean())
+
+
+def test_a_divider_moves_all_pictures_of_its_view(browser, address):
+    with opened(browser, address) as tab:
+        pairs = tab.page.locator(".pair")
+        assert pairs.count() == 2
+        assert split_at(tab.picture(".pair >> nth=0")) == pytest.approx(0.5, abs=0.02)
+        pairs.nth(1).scroll_into_view_if_needed()
+        box = pairs.nth(1).bounding_box()
+        tab.page.mouse.click(box["x"] + 0.2 * box["width"], box["y"] + 0.7 * box["height"])
+        for at in range(2):
+            assert split_at(tab.picture(f".pair >> nth={at}")) == pytest.approx(0.2, abs=0.04)
+        tab.page.keyboard.press("End")
+        assert split_at(tab.picture(".pair >> nth=0")) == pytest.approx(1.0, abs=0.02)
+        assert tab.errors == tab.strangers == []
+
+
+@pytest.mark.parametrize("width", [320, 390, 800, 1280])
+def test_nothing_is_wider_than_the_window(browser, address, width):
+    with opened(browser, address, width=width) as tab:
+        assert tab.run("document.documentElement.scrollWidth") == width
+        widths = tab.run("[...document.querySelectorAll('figure')].map(f => f.offsetWidth)")
+        assert max(widths) <= min(width, 480)
+        assert min(widths) > 250  # not tiny either
+
+
+def test_a_portrait_fits_the_window(browser, tmp_path):
+    save_image(tmp_path / "tall.png", torch.zeros(3, 1920, 1080))
+    figure = page.picture(page.embedded(tmp_path / "tall.png"), "tall", (1080, 1920))
+    text = page.compose(title="t", quote="q", parts=[page.section("v", figure)])
+    (tmp_path / "page.html").write_text(text + '<link rel="icon" href="data:,">')
+    with served(tmp_path) as at, opened(browser, at + "page.html") as tab:
+        assert tab.run("document.querySelector('img').offsetHeight") <= 720
+        assert tab.run("document.querySelector('img').offsetWidth") > 300
+
+
+def test_it_is_dark_where_the_reader_wants_that(browser, address):
+    shown = {}
+    for scheme in ("light", "dark"):
+        with opened(browser, address, color_scheme=scheme) as tab:
+            shown[scheme] = np.median(tab.picture().reshape(-1, 3), axis=0)
+    assert (shown["light"] > 200).all()
+    assert (shown["dark"] < 60).all()
+
+
+def test_small_pictures_are_shown_pixel_by_pixel(browser, address):
+    with opened(browser, address) as tab:
+        style = "getComputedStyle(document.querySelector('.pair img'))"
+        assert tab.run(f"{style}.imageRendering") == "pixelated"
+        assert tab.run("document.querySelector('.pair').offsetWidth") == 480  # three times 160

@@ -1,0 +1,140 @@
+"""fragprune audit: a page, a JSON and maps from a model alone."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+from PIL import Image
+
+from fragprune_plugins.storage.ply import write_ply
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("audit") / "model.ply"
+    write_ply(path, tiny.random_model())
+    return path
+
+
+@pytest.fixture(scope="module")
+def audited(model, tmp_path_factory):
+    out = tmp_path_factory.mktemp("audited") / "out"
+    words = ("--views", 3, "--resolution", 10)
+    return out, run_json("audit", model, "--out", out, *words)
+
+
+def test_one_page_and_one_json_of_a_model_alone(audited):
+    out, report = audited
+    saved = json.loads((out / "audit.json").read_text())
+    assert saved == {key: value for key, value in report.items() if key != "page"}
+    assert report["page"] == str(out / "audit.html")
+    assert report["views"] == 3
+    assert report["cameras"]["kind"] == "orbit"
+    assert report["gaussians"] == 60
+    first, *cuts = report["cuts"]
+    assert first["psnr"] is None  # equal
+    assert all(cut["psnr"] > 10 for cut in cuts)
+    files = {file for view in report["maps"]["views"] for file in view["files"]}
+    assert {path.name for path in out.iterdir()} == {"audit.html", "audit.json", *files}
+
+
+def test_the_page_stands_alone_and_quotes_the_result(audited):
+    out, report = audited
+    page = (out / "audit.html").read_text()
+    sources = re.findall(r'\b(?:src|href)="([^"]*)"', page)
+    assert len(sources) == 4 * len(report["maps"]["views"])
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert not re.search(r"https?:|url\(|@import", page)
+    assert report["result"] in page
+    assert report["cameras"]["why"] in page
+
+
+def test_maps_have_the_views_pixels_and_one_scale(audited):
+    out, report = audited
+    limit = report["maps"]["limit"]
+    for view in report["maps"]["views"]:
+        means = []
+        for file in view["files"]:
+            with Image.open(out / file) as picture:
+                assert picture.size == (80, 80)
+                means.append(np.asarray(picture).mean())
+        # indices into the colours are counts over the limit
+        expected = [255 * view[key] / limit for key in ("fragments_per_pixel", "overdraw")]
+        assert means[1:] == pytest.approx(expected, rel=0.05, abs=1)
+
+
+def test_as_text_the_result_comes_first(model, audited, tmp_path):
+    words = ("--views", 1, "--resolution", 16, "--orbit")
+    result = run("audit", model, "--out", tmp_path / "out", *words)
+    assert result.exit_code == 0
+    first, *others = result.stdout.splitlines()
+    assert re.match(r"60 Gaussians draw [\d.]+ fragments per pixel, [\d.]+ ms a frame", first)
+    assert "1 generated view from all around" in first
+    assert any(line.startswith("PlayCanvas ") for line in others)
+    assert "fragprune finetune" in result.stdout
+    assert "audit" in result.stderr  # the bar
+
+
+def test_given_cameras_need_no_photographs(model, tmp_path):
+    images = tiny.photographs(tiny.random_model())
+    data = tiny.write_blender(tmp_path / "data", images)
+    transforms = data / "transforms_train.json"
+    content = json.loads(transforms.read_text()) | {"w": tiny.SIDE, "h": tiny.SIDE}
+    transforms.write_text(json.dumps(content))
+    for picture in data.rglob("*.png"):
+        picture.unlink()
+    given = ("--cameras", transforms, "--views", 3)
+    report = run_json("audit", model, *given, "--out", tmp_path / "out")
+    assert report["cameras"]["kind"] == "given"
+    assert "3 of the 7 cameras" in report["cameras"]["why"]
+    assert {view["width"] for view in report["maps"]["views"]} == {tiny.SIDE}
+
+
+def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(model, tmp_path):
+    path = tmp_path / "run" / "point_cloud" / "iteration_5" / "point_cloud.ply"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(model.read_bytes())
+    (tmp_path / "run" / "cfg_args").write_text("Namespace(source_path='scene')")
+    camera = {"id": 0, "img_name": "a", "width": 3300, "height": 33, "fx": 3000.0, "fy": 3000.0}
+    pose = {"position": [0.0, 0.0, -3.0], "rotation": torch.eye(3).tolist()}
+    (tmp_path / "run" / "cameras.json").write_text(json.dumps([camera | pose]))
+    out = ("--out", tmp_path / "out")
+    report = run_json("audit", tmp_path / "run", *out)
+    assert (report["cameras"]["kind"], report["model"]) == ("given", str(path))
+    assert report["maps"]["views"][0]["width"] == 1100  # of 3300: thrice less, not to be too large
+    asked = run_json("audit", path, "--orbit", "--views", 1, "--resolution", 16, *out)
+    assert asked["cameras"]["kind"] == "orbit"
+
+
+def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
+    path = tmp_path / "pruned.ply"
+    write_ply(path, tiny.random_model(), torch.full((60,), 0.3))
+    words = ("--views", 1, "--resolution", 16)
+    report = run_json("audit", path, "--out", tmp_path / "out", *words)
+    assert report["truncated"] is True
+    assert re.search(
+        r"has thresholds. With them it draws \d\.\d\dx fewer fragments", report["pruning"]
+    )
+    plain = run_json("audit", path, "--out", tmp_path / "out", "--no-truncation", *words)
+    assert plain["truncated"] is False
+    assert plain["fragments_per_pixel"] == report["cuts"][-1]["fragments_per_pixel"]
+
+
+def test_two_sources_of_cameras_are_refused(model, tmp_path):
+    result = run("audit", model, "--data", tmp_path, "--orbit", "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "one of them at most" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_is_none_is_refused(tmp_path):
+    (tmp_path / "model.ply").write_text("no model")
+    result = run("audit", tmp_path / "model.ply", "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["error"]["code"] == "model-file"

@@ -1,0 +1,174 @@
+"""What a splat costs and what of it nobody sees, against pictures that were drawn without it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from finetune import tiny
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fragprune_plugins.engines.reference import ReferenceEngine, fragments
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.measure.audit import (
+    AS_IT_IS,
+    HALF_LEVEL,
+    HONOURING,
+    REASONS,
+    UNTRUNCATED,
+    Idle,
+    audit,
+    weigh,
+)
+from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.storage.models import Model
+from fragprune_plugins.types import RasterInputs
+from reference_renderer.composite import transmittances
+
+ENGINE = engine_for("auto", "cpu")
+
+
+def column(seed, count):
+    """The fragments of 16 pixels, as the reference engine gives them, in float64."""
+    stream = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=stream, dtype=torch.float64)
+
+    drawn = uniform(count, 16) < 0.7
+    alpha = uniform(count, 16).pow(4).clamp(1 / 255, 0.99) * drawn
+    light = transmittances(alpha)[:-1]
+    return SimpleNamespace(
+        rows=torch.arange(count),
+        alpha=alpha,
+        drawn=drawn,
+        light=light,
+        opacity=uniform(count).clamp(min=0.02),
+        color=1.3 * uniform(count, 3),
+    )
+
+
+def composed(tile, kept, background):
+    """(3, P) the colours of the pixels of those fragments alone, blended one after another."""
+    colour = torch.zeros(3, tile.alpha.shape[1], dtype=torch.float64)
+    left = torch.ones(tile.alpha.shape[1], dtype=torch.float64)
+    for alpha, keep, each in zip(tile.alpha, kept, tile.color, strict=True):
+        alpha = alpha * keep
+        colour += each[:, None] * alpha * left
+        left = left * (1 - alpha)
+    return colour + background[:, None] * left
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 1000), st.integers(1, 20))
+def test_idle_fragments_can_go_alone_and_together(seed, count):
+    tile, background = column(seed, count), torch.tensor([0.1, 0.9, 0.4], dtype=torch.float64)
+    found = weigh(tile, background)
+    whole = composed(tile, tile.drawn, background)
+    for row in range(count):
+        kept = tile.drawn.clone()
+        kept[row] = False
+        moved = (composed(tile, kept, background) - whole).abs().amax(dim=0)
+        unclear = (moved - HALF_LEVEL).abs() < 1e-9
+        expected = tile.drawn[row] & (moved < HALF_LEVEL)
+        assert torch.equal(found.alone[row] | unclear, expected | unclear)
+    rest = composed(tile, tile.drawn & ~found.together, background)
+    assert float((rest - whole).abs().max()) <= HALF_LEVEL + 1e-12
+    assert not (found.together & ~found.drawn).any()
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 1000))
+def test_together_are_as_many_as_the_bound_allows(seed):
+    tile, background = column(seed, 20), torch.zeros(3, dtype=torch.float64)
+    found = weigh(tile, background)
+    reach = float(tile.color.max())
+    for pixel in range(16):
+        weights = (tile.alpha * tile.light)[tile.drawn[:, pixel], pixel].sort().values.tolist()
+        spent, most = 0.0, 0
+        while most < len(weights) and spent + reach * weights[most] <= HALF_LEVEL:
+            spent += reach * weights[most]
+            most += 1
+        assert int(found.together[:, pixel].sum()) == most
+
+
+def test_alone_is_what_pictures_without_one_gaussian_show():
+    model, view, engine = tiny.random_model(20), tiny.cameras()[0].view(), ReferenceEngine()
+    # Without pixels that end, for the light behind them would be a third picture's.
+    splats = replace(model.splats(), opacities=0.3 * model.splats().opacities)
+    inputs = RasterInputs(view, splats)
+    idle = Idle()
+    for tile in fragments(inputs, None):
+        idle.add(torch.zeros(len(tile.rows), dtype=torch.int64), weigh(tile, view.background))
+    whole = engine.rasterize(replace(inputs, counts=True), None)
+    expected = unclear = 0
+    nothing = torch.full_like(splats.opacities, 1e-6)
+    for row in range(len(splats)):
+        alone = torch.where(torch.arange(len(splats)) == row, splats.opacities, nothing)
+        there = engine.rasterize(
+            replace(inputs, splats=replace(splats, opacities=alone), counts=True), None
+        ).fragments
+        without = torch.where(torch.arange(len(splats)) == row, nothing, splats.opacities)
+        image = engine.rasterize(replace(inputs, splats=replace(splats, opacities=without)), None)
+        moved = (image.image - whole.image).abs().amax(dim=0)[there > 0]
+        expected += int((moved < HALF_LEVEL).sum())
+        unclear += int(((moved - HALF_LEVEL).abs() < 1e-6).sum())
+    assert idle.drawn == int(whole.fragments.sum())
+    assert abs(idle.alone - expected) <= unclear
+    assert 0 < idle.alone < idle.drawn
+
+
+@pytest.fixture(scope="module")
+def figures():
+    views = [("the same", camera.view()) for camera in tiny.cameras(4)]
+    found, shown = audit(Model(tiny.random_model()), views, engine=ENGINE, repeats=1)
+    return found, shown
+
+
+def test_classes_and_reasons_share_out_all_fragments(figures):
+    idle = figures[0]["idle"]
+    assert idle["together"] <= idle["alone"] <= 1
+    assert [each["name"] for each in idle["reasons"]] == list(REASONS)
+    for all_of, named in (("share", 1.0), ("idle", idle["together"])):
+        assert sum(each[all_of] for each in idle["reasons"]) == pytest.approx(named)
+        table = idle[f"{all_of}_by_opacity_and_radius"]
+        assert sum(map(sum, table)) == pytest.approx(named)
+    assert idle["pixels"] == 4 * tiny.SIDE**2  # of so small views no tile is left out
+    per_pixel = idle["fragments"] / idle["pixels"]
+    assert per_pixel == pytest.approx(figures[0]["fragments_per_pixel"])
+
+
+def test_cuts_are_compared_with_the_model_as_it_is(figures):
+    found, shown = figures
+    first, *cuts = found["cuts"]
+    assert (first["name"], first["psnr"], first["worst_psnr"]) == (AS_IT_IS, math.inf, math.inf)
+    for cut in cuts:
+        assert cut["fragments_per_pixel"] < first["fragments_per_pixel"]
+        assert cut["worst_psnr"] <= cut["psnr"] < 100
+    by_alpha = [cut["psnr"] for cut in cuts if cut["name"].startswith("alpha")]
+    assert by_alpha == sorted(by_alpha, reverse=True)
+    assert len({float(view.image.sum()) for view in shown}) == len(shown) == 3
+    for view in shown:
+        assert view.fragments.shape == view.overdraw.shape == view.image.shape[1:]
+    assert HONOURING not in [each["viewers"] for each in found["viewers"]]
+
+
+def test_a_pruned_model_is_measured_with_its_thresholds_and_without():
+    splat = tiny.random_model()
+    pruned = Model(splat, ThresholdStore.from_falloff(torch.full((len(splat),), 0.3)))
+    views = [("view", tiny.cameras()[0].view())]
+    found, _ = audit(pruned, views, engine=ENGINE, repeats=1)
+    plain, _ = audit(Model(splat), views, engine=ENGINE, repeats=1)
+    last = found["cuts"][-1]
+    assert last["name"] == UNTRUNCATED
+    assert last["fragments_per_pixel"] == plain["fragments_per_pixel"]
+    assert found["fragments_per_pixel"] < plain["fragments_per_pixel"]
+    assert found["cuts"][-2]["fragments_per_pixel"] <= found["fragments_per_pixel"]
+    pays = {each["viewers"]: each["shaded_per_pixel"] for each in found["viewers"]}
+    others = {each["viewers"]: each["shaded_per_pixel"] for each in plain["viewers"]}
+    assert pays.pop(HONOURING) < min(pays["PlayCanvas"], pays[found["viewers"][0]["viewers"]])
+    assert pays == others  # who knows no thresholds pays as before
