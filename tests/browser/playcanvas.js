@@ -70,11 +70,15 @@ export async function start(canvas, options) {
     }
 
     const gl = device.gl;
-    const frame = () => new Promise((resolve) => app.once('frameend', resolve));
+    const frame = () => new Promise((resolve) => {
+        app.once('frameend', resolve);
+        app.renderNextFrame = true;
+    });
     const ready = new Promise((resolve) => {
         app.systems.gsplat.on('frame:ready', (_camera, _layer, done, loading) => done && loading === 0 && resolve());
     });
     await ready;
+    app.autoRender = false; // other pages are measured meanwhile
     for (let i = 0; i < 3; i++) await frame();
 
     return {

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from browser.chromium import opened, served
 from browser.engines import NoEnginesError, drawing, engines
+from cli.commands import run
 from playwright.sync_api import Error
 
 from fragprune_plugins import RasterInputs, View, rasterize
@@ -14,6 +19,7 @@ from fragprune_plugins.storage.ply import SplatFile, write_ply
 
 pytestmark = pytest.mark.browser
 
+ROOT = Path(__file__).parents[2]
 ENGINES = ["playcanvas", "spark"]
 each_engine = pytest.mark.parametrize("engine", ENGINES)
 
@@ -260,3 +266,25 @@ def test_spark_reads_the_column_of_a_ply(browser, view, cut, text, body, codes):
                 page.tab.run(script, given)
         else:
             assert page.tab.run(script, given) == codes
+
+
+@each_engine
+def test_the_page_of_the_how_to_works_as_it_stands(browser, engine, tmp_path, whole, cut):
+    text = (ROOT / "docs" / "how-to" / f"{engine}.md").read_text()
+    (page,) = re.findall(r"```html\n(.*?)```", text, re.DOTALL)
+    shown = []
+    for name, model in (("whole", whole), ("cut", cut)):
+        folder = tmp_path / name
+        run("bridge", engine, "--out", str(folder))
+        (folder / "index.html").write_text(page + '<link rel="icon" href="data:,">')
+        (folder / "for_viewer.ply").symlink_to(model)
+        (folder / "node_modules").symlink_to(engines() / "node_modules")
+        with served(folder) as address, opened(browser, address, width=160, height=120) as tab:
+            for _ in range(40):
+                tab.page.wait_for_timeout(500)
+                last = tab.picture()
+                if (last > 0).any():
+                    break
+            shown.append(last)
+            assert tab.errors == tab.strangers == []
+    assert (shown[0] > 0).mean() > (shown[1] > 0).mean() > 0.1
