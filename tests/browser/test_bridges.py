@@ -97,7 +97,7 @@ def cut(splat, tmp_path_factory):
 def draw(browser, view):
     """A picture by an engine, (H, W, 3) uint8."""
 
-    def picture(engine, model, **options):
+    def picture(engine, model, view=view, **options):
         with drawing(browser, engine, model, view, **options) as page:
             return page.picture()
 
@@ -139,6 +139,26 @@ def test_the_picture_is_that_of_our_engine(draw, engine, truncated, splat, view,
     assert psnr(have[firm], want[firm]) > 50
     assert (np.abs(have - want)[firm].max(axis=1) > 8 / 255).mean() < 0.001
     assert psnr(have, want) > 42
+
+
+CONFORMING = 40
+"""dB that the conformance files ask of a renderer."""
+
+
+@each_engine
+@pytest.mark.parametrize("name", ["rims", "faint", "cloud"])
+def test_the_conformance_scenes_are_drawn_as_expected(draw, engine, name, tmp_path):
+    """PlayCanvas draws the cloud's smallest Gaussians smaller than 3DGS does; see DILATION."""
+    conformance = pytest.importorskip("fragprune_plugins.testing.cutoffs")
+    splat, camera = conformance.scene(name), conformance.cameras()["front"]
+    path = tmp_path / "scene.ply"
+    write_ply(path, splat, splat.thresholds)
+    have = draw(engine, path, camera.view(), bridge=True, plain=True) / 255
+    want, _ = conformance.draw(splat, camera, splat.thresholds)
+    if (engine, name) != ("playcanvas", "cloud"):
+        assert psnr(have, want.permute(1, 2, 0).numpy()) > CONFORMING
+    want = ours(splat, camera.view(), engine, splat.thresholds.clamp(min=EDGE)).image
+    assert psnr(have, want.permute(1, 2, 0).clamp(0, 1).numpy()) > CONFORMING + 2
 
 
 @each_engine
