@@ -13,7 +13,7 @@
  */
 import * as pc from 'playcanvas';
 
-const SUPPORTED = '2.23 on WebGL 2';
+const SUPPORTED = '2.20 to 2.23, WebGL 2';
 const COLUMN = 'trunc_threshold';
 const CODES = 'fragprune_codes'; // our own column, so that the engine moves it with the rows
 const STREAM = 'fragpruneCutoff'; // codes of an entity's rows

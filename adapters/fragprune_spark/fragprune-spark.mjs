@@ -13,7 +13,7 @@
  */
 import * as THREE from 'three';
 
-const SUPPORTED = '@sparkjsdev/spark 2.2';
+const SUPPORTED = '@sparkjsdev/spark 2.0 to 2.2';
 const COLUMN = 'trunc_threshold';
 const WIDTH = 2048; // of the texture of codes; Spark starts each mesh at a multiple of it
 

@@ -22,6 +22,7 @@ export async function start(canvas, options) {
 
     const material = app.scene.gsplat.material;
     const chunks = material.getShaderChunks(pc.SHADERLANGUAGE_GLSL);
+    for (const [name, text] of Object.entries(options.chunks ?? {})) chunks.set(name, text);
     if (options.plain) {
         app.scene.gsplat.dataFormat = pc.GSPLATDATA_LARGE;
         app.scene.gsplat.minPixelSize = 0;

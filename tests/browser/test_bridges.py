@@ -218,6 +218,7 @@ REFUSED = {
     "fewer codes": ("both", {"cutoffs": [1] * (COUNT - 1)}, "599 cutoffs for 600 splats"),
     "rows lost": ("playcanvas", {"cutoffs": [1] * COUNT, "late": True}, "reordered its rows"),
     "old renderer": ("playcanvas", {"component": {"unified": False}}, "unified: false"),
+    "a chunk of one's own": ("playcanvas", {"chunks": {"gsplatCommonVS": ""}}, "has no places"),
     "level of detail": ("spark", {"mesh": {"lod": True, "nonLod": True}}, "has LoD"),
     "a shader of one's own": ("spark", {"spark": {"vertexShader": "void main() {}"}}, "no lines"),
     "other codes": ("spark", {"cutoffs": "column"}, "not a Uint8Array"),
@@ -234,7 +235,7 @@ REFUSED = {
 )
 def test_what_cannot_work_is_refused_in_one_sentence(browser, engine, options, told, view, cut):
     supported = {
-        "playcanvas": "PlayCanvas 2.23.3; supported: 2.23",
+        "playcanvas": "PlayCanvas 2.23.3; supported: 2.20",
         "spark": "supported: @sparkjsdev",
     }
     with (
