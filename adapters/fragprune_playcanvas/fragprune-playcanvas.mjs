@@ -3,7 +3,7 @@
  *
  *     const entity = new pc.Entity();
  *     entity.addComponent('gsplat', { asset });
- *     await installCutoffs(app, entity);             // from the PLY's column trunc_threshold
+ *     await installCutoffs(app, entity);             // those that the PLY or SOG holds
  *     await installCutoffs(app, entity, { cutoffs }) // or Uint8Array: a code per row of the file
  *
  * A code c is the threshold 255^(c/256 - 1) of the falloff exp(-q/2), q the squared distance in
@@ -17,6 +17,8 @@ const SUPPORTED = '2.20 to 2.23, WebGL 2';
 const COLUMN = 'trunc_threshold';
 const CODES = 'fragprune_codes'; // our own column, so that the engine moves it with the rows
 const STREAM = 'fragpruneCutoff'; // codes of an entity's rows
+const IMAGE = 'fragpruneCutoffImage'; // the same from a SOG's image, as red
+const EXTRA = 'fragprune_cutoff'; // of a SOG's meta.json
 const BUFFER = 'fragpruneCode'; // codes of all splats of the scene, in the engine's work buffer
 const LIMIT = 'fragpruneLimit'; // squared radius of a splat's ellipse in units of gaussianUV
 
@@ -51,12 +53,11 @@ export function encode(threshold) {
  * @param {pc.AppBase} app - The application.
  * @param {pc.Entity} entity - With a gsplat component; its asset may still have to load.
  * @param {object} [options]
- * @param {Uint8Array} [options.cutoffs] - A code per row, in the order of the file; default: of the
- * PLY's column trunc_threshold.
+ * @param {Uint8Array} [options.cutoffs] - A code per row, in the order of the file; default: those
+ * that the file holds, a PLY in its column trunc_threshold, a SOG in its extras.
  * @param {string} [options.modifier] - GLSL of your own work buffer modifier, if you have one: a
  * component takes one modifier, and this is where ours and yours become one.
- * @returns {Promise<Uint8Array|null>} The codes, in the order in which the engine keeps the rows;
- * null if the file has no cutoffs: then nothing is changed.
+ * @returns {Promise<boolean>} Whether there are cutoffs; if not, nothing is changed.
  */
 export async function installCutoffs(app, entity, { cutoffs, modifier = SPLAT_MODIFIER } = {}) {
     const component = entity.gsplat;
@@ -72,20 +73,27 @@ export async function installCutoffs(app, entity, { cutoffs, modifier = SPLAT_MO
     if (!resource?.format?.addExtraStreams) {
         throw fail('the asset is not one splat file', 'Cutoffs of streamed LOD are not supported.');
     }
-    const codes = codesOf(resource, cutoffs);
-    if (!codes) return null;
+    const image = cutoffs ? null : await imageOf(asset, resource);
+    const codes = image ? null : codesOf(resource, cutoffs);
+    if (!image && !codes) return false;
     installShaders(app);
-    resource.format.addExtraStreams([
-        { name: STREAM, format: pc.PIXELFORMAT_R8U, storage: pc.GSPLAT_STREAM_INSTANCE }
-    ]);
-    const texture = component.getInstanceTexture(STREAM);
+    const [name, format] = image ? [IMAGE, pc.PIXELFORMAT_RGBA8] : [STREAM, pc.PIXELFORMAT_R8U];
+    resource.format.addExtraStreams([{ name, format, storage: pc.GSPLAT_STREAM_INSTANCE }]);
+    const texture = component.getInstanceTexture(name);
     if (!texture) throw fail('the engine gave no texture for codes', 'Enable the component first.');
-    texture.lock().fill(0).set(codes);
-    texture.unlock();
+    if (image) {
+        const [have, want] = [image, texture].map(({ width, height }) => `${width}x${height}`);
+        if (have !== want) throw fail(`an image of ${have} cutoffs for ${want} splats`, 'Write the SOG again.');
+        texture.setSource(image);
+    } else {
+        texture.lock().fill(0).set(codes);
+        texture.unlock();
+    }
+    const code = image ? `uint(load${pascal(IMAGE)}().r * 255.0 + 0.5)` : `load${pascal(STREAM)}().r`;
     const header = 'void modifySplatColor(vec3 center, inout vec4 color) {';
-    const read = `${header}\n    ${BUFFER} = load${pascal(STREAM)}().r;`;
+    const read = `${header}\n    ${BUFFER} = ${code};`;
     component.setWorkBufferModifier({ glsl: replaceOnce(modifier, header, read, 'the modifier') });
-    return codes;
+    return true;
 }
 
 const pascal = (name) => name[0].toUpperCase() + name.slice(1);
@@ -140,6 +148,38 @@ function codesOf(resource, cutoffs) {
     if (!(codes instanceof Uint8Array)) throw fail('cutoffs are not a Uint8Array', 'Pass codes of 8 bits.');
     if (codes.length !== resource.numSplats) throw wrongCount(codes.length, resource.numSplats);
     return codes;
+}
+
+/** The image of codes of a SOG, a texel for each row; undefined if it has none. */
+async function imageOf(asset, resource) {
+    const file = resource.gsplatData?.meta?.extras?.[EXTRA]?.files?.[0];
+    if (!file || !asset) return undefined;
+    const url = new URL(asset.getFileUrl(), location.href);
+    const bundle = !/\.json$/i.test(url.pathname);
+    const answer = await fetch(bundle ? url : new URL(file, url));
+    if (!answer.ok) throw fail(`${answer.url}: ${answer.status}`, 'Serve the whole model.');
+    const bytes = await answer.arrayBuffer();
+    const image = new Blob([bundle ? await unzipped(bytes, file) : bytes]);
+    return createImageBitmap(image, { premultiplyAlpha: 'none', colorSpaceConversion: 'none' });
+}
+
+/** One file of a zip, found in the directory at its end. */
+async function unzipped(bytes, wanted) {
+    const view = new DataView(bytes);
+    const end = view.byteLength - 22;
+    let at = view.getUint32(end + 16, true);
+    for (let left = view.getUint16(end + 10, true); left > 0; left--) {
+        const [name, extra, comment] = [28, 30, 32].map((offset) => view.getUint16(at + offset, true));
+        if (new TextDecoder().decode(new Uint8Array(bytes, at + 46, name)) === wanted) {
+            const local = view.getUint32(at + 42, true);
+            const from = local + 30 + view.getUint16(local + 26, true) + view.getUint16(local + 28, true);
+            const packed = new Blob([new Uint8Array(bytes, from, view.getUint32(at + 20, true))]);
+            if (view.getUint16(at + 10, true) === 0) return packed;
+            return new Response(packed.stream().pipeThrough(new DecompressionStream('deflate-raw'))).blob();
+        }
+        at += 46 + name + extra + comment;
+    }
+    throw fail(`the SOG has no ${wanted}`, 'Write it again.');
 }
 
 const installed = new WeakSet();

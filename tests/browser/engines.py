@@ -97,7 +97,7 @@ def drawing(
     Args:
         browser: from ``chromium``.
         engine: "playcanvas" or "spark".
-        model: PLY.
+        model: PLY, or what the engine reads besides.
         view: the camera; its principal point is the centre, and both focal lengths are equal.
         errors: the page may report some; else they raise AssertionError.
         options: of ``playcanvas.js`` or ``spark.js``.
@@ -105,10 +105,16 @@ def drawing(
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         (root / "node_modules").symlink_to(engines() / "node_modules")
-        (root / "model.ply").symlink_to(model.resolve())
+        (root / f"model{model.suffix}").symlink_to(model.resolve())
         for name in (f"{engine}.js", "page.html"):
             (root / name).symlink_to(HERE / name)
-        given = {"width": view.width, "height": view.height, "camera": _camera(view), **options}
+        given = {
+            "model": f"model{model.suffix}",
+            "width": view.width,
+            "height": view.height,
+            "camera": _camera(view),
+            **options,
+        }
         with served(root) as address, opened(browser, address + "page.html") as tab:
             imports = {name: f"./{path}" for name, path in MODULES.items()}
             tab.run("given => window.start(given)", [engine, imports, given])

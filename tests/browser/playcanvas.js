@@ -13,7 +13,7 @@ export async function start(canvas, options) {
     const set = new pc.AppOptions();
     set.graphicsDevice = device;
     set.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem];
-    set.resourceHandlers = [pc.GSplatHandler];
+    set.resourceHandlers = [pc.GSplatHandler, pc.TextureHandler];
     const app = new pc.AppBase(canvas);
     app.init(set);
     app.setCanvasFillMode(pc.FILLMODE_NONE);
@@ -36,7 +36,7 @@ export async function start(canvas, options) {
     eye.setRotation(new pc.Quat().setFromMat4(pose));
 
     const { installCutoffs } = options.bridge ? await import('fragprune-playcanvas') : {};
-    const asset = new pc.Asset('model', 'gsplat', { url: 'model.ply' }, options.data ?? {});
+    const asset = new pc.Asset('model', 'gsplat', { url: options.model }, options.data ?? {});
     app.assets.add(asset);
     const loaded = new Promise((resolve, reject) => {
         asset.ready(resolve);

@@ -20,9 +20,9 @@ export async function start(canvas, options) {
     const plain = { preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, accumExtSplats: true, minAlpha: 1 / 255 };
     const spark = new SparkRenderer({ renderer, ...(options.plain ? plain : {}), ...options.spark });
     scene.add(spark);
-    const fileBytes = await (await fetch('model.ply')).arrayBuffer();
+    const fileBytes = await (await fetch(options.model)).arrayBuffer();
     const make = (...place) => {
-        const made = new SplatMesh({ fileBytes, fileName: 'model.ply', extSplats: options.plain, ...options.mesh });
+        const made = new SplatMesh({ fileBytes, fileName: options.model, extSplats: options.plain, ...options.mesh });
         made.position.set(...place);
         scene.add(made);
         return made;

@@ -214,6 +214,23 @@ def test_rows_that_playcanvas_was_told_to_leave_in_order(draw, whole, cut, codes
     assert (loaded == draw("playcanvas", cut, bridge=True, data={"reorder": False})).all()
 
 
+def test_playcanvas_draws_the_cutoffs_of_a_sog(draw, splat, codes, tmp_path):
+    """The format reorders rows; a file keeps its codes in its own order, also without a column."""
+    formats = pytest.importorskip("fragprune_plugins.storage.formats")
+    for name, thresholds in (("cut", splat.thresholds), ("whole", None)):
+        path = tmp_path / f"{name}.sog"
+        formats.write(formats.named(path), path, splat, thresholds)
+    stored = encode(formats.read(tmp_path / "cut.sog").thresholds).tolist()
+    assert sorted(stored) == sorted(codes)
+    assert stored != codes
+    cut = draw("playcanvas", tmp_path / "cut.sog", bridge=True)
+    given = draw("playcanvas", tmp_path / "whole.sog", bridge=True, cutoffs=stored)
+    whole = draw("playcanvas", tmp_path / "whole.sog", bridge=True)
+    assert (cut == given).all()
+    assert (whole == draw("playcanvas", tmp_path / "whole.sog")).all()
+    assert psnr(cut / 255, whole / 255) < 30
+
+
 REFUSED = {
     "fewer codes": ("both", {"cutoffs": [1] * (COUNT - 1)}, "599 cutoffs for 600 splats"),
     "rows lost": ("playcanvas", {"cutoffs": [1] * COUNT, "late": True}, "reordered its rows"),
