@@ -76,6 +76,9 @@ export async function installCutoffs(app, entity, { cutoffs, modifier = SPLAT_MO
     const image = cutoffs ? null : await imageOf(asset, resource);
     const codes = image ? null : codesOf(resource, cutoffs);
     if (!image && !codes) return false;
+    const code = image ? `uint(load${pascal(IMAGE)}().r * 255.0 + 0.5)` : `load${pascal(STREAM)}().r`;
+    const header = 'void modifySplatColor(vec3 center, inout vec4 color) {';
+    const glsl = replaceOnce(modifier, header, `${header}\n    ${BUFFER} = ${code};`, 'the modifier');
     installShaders(app);
     const [name, format] = image ? [IMAGE, pc.PIXELFORMAT_RGBA8] : [STREAM, pc.PIXELFORMAT_R8U];
     resource.format.addExtraStreams([{ name, format, storage: pc.GSPLAT_STREAM_INSTANCE }]);
@@ -89,10 +92,7 @@ export async function installCutoffs(app, entity, { cutoffs, modifier = SPLAT_MO
         texture.lock().fill(0).set(codes);
         texture.unlock();
     }
-    const code = image ? `uint(load${pascal(IMAGE)}().r * 255.0 + 0.5)` : `load${pascal(STREAM)}().r`;
-    const header = 'void modifySplatColor(vec3 center, inout vec4 color) {';
-    const read = `${header}\n    ${BUFFER} = ${code};`;
-    component.setWorkBufferModifier({ glsl: replaceOnce(modifier, header, read, 'the modifier') });
+    component.setWorkBufferModifier({ glsl });
     return true;
 }
 

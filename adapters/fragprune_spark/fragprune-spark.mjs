@@ -66,10 +66,10 @@ export function readCutoffs(file) {
  * @param {object} options
  * @param {Uint8Array|null} options.cutoffs - A code per splat, in the order of the file. null, as
  * readCutoffs says where a file has none, changes nothing.
- * @returns {Promise<Uint8Array|null>} The codes.
+ * @returns {Promise<boolean>} Whether there are cutoffs.
  */
 export async function installCutoffs(spark, mesh, { cutoffs } = {}) {
-    if (cutoffs === null) return null;
+    if (cutoffs === null) return false;
     if (!(cutoffs instanceof Uint8Array)) throw fail('cutoffs are not a Uint8Array', 'Pass codes of 8 bits.');
     const shader = patched(spark);
     await mesh.initialized;
@@ -78,7 +78,7 @@ export async function installCutoffs(spark, mesh, { cutoffs } = {}) {
     if (count !== cutoffs.length) throw wrongCount(cutoffs, count);
     if (shader) install(spark, shader);
     installed.get(spark).set(mesh, cutoffs);
-    return cutoffs;
+    return true;
 }
 
 const lod = (mesh) => mesh.enableLod !== false && !!(mesh.packedSplats?.lodSplats ?? mesh.extSplats?.lodSplats);

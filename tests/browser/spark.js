@@ -1,7 +1,7 @@
-// One splat in Spark. options: width, height, camera {matrix, fovY}; bridge; cutoffs; plain: draw
-// as the 3DGS rasterizer does as far as Spark's own settings go; second: a place for the same splat
-// without cutoffs, where "hidden" says which of the two is there instead of at the origin, and
-// "first" whether it is made first.
+// One splat in Spark. options: model, width, height, camera {matrix, fovY}; bridge; cutoffs; spark,
+// mesh: more of theirs; plain: draw as the 3DGS rasterizer does as far as Spark's own settings go;
+// second: a place for the same splat without cutoffs, where "hidden" says which of the two is there
+// instead of at the origin, and "first" whether it is made first.
 import * as THREE from 'three';
 import { SparkRenderer, SplatMesh } from '@sparkjsdev/spark';
 
@@ -84,14 +84,14 @@ export async function start(canvas, options) {
         },
         async frames(count) {
             const times = [];
-            for (let i = 0; i < count + 2; i++) {
+            for (let i = 0; i < count + 1; i++) {
                 await frame();
                 const from = performance.now();
                 draw();
                 gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
                 times.push(performance.now() - from);
             }
-            return times.slice(2);
+            return times.slice(1);
         }
     };
 }

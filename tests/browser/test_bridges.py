@@ -236,6 +236,7 @@ REFUSED = {
     "rows lost": ("playcanvas", {"cutoffs": [1] * COUNT, "late": True}, "reordered its rows"),
     "old renderer": ("playcanvas", {"component": {"unified": False}}, "unified: false"),
     "a chunk of one's own": ("playcanvas", {"chunks": {"gsplatCommonVS": ""}}, "has no places"),
+    "a modifier that modifies nothing": ("playcanvas", {"modifier": ""}, "the modifier has no"),
     "level of detail": ("spark", {"mesh": {"lod": True, "nonLod": True}}, "has LoD"),
     "a shader of one's own": ("spark", {"spark": {"vertexShader": "void main() {}"}}, "no lines"),
     "other codes": ("spark", {"cutoffs": "column"}, "not a Uint8Array"),
