@@ -61,10 +61,12 @@ def engines() -> Path:
 
 
 def _run(folder: Path, npm: str, *what: str) -> None:
-    command = [npm, "install", "--no-audit", "--no-fund", "--prefix", str(folder), *what]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=280)
-    if done.returncode:
-        raise NoEnginesError(f"npm install failed: {done.stderr.strip().splitlines()[-1]}")
+    quiet = ["--no-audit", "--no-fund", "--fetch-retries=1"]
+    command = [npm, "install", *quiet, "--prefix", str(folder), *what]
+    try:
+        subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=120, check=True)
+    except subprocess.SubprocessError as error:
+        raise NoEnginesError(f"npm install failed: {error}") from error
 
 
 @dataclass

@@ -11,13 +11,13 @@ import torch
 from browser.chromium import opened, served
 from browser.engines import NoEnginesError, drawing, engines
 from cli.commands import run
-from playwright.sync_api import Error
 
 from fragprune_plugins import RasterInputs, View, rasterize
 from fragprune_plugins.storage.cutoffs import decode, encode
 from fragprune_plugins.storage.ply import SplatFile, write_ply
 
 pytestmark = pytest.mark.browser
+Error = pytest.importorskip("playwright.sync_api").Error
 
 ROOT = Path(__file__).parents[2]
 ENGINES = ["playcanvas", "spark"]
