@@ -8,12 +8,12 @@ with drawing(browser, "spark", model, view, bridge=True) as page:
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +24,14 @@ from fragprune_plugins.types import View
 
 PACKAGES = {"playcanvas": "2.23.3", "@sparkjsdev/spark": "2.2.0", "three": "0.187.0"}
 HERE = Path(__file__).parent
-BRIDGES = HERE.parents[1] / "adapters"
+ADAPTERS = HERE.parents[1] / "adapters"
 MODULES = {
     "playcanvas": "node_modules/playcanvas/build/playcanvas.mjs",
     "three": "node_modules/three/build/three.module.js",
     "three/addons/": "node_modules/three/examples/jsm/",
     "@sparkjsdev/spark": "node_modules/@sparkjsdev/spark/dist/spark.module.js",
-    "fragprune-playcanvas": "node_modules/fragprune-playcanvas/fragprune-playcanvas.mjs",
-    "fragprune-spark": "node_modules/fragprune-spark/fragprune-spark.mjs",
+    "fragprune-playcanvas": "adapters/fragprune_playcanvas/fragprune-playcanvas.mjs",
+    "fragprune-spark": "adapters/fragprune_spark/fragprune-spark.mjs",
 }
 
 
@@ -39,8 +39,9 @@ class NoEnginesError(Exception):
     """npm or the network is absent."""
 
 
+@cache
 def engines() -> Path:
-    """A folder with the engines and both bridges, as npm installs them; kept between runs.
+    """A folder with the engines as npm installs them; kept between runs.
 
     Raises:
         NoEnginesError: they cannot be installed here.
@@ -48,24 +49,23 @@ def engines() -> Path:
     names = [f"{name}@{version}" for name, version in PACKAGES.items()]
     key = "-".join(name.replace("/", "-") for name in names)
     folder = Path(tempfile.gettempdir()) / f"fragprune-{key}"
-    npm = shutil.which("npm")
-    if npm is None:
-        raise NoEnginesError("no npm here")
-    bridges = [str(BRIDGES / f"fragprune_{name}") for name in ("playcanvas", "spark")]
     if not (folder / "done").exists():
         folder.mkdir(exist_ok=True)
-        _run(folder, npm, *names)
+        install(folder, "--prefix=.", *names)
         (folder / "done").touch()
-    _run(folder, npm, "--offline", *bridges)  # links to this checkout's
     return folder
 
 
-def _run(folder: Path, npm: str, *what: str) -> None:
-    quiet = ["--no-audit", "--no-fund", "--fetch-retries=1"]
-    command = [npm, "install", *quiet, "--prefix", str(folder), *what]
+def install(folder: Path, *what: str) -> None:
+    """Let npm install packages into a folder.
+
+    Raises:
+        NoEnginesError: it cannot.
+    """
+    command = ["npm", "install", "--no-audit", "--no-fund", "--fetch-retries=1", *what]
     try:
         subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=120, check=True)
-    except subprocess.SubprocessError as error:
+    except (OSError, subprocess.SubprocessError) as error:
         raise NoEnginesError(f"npm install failed: {error}") from error
 
 
@@ -107,6 +107,7 @@ def drawing(
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         (root / "node_modules").symlink_to(engines() / "node_modules")
+        (root / "adapters").symlink_to(ADAPTERS)
         (root / f"model{model.suffix}").symlink_to(model.resolve())
         for name in (f"{engine}.js", "page.html"):
             (root / name).symlink_to(HERE / name)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from browser.chromium import opened, served
-from browser.engines import NoEnginesError, drawing, engines
+from browser.engines import NoEnginesError, drawing, engines, install
 from cli.commands import run
 
 from fragprune_plugins import RasterInputs, View, rasterize
@@ -263,6 +263,14 @@ def test_what_cannot_work_is_refused_in_one_sentence(browser, engine, options, t
         pass
     assert "fragprune: " in str(caught.value)
     assert supported[engine] in str(caught.value)
+
+
+@each_engine
+def test_npm_installs_the_folder_of_a_bridge(engine, tmp_path):
+    folder = run("bridge", engine).stdout.strip()
+    install(tmp_path, "--prefix=.", "--offline", "--omit=peer", folder)
+    package = tmp_path / "node_modules" / f"fragprune-{engine}"
+    assert (package / f"fragprune-{engine}.mjs").is_file()
 
 
 @each_engine
