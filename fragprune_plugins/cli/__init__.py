@@ -21,6 +21,7 @@ _COMMANDS = {
     "export": "export",
     "report": "report",
     "adapters": "adapters",
+    "bridge": "bridge",
     "check": "check",
     "bench": "bench",
     "experiment": "experiment",

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 from importlib import import_module
-from importlib.metadata import version
+from importlib.metadata import entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import pytest
 
 import fragprune_plugins
 from fragprune_plugins import adapting
+from fragprune_plugins.cli import bridge as bridge_command
 from fragprune_plugins.plugins.loading import load_plugins
 
 ROOT = Path(__file__).parents[2]
@@ -167,9 +168,11 @@ def test_modules_are_called_after_what_they_hold():
 
 
 def test_the_shelf_is_no_package_and_every_book_on_it_is_an_entry_point():
+    """A host's adapter is a plugin, a viewer's an npm package and a bridge."""
     assert not (ROOT / "adapters" / "__init__.py").exists()
-    loaded = load_plugins().loaded.values()
-    assert set(ADAPTERS) <= set(loaded)
+    viewers = {name for name in ADAPTERS if (ROOT / "adapters" / name / "package.json").exists()}
+    assert viewers == {bridge.value for bridge in entry_points(group=bridge_command.GROUP)}
+    assert set(ADAPTERS) - viewers <= set(load_plugins().loaded.values())
     project = (ROOT / "pyproject.toml").read_text()
     assert [adapter for adapter in ADAPTERS if project.count(adapter) != 1] == []
 

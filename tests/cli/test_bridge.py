@@ -1,0 +1,49 @@
+"""fragprune bridge: JavaScript modules for web viewers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from cli.commands import run, run_json
+
+from fragprune_plugins import __version__
+
+VIEWERS = ["playcanvas", "spark"]
+
+
+def test_without_a_name_it_lists_the_bridges():
+    bridges = run_json("bridge")["bridges"]
+    assert list(bridges) == VIEWERS
+    assert all(Path(module).is_file() for module in bridges.values())
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_the_folder_is_an_npm_package_of_one_module(viewer):
+    folder = Path(run("bridge", viewer).stdout.strip())
+    package = json.loads((folder / "package.json").read_text())
+    assert package["version"] == __version__
+    assert package["files"] == [module.name for module in folder.glob("*.mjs")]
+    assert package["exports"] == f"./{package['files'][0]}"
+    assert package["peerDependencies"]
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_the_module_is_copied_into_a_new_folder(viewer, tmp_path):
+    wrote = Path(run_json("bridge", viewer, "--out", tmp_path / "website")["module"])
+    assert wrote.parent == tmp_path / "website"
+    assert "export async function installCutoffs" in wrote.read_text()
+
+
+def test_an_unknown_viewer_is_a_usage_error_that_names_the_known():
+    failed = run("bridge", "babylon")
+    assert failed.exit_code == 2
+    assert "playcanvas or spark" in failed.stderr
+
+
+def test_a_folder_that_cannot_be_made_is_a_stated_error(tmp_path):
+    (tmp_path / "taken").write_text("")
+    failed = run("bridge", "spark", "--out", tmp_path / "taken" / "website")
+    assert failed.exit_code == 1
+    assert str(tmp_path / "taken") in failed.stderr
