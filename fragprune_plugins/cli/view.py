@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -87,13 +87,14 @@ def command(
         start = overview(loaded[0].splat)
         start.background.copy_(torch.full((3,), float(white_background)))
     site = make_site(model.name, loaded, layers, shown, start)
-    facts = {
+    size = sum(map(len, site.values()))
+    facts: dict[str, Any] = {
         "model": str(model),
         "compare": None if compare is None else str(compare),
         "gaussians": [len(each.splat) for each in loaded],
         "truncated": truncated,
         "cameras": len(shown),
-        "bytes": sum(map(len, site.values())),
+        "bytes": size,
     }
     if out is None:
         where = _serve(site, port, browse=not no_browser)
@@ -109,7 +110,7 @@ def command(
         save_site(out, site)
         files = [out / name for name in sorted(site)]
         text = (
-            f"Wrote {len(files)} files to {out} ({facts['bytes'] / 2**20:.1f} MiB). A web server "
+            f"Wrote {len(files)} files to {out} ({size / 2**20:.1f} MiB). A web server "
             f"has to serve them; here: python -m http.server -d {out}"
         )
     return Report({**facts, "address": None, "files": [str(file) for file in files]}, text)
@@ -118,12 +119,13 @@ def command(
 def _cameras(data: Path | None, cameras: Path | None, white_background: bool) -> list[Shown]:
     """The cameras of the page's list: held-out ones of a scene, or all of a file."""
     from fragprune_plugins.datasets.cameras import load_cameras
-    from fragprune_plugins.datasets.dataset import load_dataset
+    from fragprune_plugins.datasets.dataset import Photograph, load_dataset
     from fragprune_plugins.viewer.site import Shown
 
     if data is not None:
         shots = load_dataset(data, white_background=white_background).test
-        return [Shown(shot.name, shot.view, shot.path) for shot in shots]
+        paths = [shot.path if isinstance(shot, Photograph) else None for shot in shots]
+        return [Shown(shot.name, shot.view, path) for shot, path in zip(shots, paths, strict=True)]
     if cameras is not None:
         named = load_cameras(cameras, white_background=white_background)
         return [Shown(name, view) for name, view in named]
@@ -138,7 +140,7 @@ def _serve(site: Site, port: int, *, browse: bool) -> str:
 
     with open_server(site, port) as server:
         where = address(server)
-        click.echo(f"Serving the viewer at {where} until Ctrl-C.", err=True)
+        click.echo(f"The viewer is at {where} until Ctrl-C.", err=True)
         if browse:
             webbrowser.open(where)
         try:

@@ -94,4 +94,5 @@ def _unsigned(shares: torch.Tensor) -> NDArray[np.uint16]:
 
 
 def _pair(low: NDArray[Any], high: NDArray[Any]) -> Words:
-    return low.astype("<u4") | (high.astype("<u4") << np.uint32(16))
+    pair: Words = low.astype("<u4") | (high.astype("<u4") << np.uint32(16))
+    return pair

@@ -1,4 +1,4 @@
-"""The files of a viewer: in memory, to be served, written to a folder, or put into one page."""
+"""The files of a viewer: to serve, to write into a folder, or to put into one page."""
 
 from __future__ import annotations
 

@@ -86,6 +86,7 @@ class Viewer {
     change(moves = true) {
         this.dirty = true;
         if (moves) this.counted = null;
+        $("#figures").classList.toggle("stale", !this.counted);
         if (!this.frame && !this.paused)
             this.frame = requestAnimationFrame(now => this.#frame(now));
     }
@@ -223,6 +224,14 @@ class Viewer {
         };
     }
 
+    // For measuring from outside: nothing draws by itself any more, and orders are of this camera.
+    async hold(camera) {
+        this.paused = true;
+        cancelAnimationFrame(this.frame);
+        clearTimeout(this.resting);
+        for (const { splats } of this.layers) await splats.settled(camera);
+    }
+
     #figures() {
         const rows = document.querySelectorAll("#figures tbody tr");
         ["fragments", "quads", "milliseconds"].forEach((name, r) => {
@@ -232,10 +241,10 @@ class Viewer {
                 cells[2].textContent = values[0] > 0 ? `${(values[1] / values[0]).toFixed(2)}×` : "–";
         });
         $("#figures").classList.remove("stale");
-        this.#legend();
+        this.legend();
     }
 
-    #legend() {
+    legend() {
         const [, middle, end] = document.querySelectorAll("#legend .ticks span");
         [middle.textContent, end.textContent] = [this.limit / 2, `${this.limit} and more`];
         $("#legend p").textContent =
@@ -309,6 +318,7 @@ function wire(viewer) {
 
     choices($("#maps"), MAPS, "picture", value => {
         viewer.map = value;
+        viewer.legend();
         $("#reading").hidden = true;
         viewer.change();
     });
@@ -391,11 +401,12 @@ function wire(viewer) {
     addEventListener("resize", names);
     place(0.5);
 
-    const MOVES = new Set("wasdqe").add("shift").add("arrowleft").add("arrowright").add("arrowup").add("arrowdown");
+    const MOVES = new Set([..."wasdqe", "shift", "arrowleft", "arrowright", "arrowup", "arrowdown"]);
     addEventListener("keydown", event => {
         const key = event.key.toLowerCase();
         if (event.ctrlKey || event.metaKey || event.altKey || $("#help").open) return;
-        if (event.target.closest?.("select, fieldset") && !"wasdqe".includes(key)) return;
+        const within = name => event.target.closest?.(name);
+        if (within("select") || (within("fieldset") && key.startsWith("arrow"))) return;
         if (MOVES.has(key)) {
             if (key !== "shift" || viewer.keys.size) event.preventDefault();
             viewer.keys.add(key);

@@ -50,6 +50,12 @@ export class Splats {
         this.worker.postMessage({ camera });
     }
 
+    // Wait until the order is that of a camera.
+    async settled(camera) {
+        this.sort(camera);
+        while (this.inOrder !== camera) await new Promise(done => setTimeout(done, 1));
+    }
+
     #sorted({ order, milliseconds }) {
         const { gl } = this;
         const rows = Math.ceil(order.length / ROW);
