@@ -77,7 +77,7 @@ def command(
             names = [str(model), str(compare)]
         layers = [Layer(name, i, truncated[i]) for i, name in enumerate(names)]
     elif truncated[0]:
-        layers = [Layer("truncated", 0, True), Layer("untruncated", 0, False)]
+        layers = [Layer("Truncated", 0, True), Layer("Untruncated", 0, False)]
     else:
         layers = [Layer(model.stem, 0, False)]
     shown = _cameras(data, cameras, white_background)

@@ -1,9 +1,10 @@
-"""``cd tests && python -m browser.reach``: how the viewer compares with itself and with usual quads.
+"""``cd tests && python -m browser.reach``: the viewer against itself and against usual quads.
 
-Everything is drawn in turns in one run, in one headless Chromium: a pruned model with its thresholds,
-the unpruned one, and the unpruned one as most viewers draw it (every quad reaches the square root of 8
-standard deviations, and full pixels are drawn on). Pixels are counted beside milliseconds: a software
-renderer shows the work of fragments, and nothing of what a GPU's geometry units do.
+Everything is drawn in turns in one run, in one headless Chromium: a pruned model with its
+thresholds, the unpruned one, and the unpruned one as most viewers draw it (every quad reaches the
+square root of 8 standard deviations, and full pixels are drawn on). Pixels are counted beside
+milliseconds: a software renderer shows the work of fragments, and nothing of what a GPU's geometry
+units do.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 from browser.chromium import chromium, opened
 from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
 
-from fragprune_plugins.bench.machine import machine
+from fragprune_plugins.bench.machine import describe_machine
 from fragprune_plugins.bench.scene import make_scene, make_view
 from fragprune_plugins.measure.viewing import overview
 from fragprune_plugins.storage.models import Model, load
@@ -134,16 +135,16 @@ def cold(browser: Any, count: int, rounds: int) -> dict[str, Any]:
 def table(report: dict[str, Any]) -> str:
     """The report in Markdown."""
     lines = [
-        f"Chromium {report['chromium']}, {report['renderer']}; {SIZE[0]}x{SIZE[1]}; load "
-        f"{report['load'][0]:.1f} before and {report['load'][1]:.1f} after, {report['cores']} cores. "
-        "Median (least) of rounds in turns.",
+        f"Chromium {report['chromium']}, {report['renderer']}; {SIZE[0]}x{SIZE[1]}; "
+        f"load {report['load'][0]:.1f} before and {report['load'][1]:.1f} after, "
+        f"{report['machine']['cores']} cores. Median (least) of rounds in turns.",
     ]
     for name, scene in report["scenes"].items():
         lines += [
             "",
             f"**{name}**, {scene['gaussians']:,} Gaussians",
             "",
-            "| drawn | fragments per pixel | quad pixels per pixel | ms | against the cpu engine, dB |",
+            "| drawn | fragments per pixel | quad pixels per pixel | ms | to the cpu engine, dB |",
             "|---|---|---|---|---|",
             *(
                 f"| {way} | {of['fragments']:.1f} | {of['quads']:.1f} "
@@ -163,7 +164,7 @@ def table(report: dict[str, Any]) -> str:
     if report["cold"]:
         lines += [
             "",
-            "| Gaussians | first frame, ms | a frame while turning, ms | at a share of the size | sort, ms |",
+            "| Gaussians | first frame, ms | while turning, ms | of its size | sort, ms |",
             "|---|---|---|---|---|",
             *(
                 f"| {of['gaussians']:,} | {of['first_frame_ms']:.0f} "
@@ -191,7 +192,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7, help="of all in turns (7)")
     words = parser.parse_args()
     words.out.mkdir(parents=True, exist_ok=True)
-    report: dict[str, Any] = {"cores": os.cpu_count(), "machine": machine(), "scenes": {}}
+    report: dict[str, Any] = {"machine": describe_machine(), "scenes": {}}
     report["load"] = [os.getloadavg()[0]]
     with chromium() as browser:
         report["chromium"] = browser.version

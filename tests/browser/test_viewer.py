@@ -54,13 +54,13 @@ def test_the_picture_is_our_engines(browser, tmp_path, degree):
         for layer, truncated in ((0, True), (1, False)):
             shown = frame(tab, view, layer)
             expected = engine_frame(model, view, truncated=truncated)
-            # 8 bits alone leave 59 dB; the engine leaves out what lies beyond its tiles.
-            assert decibels(shown.image, expected) > 50
+            # 8 bits alone leave 59 dB; pixels on the edge of an opaque Gaussian may differ.
+            assert decibels(shown.image, expected) > 56
         assert tab.errors == tab.strangers == []
 
 
 def boxes(model: Model, view: View, *, truncated: bool) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) counts of boxes around ellipses, and of ellipses, over each pixel's centre."""
+    """(H, W) counts of boxes and octagons around ellipses, and of ellipses, over pixel centres."""
     splat = model.splat.splats()
     front = (model.splat.xyz @ view.viewmatrix[:3, :3] + view.viewmatrix[3, :3])[:, 2] > 0.2
     camera = Camera(**{name: getattr(view, name) for name in Camera.__dataclass_fields__})
@@ -87,7 +87,11 @@ def boxes(model: Model, view: View, *, truncated: bool) -> tuple[np.ndarray, np.
             continue
         precision, axes = np.linalg.eigh([[conic[0], conic[1]], [conic[1], conic[2]]])
         offsets = np.stack([x - mean[0], y - mean[1]], axis=-1) @ axes * np.sqrt(precision)
-        quads += (np.abs(offsets) <= np.sqrt(cutoff)).all(axis=-1)
+        reaches = np.abs(offsets) / np.sqrt(cutoff)
+        covered = (reaches <= 1).all(axis=-1)
+        if 4 * cutoff / np.sqrt(precision.prod()) > 36:
+            covered &= reaches.sum(axis=-1) <= np.sqrt(2)
+        quads += covered
         ellipses += (offsets**2).sum(axis=-1) <= cutoff
     return quads, ellipses
 
@@ -219,7 +223,7 @@ def test_one_page_from_disk(browser, tmp_path):
     with opened(browser, (tmp_path / "page.html").as_uri()) as tab:
         tab.page.wait_for_function("window.viewer && viewer.counted")
         hold(tab, view)
-        assert decibels(frame(tab, view).image, engine_frame(model, view, truncated=False)) > 50
+        assert decibels(frame(tab, view).image, engine_frame(model, view, truncated=False)) > 56
         assert tab.errors == tab.strangers == []
 
 

@@ -4,7 +4,7 @@
 import { FRAGMENT, MARK, PROJECT, QUADS, ROW, SHOW, SUM, WHOLE } from "./shaders.js";
 import { texture } from "./splats.js";
 
-const PORTION = 16000; // quads: their corners have 16-bit numbers, and 65535 means a new strip
+const PORTION = 8191; // Gaussians: their corners have 16-bit numbers, and 65535 means a new strip
 const BLOCK = 16; // pixels of a side that are summed at once
 
 export class Drawing {
@@ -24,13 +24,14 @@ export class Drawing {
         this.format = software ? gl.RGBA32F : gl.RGBA16F;
         this.gl = gl;
         this.canvas = canvas;
-        this.options = { fixed: false, stop: true, marks: 8 };
+        this.options = { fixed: false, stop: true, marks: 16, large: 36 };
         this.programs = new Map();
         gl.disable(gl.DITHER);
         gl.bindVertexArray(gl.createVertexArray());
-        const corners = new Uint16Array(PORTION * 6);
-        for (let i = 0; i < PORTION; i++)
-            corners.set([0, 1, 2, 2, 1, 3].map(each => i * 4 + each), i * 6);
+        // Corners 0 to 7 go around. Where pairs of them fall together, two triangles are left.
+        const octagon = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 7, 4, 5, 6, 4, 6, 7];
+        const corners = new Uint16Array(PORTION * 18);
+        for (let i = 0; i < PORTION; i++) corners.set(octagon.map(each => i * 8 + each), i * 18);
         gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
         gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
         this.tableRows = 0;
@@ -186,8 +187,9 @@ export class Drawing {
             this.#bind(1, this.paint, use("u_paint"));
             gl.uniform2f(use("u_size"), this.width, this.height);
             gl.uniform1i(use("u_first"), first);
+            gl.uniform1f(use("u_large"), this.options.fixed ? Infinity : this.options.large);
             const quads = Math.min(portion, count - first);
-            gl.drawElements(gl.TRIANGLES, quads * 6, gl.UNSIGNED_SHORT, 0);
+            gl.drawElements(gl.TRIANGLES, quads * 18, gl.UNSIGNED_SHORT, 0);
         }
         gl.disable(gl.DEPTH_TEST);
         gl.disable(gl.BLEND);

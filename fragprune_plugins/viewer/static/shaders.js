@@ -119,41 +119,50 @@ export const QUADS = `${HEAD}
 uniform usampler2D u_shape, u_paint;
 uniform int u_first;
 uniform vec2 u_size;
-out vec2 v_sigmas;          // from the centre, along both axes
-flat out float v_cutoff;
+uniform float u_large;      // pixels
+flat out vec3 v_place;      // centre, pixels from below; cutoff
+flat out vec4 v_axes;       // from pixels to standard deviations
 flat out vec4 v_color;
 
 void main() {
-    int place = u_first + (gl_VertexID >> 2);
+    int place = u_first + (gl_VertexID >> 3), corner = gl_VertexID & 7;
     ivec2 texel = ivec2(place % ${ROW}, place / ${ROW});
     uvec4 paint = texelFetch(u_paint, texel, 0);
-    v_cutoff = uintBitsToFloat(paint.y);
-    if (v_cutoff < 0.0) {
-        gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // four times: draws nothing
+    float cutoff = uintBitsToFloat(paint.y);
+    if (cutoff < 0.0) {
+        gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // all corners: draws nothing
         return;
     }
     vec4 shape = uintBitsToFloat(texelFetch(u_shape, texel, 0));
-    vec2 corner = vec2((gl_VertexID & 1) == 0 ? -1.0 : 1.0, (gl_VertexID & 2) == 0 ? -1.0 : 1.0);
-    v_sigmas = sqrt(v_cutoff) * corner;
-    vec2 other = vec2(-shape.w, shape.z) * uintBitsToFloat(paint.x);
-    vec2 at = shape.xy + v_sigmas.x * shape.zw + v_sigmas.y * other;
+    float ratio = uintBitsToFloat(paint.x);
+    vec2 other = vec2(-shape.w, shape.z) * ratio;
+    // An octagon, a sixth smaller than the quad; of a tiny one the quad: corners fall together.
+    float side = 4.0 * cutoff * ratio * dot(shape.zw, shape.zw) > u_large ? 0.41421356 : 1.0;
+    bool upright = ((corner + 1) & 2) == 0; // on the octagon's left or right side
+    vec2 signs = vec2(((corner + 2) & 7) < 4 ? 1.0 : -1.0, corner < 4 ? 1.0 : -1.0);
+    vec2 sigmas = sqrt(cutoff) * signs * (upright ? vec2(1.0, side) : vec2(side, 1.0));
+    vec2 at = shape.xy + sigmas.x * shape.zw + sigmas.y * other;
+    v_place = vec3(shape.x, u_size.y - shape.y, cutoff);
+    v_axes = vec4(shape.zw / dot(shape.zw, shape.zw), other / dot(other, other)) * vec2(1.0, -1.0).xyxy;
     v_color = vec4(unpackHalf2x16(paint.z), unpackHalf2x16(paint.w));
     gl_Position = vec4(2.0 * at / u_size - 1.0, 0.0, 1.0);
     gl_Position.y = -gl_Position.y;
 }`;
 
-// Front to back: colour times the light that is left, which alpha holds.
+// Front to back: colour times the light that is left, which alpha holds. Distances are taken anew at
+// each pixel, because corners are rounded to fractions of a pixel, and what they carry with them.
 export const FRAGMENT = counted => `${HEAD}
-in vec2 v_sigmas;
-flat in float v_cutoff;
-flat in vec4 v_color;
+flat in vec3 v_place;
+flat in vec4 v_axes, v_color;
 layout(location = 0) out vec4 color;
 ${counted ? "layout(location = 1) out vec4 counts;" : ""}
 
 void main() {
-    float q = dot(v_sigmas, v_sigmas);
-    ${counted ? "counts = vec4(1.0, q <= v_cutoff ? 1.0 : 0.0, 0.0, 0.0);" : ""}
-    if (q > v_cutoff) ${counted ? "{ color = vec4(0.0); return; }" : "discard;"}
+    vec2 from = gl_FragCoord.xy - v_place.xy;
+    vec2 sigmas = vec2(dot(from, v_axes.xy), dot(from, v_axes.zw));
+    float q = dot(sigmas, sigmas);
+    ${counted ? "counts = vec4(1.0, q <= v_place.z ? 1.0 : 0.0, 0.0, 0.0);" : ""}
+    if (q > v_place.z) ${counted ? "{ color = vec4(0.0); return; }" : "discard;"}
     float alpha = min(0.99, v_color.a * exp(-0.5 * q));
     color = vec4(v_color.rgb * alpha, alpha);
 }`;
@@ -162,7 +171,7 @@ void main() {
 export const MARK = `${HEAD}
 uniform sampler2D u_color;
 void main() {
-    if (texelFetch(u_color, ivec2(gl_FragCoord.xy), 0).a >= ${1 / 1024}) discard;
+    if (texelFetch(u_color, ivec2(gl_FragCoord.xy), 0).a >= ${1 / 512}) discard;
 }`;
 
 export const SUM = side => `${HEAD}
