@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fragprune_plugins.cli.common import FILE, Command, Report
+from fragprune_plugins.cli.common import FILE, MODEL, Command, Report
 from fragprune_plugins.errors import UsageError
 
 if TYPE_CHECKING:
@@ -15,12 +15,17 @@ if TYPE_CHECKING:
 
 
 @click.command("view", cls=Command)
-@click.argument("model", type=FILE)
-@click.option("--compare", type=FILE, help="Another model, shown on the right side of the split.")
+@click.argument("model", type=MODEL)
+@click.option("--compare", type=MODEL, help="Another model, shown on the right side of the split.")
 @click.option(
     "--data", type=FILE, help="Scene folder: its held-out cameras, with their photographs."
 )
-@click.option("--cameras", type=FILE, help="cameras.json of a 3DGS model, or transforms_*.json.")
+@click.option(
+    "--cameras",
+    type=FILE,
+    help="cameras.json of a 3DGS model, transforms*.json, or nerfstudio's camera_path.json. "
+    "Default: the cameras.json that the training of MODEL wrote, if there is one.",
+)
 @click.option("--out", type=FILE, help="Write the viewer into this folder instead of serving it.")
 @click.option("--single-file", is_flag=True, help="With --out: one HTML file that holds it all.")
 @click.option("--white-background", is_flag=True, help="Show the model over white.")
@@ -54,6 +59,7 @@ def command(
       fragprune view pruned.ply
       fragprune view pruned.ply --compare point_cloud.ply --data scene
       fragprune view pruned.ply --out page --single-file
+      fragprune view out                                (the output folder of a training)
     """
     if data is not None and cameras is not None:
         raise UsageError("options", "both --data and --cameras", "one of them", "Pass one.")
@@ -80,7 +86,7 @@ def command(
         layers = [Layer("Truncated", 0, True), Layer("Untruncated", 0, False)]
     else:
         layers = [Layer(model.stem, 0, False)]
-    shown = _cameras(data, cameras, white_background)
+    shown = _cameras(data, cameras or _of_training(model), white_background)
     if shown:
         start = shown[0].view
     else:
@@ -119,17 +125,24 @@ def command(
 def _cameras(data: Path | None, cameras: Path | None, white_background: bool) -> list[Shown]:
     """The cameras of the page's list: held-out ones of a scene, or all of a file."""
     from fragprune_plugins.datasets.cameras import load_cameras
-    from fragprune_plugins.datasets.dataset import Photograph, load_dataset
+    from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.viewer.site import Shown
 
     if data is not None:
         shots = load_dataset(data, white_background=white_background).test
-        paths = [shot.path if isinstance(shot, Photograph) else None for shot in shots]
-        return [Shown(shot.name, shot.view, path) for shot, path in zip(shots, paths, strict=True)]
+        return [Shown(shot.name, shot.view, shot) for shot in shots]
     if cameras is not None:
         named = load_cameras(cameras, white_background=white_background)
         return [Shown(name, view) for name, view in named]
     return []
+
+
+def _of_training(model: Path) -> Path | None:
+    """The cameras that a host wrote beside a model; None if there are none."""
+    from fragprune_plugins.hosts.graphdeco.output import CAMERAS, output_folder
+
+    folder = output_folder(model)
+    return folder / CAMERAS if folder is not None and (folder / CAMERAS).is_file() else None
 
 
 def _serve(site: Site, port: int, *, browse: bool) -> str:

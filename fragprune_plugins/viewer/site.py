@@ -13,9 +13,10 @@ from typing import Any
 
 import torch
 
+from fragprune_plugins.datasets.dataset import Shot
 from fragprune_plugins.datasets.generated import bounds
-from fragprune_plugins.datasets.images import opened
 from fragprune_plugins.errors import OutputError
+from fragprune_plugins.measure.pictures import picture
 from fragprune_plugins.storage.atomic import replacing, writable_folder
 from fragprune_plugins.storage.models import Model
 from fragprune_plugins.types import View
@@ -55,12 +56,12 @@ class Shown:
     Attributes:
         name: what the page calls it.
         view: the camera.
-        photograph: an image file; None where there is none.
+        photograph: of this camera; None where there is none.
     """
 
     name: str
     view: View
-    photograph: Path | None = None
+    photograph: Shot | None = None
 
 
 def make_site(
@@ -177,10 +178,10 @@ def single_page(site: Site) -> bytes:
     return page.encode()
 
 
-def _jpeg(path: Path) -> bytes:
+def _jpeg(photograph: Shot) -> bytes:
     """A photograph as a JPEG of at most ``_PHOTOGRAPH_SIDE`` pixels a side; none is enlarged."""
-    with opened(path) as image:
-        image.thumbnail((_PHOTOGRAPH_SIDE, _PHOTOGRAPH_SIDE))
-        held = io.BytesIO()
-        image.convert("RGB").save(held, format="JPEG", quality=88)
-        return held.getvalue()
+    image = picture(photograph.image)
+    image.thumbnail((_PHOTOGRAPH_SIDE, _PHOTOGRAPH_SIDE))
+    held = io.BytesIO()
+    image.save(held, format="JPEG", quality=88)
+    return held.getvalue()

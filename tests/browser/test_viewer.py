@@ -9,6 +9,7 @@ from browser.chromium import opened, served
 from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
 from finetune import tiny
 
+from fragprune_plugins.datasets.dataset import load_dataset
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage.models import Model
 from fragprune_plugins.types import View
@@ -161,8 +162,7 @@ def test_split_shows_each_side_as_it_is_alone(browser, tmp_path):
 def test_hands_and_keys(browser, tmp_path):
     """Split, maps, cameras, photographs, orbit: each changes what it should, and nothing fails."""
     data, _, splat = tiny.scene(tmp_path / "scene")
-    photograph = next(data.rglob("*.png"))
-    shown = [Shown(f"{i}", tiny.cameras()[i].view(), photograph) for i in range(2)]
+    shown = [Shown(shot.name, shot.view, shot) for shot in load_dataset(data).test]
     store = ThresholdStore.from_falloff(torch.full((len(splat),), 0.3))
     write_page(tmp_path / "page", [Model(splat, store)], shown[0].view, tuple(shown))
     with viewing(browser, tmp_path / "page", width=800, height=600) as tab:

@@ -46,6 +46,22 @@ def test_two_models_are_two_sides(scene, tmp_path):
     assert report["gaussians"] == [60, 20]
 
 
+def test_the_cameras_of_a_training_are_found(scene, tmp_path):
+    _, path = scene
+    place = tmp_path / "out" / "point_cloud" / "iteration_7"
+    place.mkdir(parents=True)
+    path.rename(place / "point_cloud.ply")
+    camera = {
+        **{"id": 0, "img_name": "a", "width": 20, "height": 10, "fx": 9.0, "fy": 9.0},
+        **{"position": [0, 0, -3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
+    }
+    (tmp_path / "out" / "cameras.json").write_text(json.dumps([camera]))
+    (tmp_path / "out" / "cfg_args").write_text("Namespace()")
+    assert run_json("view", tmp_path / "out", "--out", tmp_path / "page")["cameras"] == 1
+    held = json.loads((tmp_path / "page" / "scene.json").read_text())
+    assert held["start"]["position"] == [0, 0, -3]
+
+
 def test_one_page(scene, tmp_path):
     run_json("view", scene[1], "--out", tmp_path / "page", "--single-file")
     assert [each.name for each in (tmp_path / "page").iterdir()] == ["index.html"]
