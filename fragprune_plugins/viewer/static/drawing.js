@@ -55,13 +55,13 @@ export class Drawing {
         gl.disable(gl.SCISSOR_TEST);
     }
 
-    // Put the picture, or counts as colours, on the canvas.
+    // Put the picture, or counts as colours, on the canvas; or aside, where nobody sees it.
     show(how = {}) {
-        this.shown = how;
-        const { background = [0, 0, 0], limit = 0, channel = 0 } = how;
+        this.shown = { ...how, aside: false };
+        const { background = [0, 0, 0], limit = 0, channel = 0, aside = false } = how;
         const { gl } = this;
         const use = this.#use("show", WHOLE, SHOW);
-        gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, aside ? this.aside : null);
         gl.viewport(0, 0, this.width, this.height);
         this.#bind(0, this.color, use("u_color"));
         this.#bind(1, limit > 0 ? this.counts : this.color, use("u_counts"));
@@ -126,10 +126,10 @@ export class Drawing {
         return turned;
     }
 
-    // Wait for the GPU.
+    // Wait until what was shown aside is there.
     finish() {
         const { gl } = this;
-        gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, this.aside);
         gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     }
 
@@ -212,8 +212,8 @@ export class Drawing {
         if (width !== this.width || height !== this.height) {
             [this.width, this.height] = [width, height];
             Object.assign(this.canvas, { width, height });
-            for (const each of [this.color, this.sums, this.counts]) gl.deleteTexture(each);
-            for (const each of [this.target, this.marks, this.sumTarget, this.countTarget])
+            for (const each of [this.color, this.sums, this.counts, this.plain]) gl.deleteTexture(each);
+            for (const each of [this.target, this.marks, this.sumTarget, this.countTarget, this.aside])
                 gl.deleteFramebuffer(each);
             gl.deleteRenderbuffer(this.depth);
             this.counts = null;
@@ -225,6 +225,8 @@ export class Drawing {
             this.target = this.#target([this.color], this.depth);
             this.marks = this.#target([], this.depth);
             this.sumTarget = this.#target([this.sums]);
+            this.plain = texture(gl, gl.RGBA8, width, height);
+            this.aside = this.#target([this.plain]);
         }
         if (counted && !this.counts) {
             this.counts = texture(gl, this.exact ? gl.RGBA32F : gl.RGBA16F, width, height);

@@ -59,7 +59,9 @@ class Viewer {
         this.quality = asked.has("full") ? 1 : 0.5; // the first frame comes soon, the sharp one next
         this.firstFrame = null; // milliseconds since the page was asked for
         this.keys = new Set();
-        this.dirty = true;
+        this.dirty = true; // what is on the screen is of another camera or choice
+        this.sharp = false; // what is on the screen has its full size
+        this.pending = false; // a frame is being drawn
         this.last = 0; // when the last frame began, while moving
         this.before = 0; // and the one before it
         this.movedAt = -Infinity;
@@ -87,8 +89,7 @@ class Viewer {
         this.dirty = true;
         if (moves) this.counted = null;
         $("#figures").classList.toggle("stale", !this.counted);
-        if (!this.frame && !this.paused)
-            this.frame = requestAnimationFrame(now => this.#frame(now));
+        this.#again();
     }
 
     go(camera, moves = true) {
@@ -126,40 +127,46 @@ class Viewer {
         this.present();
     }
 
-    present(mapped = this.map !== "picture") {
+    present() {
         this.drawing.show({
             background: this.background,
-            limit: mapped ? this.limit : 0,
+            limit: this.map === "picture" ? 0 : this.limit,
             channel: this.map === "fragments" ? 1 : 0,
         });
     }
+
+    get moving() { return performance.now() - this.movedAt < REST || this.keys.size > 0; }
 
     #frame(now) {
         this.frame = 0;
         const seconds = this.last ? Math.min(0.1, (now - this.last) / 1000) : 1 / 60;
         if (this.keys.size) this.#keysMove(seconds);
-        const moving = now - this.movedAt < REST || this.keys.size > 0;
-        const sorted = this.layers.filter(({ splats }) => splats.inOrder);
-        for (const { splats } of this.sides(100)) splats.sort(this.camera);
-        if (this.dirty && sorted.length === this.layers.length && sorted.length) {
+        const { moving } = this, first = this.firstFrame === null;
+        for (const { splats } of this.layers) splats.sort(this.camera);
+        const shown = this.sides(100);
+        const ready = shown.length > 0 && shown.every(({ splats }) => splats.inOrder);
+        if (moving) this.sharp = false;
+        if (ready && !this.pending && (this.dirty || (!moving && !this.sharp))) {
             this.dirty = false;
             const began = performance.now();
-            this.draw(moving || this.firstFrame === null ? this.quality : 1);
-            if (moving || this.firstFrame === null) this.#pace(began, now);
-            else this.sharp = true;
+            this.draw(moving || first ? this.quality : 1);
+            this.sharp = !moving && !first;
+            if (!this.sharp) this.#pace(began, now);
         }
         this.last = moving ? now : 0;
-        if (moving) {
-            this.sharp = false;
-            this.change(false);
-        } else if (!this.sharp) this.change(false);
-        else if (sorted.length && !this.counted && !this.dirty) this.#rest();
+        if (moving || (ready && !this.sharp)) this.#again();
+        else if (ready && !this.counted && !this.dirty) this.#rest();
+    }
+
+    #again() {
+        if (!this.frame && !this.paused) this.frame = requestAnimationFrame(now => this.#frame(now));
     }
 
     // Wait for a frame without stopping the page, and choose the resolution by how long it took.
     #pace(began, now) {
         const { gl } = this.drawing, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
         const size = this.quality;
+        this.pending = true; // one frame at a time
         gl.flush();
         const look = () => {
             if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) {
@@ -167,6 +174,7 @@ class Viewer {
                 return;
             }
             gl.deleteSync(fence);
+            this.pending = false;
             const milliseconds = performance.now() - began;
             if (this.firstFrame === null) {
                 this.firstFrame = performance.now();
@@ -188,17 +196,28 @@ class Viewer {
 
     // At rest: count and time every layer on the whole picture.
     #rest() {
-        if (this.layers.some(({ splats }) => splats.inOrder !== this.camera)) return;
         clearTimeout(this.resting);
-        this.resting = setTimeout(() => {
-            if (this.paused || this.dirty || performance.now() - this.movedAt < REST) return;
-            this.counted = this.layers.map((_, i) => this.measure(i));
+        this.resting = setTimeout(async () => {
+            const { camera } = this;
+            const busy = () => this.paused || this.dirty || this.moving || this.camera !== camera
+                || this.layers.some(({ splats }) => splats.inOrder !== camera);
+            const pause = () => new Promise(done => setTimeout(done)); // for hands and keys
+            const counted = [];
+            for (const i of this.layers.keys()) {
+                if (busy()) return;
+                counted.push(this.measure(i));
+                await pause();
+            }
             const enough = performance.now() + 400; // on a busy machine a single frame says little
             for (let round = 1; round < 5 && performance.now() < enough; round++)
-                this.counted.forEach((each, i) => {
+                for (const [i, each] of counted.entries()) {
+                    if (busy()) return;
                     each.milliseconds = Math.min(each.milliseconds, this.time(i));
-                });
-            const most = Math.max(...this.counted.map(each => each.most));
+                    await pause();
+                }
+            if (busy()) return;
+            this.counted = counted;
+            const most = Math.max(...counted.map(each => each.most));
             this.limit = [10, 20, 50, 100, 200, 500, 1000, 2000].find(each => each >= 0.8 * most) ?? 5000;
             this.draw();
             this.#figures();
@@ -222,7 +241,7 @@ class Viewer {
         this.drawing.finish();
         const began = performance.now();
         this.drawing.draw(camera, [{ ...this.layers[i], sides: [0, camera.width] }]);
-        this.present(false);
+        this.drawing.show({ background: this.background, aside: true });
         this.drawing.finish();
         return performance.now() - began;
     }
@@ -317,13 +336,15 @@ function wire(viewer) {
             reading.style.transform = `translate(${Math.min(x + 14, innerWidth - 150)}px, ${y + 14}px)`;
         },
     });
+    viewer.canvas.addEventListener("webglcontextlost", () =>
+        failed(new Error("The graphics card has let go of the page: load it again.")));
     viewer.canvas.addEventListener("pointerleave", () => { $("#reading").hidden = true; });
 
     choices($("#maps"), MAPS, "picture", value => {
         viewer.map = value;
         viewer.legend();
         $("#reading").hidden = true;
-        viewer.change();
+        viewer.change(false);
     });
     choices($("#moves"), { orbit: "Orbit", fly: "Fly" }, "orbit", value => { viewer.fly = value === "fly"; });
 
@@ -371,6 +392,7 @@ function wire(viewer) {
 
     const split = $("#split");
     const place = share => {
+        if (viewer.firstFrame !== null) viewer.movedAt = performance.now();
         viewer.split = Math.max(0, Math.min(1, share));
         split.style.left = `${100 * viewer.split}%`;
         split.setAttribute("aria-valuenow", Math.round(100 * viewer.split));
@@ -474,9 +496,13 @@ async function start() {
     $("#about").textContent = `${counts.join(" and ")} Gaussians`;
 }
 
-window.started = start().catch(error => {
+function failed(error) {
     $("#loading").hidden = false;
     $("#loading span").textContent = error.message;
     $("#loading progress").hidden = true;
+}
+
+start().catch(error => {
+    failed(error);
     throw error;
 });

@@ -11,6 +11,7 @@ export function sorting() {
             [-cx / fx, (width - cx) / fx], [-cy / fy, (height - cy) / fy],
         ].map(([low, high]) => [low, high, Math.hypot(1, low), Math.hypot(1, high)]);
         const [[left, right, leftRoot, rightRoot], [top, bottom, topRoot, bottomRoot]] = slopes;
+        const wider = Math.max(0.01, 6 / Math.min(fx, fy)); // the dilation, in small pictures too
         let count = 0, nearest = Infinity, farthest = 0;
         const depths = new Float32Array(keys2.buffer);
         for (let i = 0, j = 0; i < reaches.length; i++, j += 3) {
@@ -20,7 +21,7 @@ export function sorting() {
             const reach = reaches[i];
             // Close to the camera the projection is steeper than the sphere around a Gaussian.
             if (depth > 4 * reach) {
-                const margin = 1.5 * reach + 0.005 * depth; // half a percent: the dilation
+                const margin = 1.5 * reach + wider * depth;
                 const right_ = m[0] * x + m[1] * y + m[2] * z;
                 if (left * depth - right_ > margin * leftRoot) continue;
                 if (right_ - right * depth > margin * rightRoot) continue;
