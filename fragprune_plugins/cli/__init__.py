@@ -15,6 +15,7 @@ _COMMANDS = {
     "run": "run",
     "finetune": "finetune",
     "render": "render",
+    "view": "view",
     "profile": "profile",
     "audit": "audit",
     "compare": "compare",

@@ -1,0 +1,88 @@
+"""The viewer in a tab: what it draws and counts from a camera, and what our engine draws."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from browser.chromium import Tab, opened, served
+
+from fragprune_plugins import rasterize
+from fragprune_plugins.storage.models import Model
+from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.viewer.site import Layer, camera, make_site, save_site
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of the page, rows from the top.
+
+    Attributes:
+        image: (H, W, 3) RGB in [0, 1], of 8 bits.
+        quads: (H, W) how often a quad covered each pixel.
+        fragments: (H, W) how often a fragment was drawn there.
+    """
+
+    image: np.ndarray
+    quads: np.ndarray
+    fragments: np.ndarray
+
+
+def write_page(folder: Path, models: list[Model], view: View, cameras: tuple = ()) -> None:
+    """The viewer of one model with both sides, or of two."""
+    if len(models) == 1:
+        layers = [Layer("truncated", 0, True), Layer("untruncated", 0, False)]
+    else:
+        layers = [Layer(str(i), i, m.thresholds is not None) for i, m in enumerate(models)]
+    save_site(folder, make_site("test", models, layers, cameras, view))
+
+
+@contextmanager
+def viewing(browser: Any, folder: Path, options: str = "", **context: Any) -> Iterator[Tab]:
+    """The page of a folder, with its models loaded."""
+    with served(folder) as address, opened(browser, f"{address}?{options}", **context) as tab:
+        ready = "window.viewer && viewer.layers.length === viewer.scene.layers.length"
+        tab.page.wait_for_function(ready, timeout=120_000)
+        yield tab
+
+
+def hold(tab: Tab, view: View) -> None:
+    """Sort for a camera, and let nothing else draw."""
+    tab.run(f"async () => {{ window.held = {json.dumps(camera(view))}; await viewer.hold(held); }}")
+
+
+def frame(tab: Tab, view: View, layer: int = 0, *, stop: bool = True) -> Frame:
+    """Draw a layer with counts from a camera, after ``hold``."""
+    width, height = view.width, view.height
+    background = view.background.tolist()
+    tab.run(
+        f"""() => {{
+            viewer.drawing.options.stop = {json.dumps(stop)};
+            const layer = {{ ...viewer.layers[{layer}], sides: [0, {width}] }};
+            viewer.drawing.draw(held, [layer], {{ counted: true }});
+            viewer.drawing.show({{ background: {background} }});
+        }}"""
+    )
+    image = tab.array("viewer.drawing.pixels()").reshape(height, width, 4)[..., :3] / 255
+    counts = tab.array("viewer.drawing.allCounts()").reshape(height, width, 2)
+    return Frame(image, counts[..., 0], counts[..., 1])
+
+
+def engine_frame(model: Model, view: View, *, truncated: bool = True) -> np.ndarray:
+    """Our cpu engine's picture, (H, W, 3) RGB in [0, 1]."""
+    store = model.thresholds if truncated else None
+    with torch.no_grad():
+        inputs = RasterInputs(view, model.splat.splats(), planes=())
+        image = rasterize(inputs, store, engine="cpu").image
+    return image.clamp(0, 1).permute(1, 2, 0).numpy()
+
+
+def decibels(one: np.ndarray, other: np.ndarray) -> float:
+    """Peak signal-to-noise ratio of two pictures in [0, 1]."""
+    return float(-10 * np.log10(np.mean((one.astype(float) - other) ** 2)))

@@ -1,0 +1,104 @@
+"""fragprune view."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+from threading import Thread
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.viewer import server as serving
+
+
+@pytest.fixture
+def scene(tmp_path):
+    data, path, model = tiny.scene(tmp_path)
+    write_ply(path, model, torch.full((len(model),), 0.3))
+    return data, path
+
+
+def test_a_folder_with_cameras_and_photographs(scene, tmp_path):
+    data, path = scene
+    out = tmp_path / "page"
+    report = run_json("view", path, "--data", data, "--out", out)
+    held = json.loads((out / "scene.json").read_text())
+    assert [each["name"] for each in held["layers"]] == ["Truncated", "Untruncated"]
+    assert [each["name"] for each in held["cameras"]] == ["view00.png", "view08.png"]
+    assert all((out / each["photograph"]).exists() for each in held["cameras"])
+    assert held["start"]["position"] == held["cameras"][0]["position"]
+    assert sorted(report["files"]) == sorted(str(p) for p in out.rglob("*.*"))
+    assert report["truncated"] == [True]
+
+
+def test_two_models_are_two_sides(scene, tmp_path):
+    _, path = scene
+    other = tmp_path / "other.ply"
+    write_ply(other, tiny.random_model(20))
+    report = run_json("view", path, "--compare", other, "--out", tmp_path / "page")
+    held = json.loads((tmp_path / "page" / "scene.json").read_text())
+    assert [each["model"] for each in held["layers"]] == [0, 1]
+    assert [each["truncated"] for each in held["layers"]] == [True, False]
+    assert report["gaussians"] == [60, 20]
+
+
+def test_the_cameras_of_a_training_are_found(scene, tmp_path):
+    _, path = scene
+    place = tmp_path / "out" / "point_cloud" / "iteration_7"
+    place.mkdir(parents=True)
+    path.rename(place / "point_cloud.ply")
+    camera = {
+        **{"id": 0, "img_name": "a", "width": 20, "height": 10, "fx": 9.0, "fy": 9.0},
+        **{"position": [0, 0, -3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
+    }
+    (tmp_path / "out" / "cameras.json").write_text(json.dumps([camera]))
+    (tmp_path / "out" / "cfg_args").write_text("Namespace()")
+    assert run_json("view", tmp_path / "out", "--out", tmp_path / "page")["cameras"] == 1
+    held = json.loads((tmp_path / "page" / "scene.json").read_text())
+    assert held["start"]["position"] == [0, 0, -3]
+
+
+def test_one_page(scene, tmp_path):
+    run_json("view", scene[1], "--out", tmp_path / "page", "--single-file")
+    assert [each.name for each in (tmp_path / "page").iterdir()] == ["index.html"]
+
+
+def test_serves_until_ctrl_c(scene, monkeypatch):
+    opened = []
+
+    def serve(server):
+        def fetch():
+            with urllib.request.urlopen(serving.address(server)) as answer:
+                opened.append(answer.read())
+
+        reader = Thread(target=fetch)
+        reader.start()
+        server.handle_request()
+        reader.join()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(serving.ThreadingHTTPServer, "serve_forever", serve)
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    report = run_json("view", scene[1])
+    assert opened[0] == report["address"]
+    assert b"<title>" in opened[1]
+    report = run_json("view", scene[1], "--no-browser")
+    assert len(opened) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--data", "x", "--cameras", "y"), "--cameras"),
+        (("--single-file",), "--out"),
+        (("--port", "70000"), "--port"),
+    ],
+)
+def test_options_that_do_not_fit(scene, options, words):
+    result = run("view", scene[1], *options)
+    assert result.exit_code == 2
+    assert words in result.stderr

@@ -1,0 +1,72 @@
+"""The server gives its own files to its own machine, and nothing else to anybody."""
+
+from __future__ import annotations
+
+import http.client
+from threading import Thread
+
+import pytest
+
+from fragprune_plugins.errors import OutputError
+from fragprune_plugins.viewer import server as serving
+
+SITE = {"index.html": b"<p>here", "model-0.splats": bytes(range(7)), "photographs/0000.jpg": b"jpg"}
+
+
+@pytest.fixture
+def port():
+    server = serving.open_server(SITE)
+    thread = Thread(target=server.serve_forever)
+    thread.start()
+    yield server.server_port
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def ask(port, path, method="GET", host=None):
+    connection = http.client.HTTPConnection(serving.HOST, port, timeout=10)
+    connection.putrequest(method, path, skip_host=True)
+    connection.putheader("Host", host or f"localhost:{port}")
+    connection.endheaders()
+    answer = connection.getresponse()
+    held = answer.read()
+    connection.close()
+    return answer.status, answer.headers, held
+
+
+@pytest.mark.parametrize(
+    ("path", "name", "kind"),
+    [
+        ("/", "index.html", "text/html; charset=utf-8"),
+        ("/index.html?full", "index.html", "text/html; charset=utf-8"),
+        ("/model-0.splats", "model-0.splats", "application/octet-stream"),
+        ("/photographs/0000.jpg", "photographs/0000.jpg", "image/jpeg"),
+    ],
+)
+def test_its_files(port, path, name, kind):
+    status, headers, held = ask(port, path)
+    assert (status, held, headers["Content-Type"]) == (200, SITE[name], kind)
+    status, headers, held = ask(port, path, "HEAD")
+    assert (status, held, headers["Content-Length"]) == (200, b"", str(len(SITE[name])))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *("/../../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/photographs/"),
+        *("/photographs/../index.html", "/..%2findex.html", "/C:/x", "/index.html%00"),
+    ],
+)
+def test_no_other_file_exists(port, path):
+    assert ask(port, path)[0] == 404
+
+
+def test_the_page_of_another_site_reads_nothing(port):
+    assert ask(port, "/model-0.splats", host="example.com")[0] == 403
+    assert ask(port, "/model-0.splats", host=f"127.0.0.1:{port}")[0] == 200
+
+
+def test_a_port_that_is_taken(port):
+    with pytest.raises(OutputError, match=r"127\.0\.0\.1"):
+        serving.open_server(SITE, port)
