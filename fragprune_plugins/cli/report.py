@@ -23,7 +23,7 @@ from fragprune_plugins.cli.common import (
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.storage import models
 from fragprune_plugins.storage.reading import MEBIBYTE, Door, lies_in
-from fragprune_plugins.storage.records import DOOR
+from fragprune_plugins.storage.records import DOOR, portable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -102,7 +102,7 @@ def command(
             text=[
                 report_page.preformatted(_table(main)),
                 *([report_page.paragraph(_ONLY_CONTROLS)] if control else []),
-                report_page.paragraph(missing or (_SLIDERS if views else "")),
+                report_page.paragraph(portable(missing, folder) or (_SLIDERS if views else "")),
                 *(block for record in others for block in _block(record, files)),
             ],
             views=views,
@@ -211,6 +211,7 @@ def _facts(record: Record) -> str:
     keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
     facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
     facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
+    facts = portable(facts, record.path.parent)  # records of earlier versions have whole paths
     return "\n".join(f"{key:<16}{value}" for key, value in facts.items() if value is not None)
 
 
@@ -260,7 +261,11 @@ def _draw(
         if len(drawn.models) == 1:  # of joint learning, which leaves no model of before
             return [], learning, ""
         if data is None and not (len(allowed) == 2 and lies_in(scene.folder, inside)):
-            return [], learning, f"No views are shown: they need files outside of {inside}. {_HOW}"
+            return (
+                [],
+                learning,
+                f"No views are shown: they need files outside of the folder. {_HOW}",
+            )
         dataset = load_photographs(scene)
     except (DatasetError, ModelFileError, SidecarError) as error:
         if data is not None:  # the user asked for the views
