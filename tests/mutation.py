@@ -68,7 +68,8 @@ def _sample(modules: list[str], count: int, seed: int) -> list[str]:
     """Names of so many mutants of each module; of the same code and seed the same ones."""
     chosen: list[str] = []
     for names in map(sorted, _by_module(modules).values()):
-        chosen += random.Random(seed).sample(names, min(count or len(names), len(names)))
+        mixed = random.Random(seed).sample(names, len(names))  # a larger sample has the smaller one
+        chosen += mixed[: count or len(names)]
     return chosen
 
 
