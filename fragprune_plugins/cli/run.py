@@ -111,8 +111,8 @@ def command(
     a few thousand iterations, in which no Gaussian is added or removed. All parameters learn with
     the thresholds (but see --train). The host saves its model as usual, and the thresholds go
     beside it as a sidecar. In stage 2, Ctrl-C (exit code 130) and SIGTERM (143) save the thresholds
-    learned so far. A stage 2 that was killed starts again from the end of stage 1, with --stage
-    finetune; where it is finished already, that command says so and runs nothing.
+    learned so far. A stage 2 that was killed goes on with the same command and --stage finetune;
+    where it is finished already, that command says so and runs nothing.
 
     \b
     Examples:

@@ -37,7 +37,11 @@ def between_steps(session: SessionState, model: Any, state: ModelState) -> None:
             session.unfinished = None
             log.info("stage 2 goes on after step %d", state.steps)
     elif state.steps and session.kept.due(state.steps):
-        session.kept.save(*_state(session, model, state))
+        try:
+            session.kept.save(*_state(session, model, state))
+        except (TypeError, RuntimeError) as error:  # an optimizer of values that no file takes
+            log.warning("stage 2 cannot be kept for after a kill: %s", error)
+            session.kept = None
 
 
 def draw_nothing(engine: Engine, inputs: RasterInputs, _: int = 0) -> RasterOutputs:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import signal
@@ -103,3 +104,43 @@ def test_a_killed_stage_two_ends_as_one_that_was_not(trained, tmp_path):
     assert resumed.fragments_after == summary.fragments_after
     assert not (out / KEPT).exists()
     assert launch.run(words, FINETUNE).already_finished
+
+
+def test_with_other_settings_or_again_it_begins_anew(trained, tmp_path, caplog):
+    out, words = again(trained, tmp_path)
+    killed(words, 4)
+    kept = (out / KEPT).read_bytes()
+    other = replace(FINETUNE, settings=replace(SETTINGS, pressure=1e-3), checkpoint_every=1000.0)
+    with caplog.at_level(logging.INFO, "fragprune"):
+        assert launch.run(words, other).iterations == 12
+    assert "the unfinished stage 2 had other pressure, schedule; it begins anew" in caplog.messages
+    assert not (out / KEPT).exists()
+    (out / KEPT).write_bytes(kept)
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "fragprune"):
+        launch.run(words, replace(FINETUNE, again=True))
+    assert not [each for each in caplog.messages if "unfinished" in each]
+    assert not (out / KEPT).exists()
+
+
+def test_what_the_host_saved_before_the_kill_stays(trained, tmp_path):
+    more = ("--checkpoint_iterations", 23, 30, "--save_iterations", 24)
+    out, words = again(trained, tmp_path, *more)
+    killed(words, 8)
+    files = [out / "chkpnt23.pth", out / "point_cloud/iteration_24/point_cloud.ply"]
+    before = [(file.stat().st_mtime_ns, file.read_bytes()) for file in files]
+    launch.run(words, FINETUNE)
+    assert [(file.stat().st_mtime_ns, file.read_bytes()) for file in files] == before
+    assert (out / "chkpnt30.pth").exists()
+
+
+def test_without_a_wish_for_it_nothing_is_kept(trained, tmp_path, monkeypatch):
+    out, words = again(trained, tmp_path)
+    seen = []
+    report = stepping.report
+    monkeypatch.setattr(
+        stepping, "report", lambda *words: seen.append((out / KEPT).exists()) or report(*words)
+    )
+    launch.run(words, replace(FINETUNE, checkpoint_every=0))
+    assert seen == [False] * 12
+    assert not (out / KEPT).exists()
