@@ -39,7 +39,8 @@ def main() -> int:
     parser.add_argument("--table", action="store_true", help="run nothing, print what is known")
     words = parser.parse_args()
     if not words.table:
-        _mutmut(words.processes, [PROBE])  # makes all of them, where a module has changed
+        if _is_stale():
+            _mutmut(words.processes, [PROBE])  # makes all of them, where a module has changed
         wanted = _sample(words.modules, words.sample, words.seed)
         known = {} if words.again else _outcomes(words.modules)
         if todo := [name for name in wanted if known.get(name) in (None, "survived")]:
@@ -51,6 +52,13 @@ def _mutmut(processes: int, names: list[str]) -> None:
     """Let mutmut run mutants; one thread each, since threads do not survive a fork."""
     command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(processes), *names]
     subprocess.run(command, check=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+
+
+def _is_stale() -> bool:
+    """Whether there are no mutants yet, or a module has changed since they were made."""
+    made = [each.with_suffix("") for each in MADE.glob("fragprune_plugins/**/*.meta")]
+    changed = (each.relative_to(MADE).stat().st_mtime > each.stat().st_mtime for each in made)
+    return not made or any(changed)
 
 
 def _by_module(modules: list[str]) -> dict[str, dict[str, int | None]]:
