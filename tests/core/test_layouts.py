@@ -10,7 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from fragprune_plugins.datasets import blender, colmap
+from fragprune_plugins.datasets import colmap
+from fragprune_plugins.datasets import transforms as layout
 from fragprune_plugins.datasets.cameras import divided, load_cameras, load_scene_cameras
 from fragprune_plugins.errors import DatasetError
 
@@ -77,13 +78,13 @@ def transforms(**more):
 
 
 def read(tmp_path, **more):
-    return blender.read_transforms(written(tmp_path / "transforms.json", transforms(**more)))
+    return layout.read_transforms(written(tmp_path / "transforms.json", transforms(**more)))
 
 
 def test_a_transforms_file_gives_every_number(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "images/a.b.png").touch()
-    ((name, camera, image),) = read(tmp_path, fl_y=25.0, cx=19.0, cy=11.0)
+    ((name, camera, image, *_),) = read(tmp_path, fl_y=25.0, cx=19.0, cy=11.0)
     assert (name, image) == ("a.b", tmp_path / "images/a.b.png")
     assert (camera.width, camera.height, camera.fx, camera.fy) == (40, 20, 30.0, 25.0)
     assert (camera.cx, camera.cy) == (19.0, 11.0)
@@ -97,37 +98,48 @@ def test_a_transforms_file_gives_every_number(tmp_path):
 
 
 def test_what_a_transforms_file_leaves_out_is_square_centred_and_of_the_image(tmp_path):
-    ((_, camera, _),) = read(tmp_path)
+    ((_, camera, *_),) = read(tmp_path)
     assert (camera.fy, camera.cx, camera.cy) == (30.0, 20.0, 10.0)
     (tmp_path / "images").mkdir()
-    Image.new("RGB", (50, 30)).save(tmp_path / "images/a.b.png.png")
-    content = transforms(camera_angle_x=1.0)
+    Image.new("RGB", (50, 30)).save(tmp_path / "images/c.png")
+    frame = {"file_path": "images/c", "transform_matrix": pose()}
+    content = transforms(camera_angle_x=1.0, frames=[frame])
     del content["w"], content["fl_x"]
-    ((name, camera, image),) = blender.read_transforms(written(tmp_path / "t.json", content))
-    assert (name, image.name) == ("a.b.png", "a.b.png.png")  # named without its extension
+    ((name, camera, image, *_),) = layout.read_transforms(written(tmp_path / "t.json", content))
+    assert (name, image.name) == ("c", "c.png")  # named without its extension
     assert (camera.width, camera.height) == (50, 30)
     assert camera.fx == camera.fy == pytest.approx(50 / (2 * math.tan(0.5)))
 
 
 def test_three_rows_of_a_pose_are_enough(tmp_path):
     short = {"file_path": "a.png", "transform_matrix": pose()[:3]}
-    ((_, camera, _),) = read(tmp_path, frames=[short])
+    ((_, camera, *_),) = read(tmp_path, frames=[short])
     torch.testing.assert_close(camera.view().campos, torch.tensor(PLACE))
 
 
-@pytest.mark.parametrize("key", ["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"])
-def test_each_number_of_a_lens_is_refused_unless_it_is_zero(tmp_path, key):
-    assert len(read(tmp_path, **{key: 0.0})) == 1
-    with pytest.raises(DatasetError, match=rf"lens distortion \({key}\)") as caught:
-        read(tmp_path, **{key: -0.1})
-    assert caught.value.where == str(tmp_path / "transforms.json")
+@pytest.mark.parametrize("place", range(8))
+def test_each_number_of_a_lens_has_its_place_in_opencvs_order(tmp_path, place):
+    pytest.importorskip("cv2")
+    key = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")[place]
+    assert read(tmp_path, **{key: 0.0})[0].lens is None
+    (row,) = read(tmp_path, **{key: 0.001}, camera_model="OPENCV")
+    assert row.lens.coefficients == tuple(0.001 * (place == each) for each in range(8))
+    assert row.lens.fisheye is False
 
 
 @pytest.mark.parametrize("more", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
-def test_a_fisheye_is_refused(tmp_path, more):
-    with pytest.raises(DatasetError, match=r"lens distortion \(fisheye\)"):
-        read(tmp_path, **more)
-    assert len(read(tmp_path, camera_model="OPENCV", is_fisheye=False)) == 1
+def test_a_fisheye_has_four_numbers(tmp_path, more):
+    pytest.importorskip("cv2")
+    (row,) = read(tmp_path, k1=0.001, k2=0.002, k3=0.003, k4=0.004, p1=1.0, **more)
+    assert row.lens.coefficients == (0.001, 0.002, 0.003, 0.004)
+    assert row.lens.fisheye is True
+    assert read(tmp_path, camera_model="OPENCV", is_fisheye=False)[0].lens is None
+
+
+def test_a_camera_model_that_nobody_knows_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match="camera_model 'EQUIRECTANGULAR'") as caught:
+        read(tmp_path, camera_model="EQUIRECTANGULAR")
+    assert caught.value.where == "images/a.b.png"
 
 
 def test_a_frame_that_is_broken_is_named_by_its_number(tmp_path):
@@ -143,7 +155,7 @@ def test_a_blender_scene_is_its_two_files(tmp_path):
         (tmp_path / f"{part}.png").touch()
         frame = {"file_path": f"{part}.png", "transform_matrix": pose()}
         written(tmp_path / f"transforms_{part}.json", transforms(frames=[frame]))
-    train, test = blender.read(tmp_path)
+    train, test = layout.read(tmp_path)
     assert ([row[0] for row in train], [row[0] for row in test]) == (["train"], ["test"])
     cameras = load_scene_cameras(tmp_path, white_background=True)
     assert [[name for name, _ in part] for part in cameras] == [["train"], ["test"]]
@@ -168,8 +180,8 @@ def test_a_colmap_model_in_text_gives_every_number(tmp_path):
     (model / "images.txt").write_text("# comment\n" + "\n".join(lines) + "\n\n")
     (tmp_path / "images").mkdir()
     train, test = colmap.read(tmp_path)
-    ((first, plain, _),) = test
-    ((second, turned, path),) = train
+    ((first, plain, *_),) = test
+    ((second, turned, path, *_),) = train
     assert (first, second) == ("a.png", "sub/b c.png")  # of the sorted names the first is held out
     assert path == tmp_path / "images/b c.png"
     assert (turned.width, turned.height, turned.fx, turned.fy) == (40, 20, 30.0, 25.0)
@@ -212,7 +224,7 @@ def test_a_quaternion_that_is_no_rotation_is_refused(quaternion):
         colmap._rotation(quaternion)
 
 
-CODES = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
+CODES = {7: 5, 10: 12}
 
 
 def binary(tmp_path, cameras, images):
@@ -244,8 +256,32 @@ def test_a_colmap_model_in_binary_gives_every_number(tmp_path):
     assert train[0][1].translation.tolist() == PLACE
 
 
-@pytest.mark.parametrize("code", [2, 3, 4, 5, 6, 7, 8, 9, 10, 11, -1])
-def test_a_camera_with_a_lens_is_refused_by_the_name_of_its_model(tmp_path, code):
+BENT = {  # COLMAP's parameters after the principal point, in OpenCV's order of eight or four
+    2: (1, (0.1,), (0.1, 0, 0, 0, 0, 0, 0, 0)),
+    3: (1, (0.1, 0.2), (0.1, 0.2, 0, 0, 0, 0, 0, 0)),
+    4: (2, (0.1, 0.2, 0.3, 0.4), (0.1, 0.2, 0.3, 0.4, 0, 0, 0, 0)),
+    5: (2, (0.1, 0.2, 0.3, 0.4), (0.1, 0.2, 0.3, 0.4)),
+    6: (2, tuple(each / 1000 for each in range(1, 9)), tuple(each / 1000 for each in range(1, 9))),
+    8: (1, (0.1,), (0.1, 0, 0, 0)),
+    9: (1, (0.1, 0.2), (0.1, 0.2, 0, 0)),
+}
+
+
+@pytest.mark.parametrize("code", BENT)
+def test_the_numbers_of_a_lens_are_those_that_colmap_writes(tmp_path, code):
+    pytest.importorskip("cv2")
+    focals, values, expected = BENT[code]
+    cameras = [camera(7, code, *(30.0, 25.0)[:focals], 19.0, 11.0, *values)]
+    _, (row,) = binary(tmp_path, cameras, [image()])
+    lens = row.lens
+    assert (lens.fx, lens.fy) == (30.0, 25.0 if focals == 2 else 30.0)
+    assert (lens.cx, lens.cy, lens.width, lens.height) == (19.0, 11.0, 40, 20)
+    assert lens.coefficients == expected
+    assert lens.fisheye is (len(expected) == 4)
+
+
+@pytest.mark.parametrize("code", [7, 10, 11, -1])
+def test_a_lens_that_nothing_can_straighten_is_refused_by_its_name(tmp_path, code):
     cameras = [camera(7, code, *[1.0] * CODES.get(code, 3))]
     name = colmap._MODELS[code][0] if code in CODES else f"camera model number {code}"
     with pytest.raises(DatasetError, match=name):
