@@ -314,6 +314,14 @@ def test_a_model_is_found_in_either_folder_and_in_either_format(tmp_path):
         assert colmap.find_model(tmp_path) == tmp_path / folder
 
 
+def test_a_line_that_is_no_camera_is_named_by_its_number(tmp_path):
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse/images.txt").touch()
+    (tmp_path / "sparse/cameras.txt").write_text("# comment\n7 PINHOLE 40 20 30 25 19 none\n")
+    with pytest.raises(DatasetError, match="at line 2"):
+        colmap.read(tmp_path)
+
+
 def test_binary_files_count_more_than_text(tmp_path):
     binary(tmp_path, [camera()], [image(b"binary.png")])
     (tmp_path / "sparse/0/cameras.txt").write_text("7 PINHOLE 40 20 30 25 19 11\n")

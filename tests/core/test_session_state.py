@@ -114,6 +114,9 @@ def test_groups_are_those_of_all_optimizers_that_live():
     session.optimizers[model] += [weakref.ref(other)]
     assert [name for name, _ in session.groups(model)] == ["xyz", "o", "sky"]
     assert session.groups(model)[2][1] is other.param_groups[0]
+    session.adapter.group_name = lambda owner, group: owner is model
+    assert {named for named, _ in session.groups(model)} == {True}
+    del session.adapter.group_name
     del other
     gc.collect()
     assert [name for name, _ in session.groups(model)] == ["xyz", "o"]
