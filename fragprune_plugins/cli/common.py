@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -69,7 +70,7 @@ class ModelFile(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """The file; of an output folder that of the highest iteration, which is named on stderr."""
         path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
-        if not path.is_dir():
+        if not os.path.isdir(path):  # also of too long a name
             return path
         from fragprune_plugins.hosts.graphdeco.output import newest_model
 

@@ -22,7 +22,7 @@ from fragprune_plugins.cli.common import (
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.storage import models
 from fragprune_plugins.storage.reading import MEBIBYTE, Door, lies_in
-from fragprune_plugins.storage.records import DOOR
+from fragprune_plugins.storage.records import DOOR, portable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -103,7 +103,7 @@ def command(
             parts=[
                 _table(main),
                 page.paragraph(_ONLY_CONTROLS if control else ""),
-                page.paragraph(missing),
+                page.paragraph(portable(missing, folder)),
                 *(report_page.views(drawn, source) if drawn else ()),
                 *(block for record in others for block in _block(record, files)),
                 *(page.heading(name) + page.wide(source(file), name) for name, file in more),
@@ -210,6 +210,7 @@ def _facts(record: Record) -> list[list[str]]:
     keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
     facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
     facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
+    facts = portable(facts, record.path.parent)  # records of earlier versions have whole paths
     return [
         [key, f"{value:.4g}" if isinstance(value, float) else str(value)]
         for key, value in facts.items()
@@ -266,7 +267,7 @@ def _draw(
             return (
                 None,
                 learning,
-                f"No views are shown: they need files outside of {inside}. {_HOW}",
+                f"No views are shown: they need files outside of the folder. {_HOW}",
             )
         dataset = load_photographs(scene)
     except (DatasetError, ModelFileError, SidecarError) as error:

@@ -78,6 +78,16 @@ _CONTROL = (
 @click.option(
     "--again", is_flag=True, help="finetune: learn again, though the result is there already."
 )
+@click.option(
+    "--checkpoint-every",
+    "every",
+    type=click.FloatRange(min=0),
+    default=300.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Keep an unfinished stage 2 in stage2.fragprune-unfinished in the output folder; "
+    "0 keeps none.",
+)
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -93,6 +103,7 @@ def command(
     threads: int | None,
     evaluate: bool,
     again: bool,
+    every: float,
 ) -> Report:
     """Train with a host's own command, then learn truncation thresholds.
 
@@ -100,8 +111,8 @@ def command(
     a few thousand iterations, in which no Gaussian is added or removed. All parameters learn with
     the thresholds (but see --train). The host saves its model as usual, and the thresholds go
     beside it as a sidecar. In stage 2, Ctrl-C (exit code 130) and SIGTERM (143) save the thresholds
-    learned so far. A stage 2 that was killed starts again from the end of stage 1, with --stage
-    finetune; where it is finished already, that command says so and runs nothing.
+    learned so far. A stage 2 that was killed goes on with the same command and --stage finetune;
+    where it is finished already, that command says so and runs nothing.
 
     \b
     Examples:
@@ -150,6 +161,7 @@ def command(
         engine=engine,
         device=device,
         again=again,
+        checkpoint_every=every,
     )
     # A host prints to stdout; with --json, stdout gets only our object.
     to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None

@@ -129,14 +129,14 @@ def configuration(
         "thresholds": _digest(known.values()),
         "photographs": _digest(each for shot in shots for each in _of(shot)),
         "engine": engine,
-        "plugins": _deciding(),
+        "plugins": deciding(),
         "schedule": (schedule or schedule_for(settings)).as_dict(),
         "device": model.xyz.device.type,
         **settings.as_dict(),
     }
 
 
-def _deciding() -> list[str]:
+def deciding() -> list[str]:
     """Names of the plugins that may decide about thresholds or about the schedule."""
     plugins = installed()
     hooks = (hookspecs.fragprune_truncate, hookspecs.fragprune_create_schedule)

@@ -8,6 +8,7 @@ for more iterations, and thresholds learn.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 import sys
 import tempfile
@@ -17,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from fragprune_plugins.constants import VERSION
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import (
     HostFailed,
@@ -37,6 +39,8 @@ from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.storage import checkpoints
+from fragprune_plugins.storage.atomic import digest
 
 log = logging.getLogger("fragprune")
 
@@ -60,7 +64,8 @@ class RunOptions:
         device: the host's device. "cpu" runs a CUDA-only host without a GPU, "cuda" and "cuda:N"
             require a GPU, "auto" takes a GPU if torch sees one.
         again: False leaves a finished stage 2 alone: if "finetune" finds the result of the same
-            start, settings and host, it runs nothing.
+            start, settings and host, it runs nothing. An unfinished one goes on.
+        checkpoint_every: seconds after which an unfinished stage 2 is kept again; 0 keeps none.
     """
 
     adapter: str | None = None
@@ -71,6 +76,7 @@ class RunOptions:
     engine: str = "auto"
     device: str = "auto"
     again: bool = True
+    checkpoint_every: float = 300.0
 
 
 @dataclass(frozen=True)
@@ -241,8 +247,8 @@ class _Runner:
         self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
         total = self.host.iterations
         log.info("stage 1: the host's own training, %d iterations", total)
-        checkpoints = self.host.checkpoints(total)
-        arguments = self.host.with_flags(self.scratch, save_checkpoints=checkpoints)
+        written = self.host.checkpoints(total)
+        arguments = self.host.with_flags(self.scratch, save_checkpoints=written)
         files = starting.files(self.adapter, self.output)
         earlier = {path: path.stat().st_mtime_ns for _, path in files}
         self._execute(arguments, learn=False)
@@ -292,12 +298,55 @@ class _Runner:
                 self.around, self.output = self.output, self.output / own
             if self.output is not None and str(self.output) != self.host.flags.output:
                 extra["output"] = str(self.output)
+            going_on = self._going_on(start)
             if not self.options.again and self._is_finished(start, self._model(total)):
                 self.after, self.already_finished = self._model(total), True
+                if going_on:
+                    going_on["kept"].clear()  # the run before ended between its result and this
                 return
+            if kept := going_on.get("kept"):
+                done = first + (going_on["unfinished"] or ({}, {"step": 0}))[1]["step"]
+                if any(each <= done for each in self.host.flags.save_checkpoints or ()):
+                    later = [each for each in self.host.checkpoints(total) if each > done]
+                    extra["save_checkpoints"] = later  # earlier ones were written by the run before
             arguments = self.host.saving(self.scratch, total, **extra)
-            self._execute(arguments, learn=True, start=first)
+            self._execute(arguments, learn=True, start=first, **going_on)
+            if kept:
+                kept.clear()
             self.after = self._model(total)
+
+    def _going_on(self, start: Start) -> dict[str, Any]:
+        """Options of a session that keeps an unfinished stage 2, and goes on from a kept one."""
+        from fragprune_plugins.finetuning.resuming import SUFFIX, Checkpoints, deciding, differences
+        from fragprune_plugins.plugins.hooks import schedule_for
+
+        options, seconds = self.options, self.options.checkpoint_every
+        if self.output is None or not seconds:
+            return {}
+        asked = {
+            "version": VERSION,
+            "start": digest(start.path),
+            "adapter": [self.adapter.name, self.repo.commit],
+            "command": hashlib.sha256("\0".join(self.host.arguments).encode()).hexdigest(),
+            "engine": [options.engine, self.device],
+            "plugins": deciding(),
+            "schedule": schedule_for(options.settings, self.plugins).as_dict(),
+            **options.settings.as_dict(),
+        }
+        kept = Checkpoints(self.output / f"stage2{SUFFIX}", seconds, tell=log.warning)
+        unfinished = None
+        if not options.again and kept.path.exists():
+            tensors, values = checkpoints.load(kept.path)
+            if differ := ", ".join(differences(values.get("configuration", {}), asked)):
+                log.warning("the unfinished stage 2 had other %s; it begins anew", differ)
+            else:
+                unfinished = tensors, values
+                log.info(
+                    "an unfinished stage 2 goes on: %d steps of the host are repeated without "
+                    "drawing; what the host prints of them does not count",
+                    values["step"],
+                )
+        return {"kept": kept, "asked": asked, "unfinished": unfinished}
 
     def _execute(
         self,

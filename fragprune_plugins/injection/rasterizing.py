@@ -16,6 +16,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.adapter import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
+from fragprune_plugins.injection.resuming import draw_nothing
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.injection.stepping import (
@@ -59,12 +60,18 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
         begin_step(session, model, state)
     again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
     measured = session.settings.target_speedup is not None  # a kept view keeps its model alive
-    learns = state is not None and state.stage is not None and state.stage.plan is not None
-    if measured and state is not None and learns and torch.is_grad_enabled():
-        state.views[view] = again
+    if state is not None and learns(state) and torch.is_grad_enabled():
+        state.seen[view] = None
+        if measured:
+            state.views[view] = again
     if state is not None and state.stage is not None:
         state.stage.picture = str(getattr(call.first, "image_name", ""))
     return again()
+
+
+def learns(state: ModelState) -> bool:
+    """Whether the model is in stage 2, or on its way back to a step of it."""
+    return state.stage is not None and (state.stage.plan is not None or state.replaying)
 
 
 def warn_unknown(session: SessionState, seam: Seam) -> None:
@@ -109,6 +116,9 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
             f"{expected} of {len(state.store)}, one per drawn threshold",
             "Report this with the host's commit.",
         )
+    if state.replaying:
+        inputs, engine = unpack(session, drawn)
+        return session.dialect.answer(drawn, inputs, partial(draw_nothing, engine))
     stage = state.stage
     presses = stage is not None and stage.learning and session.settings.portable
     if state.store.neutral and not presses:
@@ -165,7 +175,7 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
     state = session.last_state
     if state is not None and call.instance.numel() == 1:
         state.begun = False
-        if state.stage is not None:
+        if state.stage is not None and not state.replaying:
             state.stage.lost(call.instance)
     return call.run()
 

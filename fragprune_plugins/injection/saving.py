@@ -30,7 +30,10 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
     Values that are not finite stop both.
     """
     check_learned(session, call.model)
-    if call.model not in session.models or call.first is None:
+    state = session.models.get(call.model)
+    if state is not None and state.replaying:  # the run before saved it
+        return None
+    if state is None or call.first is None:
         return call.run()
     path, given = Path(call.how(call.first)), Path(call.first)
     with staging(path) as folder:

@@ -377,13 +377,18 @@ class Stage2:
             skipped=self.skipped,
         )
 
-    def state_dict(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def state_dict(
+        self, order: Iterable[Hashable] | None = None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and plain values from which ``load_state_dict`` goes on, between two steps.
 
         They hold the thresholds, but nothing that the driver owns.
+
+        Args:
+            order: all views, in the order that they have at every start; that of ``views`` if None.
         """
         self.close()
-        number = {view: index for index, view in enumerate(self._again)}
+        number = {view: index for index, view in enumerate(self._ordered(order))}
         tensors = self.store.state_dict()
         plain: dict[str, Any] = {"store": [tensors.pop("adam_step"), tensors.pop("steps")]}
         for name, figures in (("before", self._before), ("after", self._after)):
@@ -395,7 +400,15 @@ class Stage2:
         plain |= {"expected": self._views.expected, "pressure": numbers_of(self.pressure)}
         return tensors, plain
 
-    def load_state_dict(self, tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> None:
+    def _ordered(self, order: Iterable[Hashable] | None) -> list[Hashable]:
+        return list(self._again if order is None else order)
+
+    def load_state_dict(
+        self,
+        tensors: Mapping[str, Tensor],
+        plain: Mapping[str, Any],
+        order: Iterable[Hashable] | None = None,
+    ) -> None:
         """Go on where ``state_dict`` was called, with the same settings and views, to the bit.
 
         Raises:
@@ -403,7 +416,7 @@ class Stage2:
         """
         adam_step, steps = plain["store"]
         self.store.load_state_dict({**tensors, "adam_step": adam_step, "steps": steps})
-        views = list(self._again)
+        views = self._ordered(order)
         for name, figures in (("before", self._before), ("after", self._after)):
             for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):
                 figures[views[view], part] = figure

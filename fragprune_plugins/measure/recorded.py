@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.datasets.photographs import Photographs
-from fragprune_plugins.storage.records import DOOR, Record
+from fragprune_plugins.storage.records import DOOR, Record, located
 
 _NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}
 """Fields of ``RasterInputs`` that a record may set to a number."""
@@ -42,7 +42,8 @@ def recorded(record: Record) -> Recorded | None:
         if values is None:
             return None
         reading.place = "data.photographs"
-        models = tuple(map(Path, values["models"]))
+        folder = record.path.parent
+        models = tuple(located(each, folder) for each in values["models"])
         if not 1 <= len(models) <= 2:
             raise ValueError(f"{len(models)} models")
         drawing = dict(values["drawing"])
@@ -51,4 +52,5 @@ def recorded(record: Record) -> Recorded | None:
             if not (number if name in _NUMBERS else name == "compensation"):
                 raise ValueError(f"{name} is {value!r}")
         filtered = bool(values["filtered"])
-        return Recorded(Photographs.from_dict(values), models, filtered, drawing)
+        scene = values | {"folder": located(values["folder"], folder)}
+        return Recorded(Photographs.from_dict(scene), models, filtered, drawing)

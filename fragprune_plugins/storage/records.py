@@ -43,11 +43,13 @@ class Record:
 def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
     """Write a record beside a result; it replaces an earlier record.
 
+    Paths in it become relative to its folder, see ``portable``: a record may be given away.
+
     Raises:
         OutputError: the file cannot be written.
     """
     target = path_beside(model)
-    content = {"format": FORMAT, "command": command, "data": data}
+    content = {"format": FORMAT, "command": command, "data": portable(data, target.parent)}
     with replacing(target, durable=True) as temporary:
         temporary.write_text(json.dumps(strict(content), indent=1) + "\n", encoding="utf-8")
     return target
@@ -94,6 +96,41 @@ def files(folder: Path, *, below: bool = False) -> list[Path]:
     return sorted(
         (each for each in inside if os.path.exists(each)), key=lambda each: each.stat().st_mtime
     )
+
+
+def portable(value: Any, folder: Path) -> Any:
+    """A value whose texts name no folder of this machine, as far as paths can be recognised.
+
+    A text that is an absolute path becomes relative to ``folder``, or to ``~`` if only the path is
+    in the home folder; ``located`` finds it again. Inside other texts, ``folder`` is left out and
+    the home folder becomes ``~``.
+    """
+    if isinstance(value, dict):
+        return {key: portable(item, folder) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [portable(item, folder) for item in value]
+    if not isinstance(value, str):
+        return value
+    homes, (near, base) = _spellings(Path.home()), _spellings(folder)
+    if os.path.isabs(value):
+        path = Path(os.path.normpath(value))
+        for home in homes:
+            if path.is_relative_to(home) and not Path(base).is_relative_to(home):
+                return str("~" / path.relative_to(home))
+        value = os.path.relpath(path, base)
+    for known, short in ((near, ""), (base, ""), *((home, "~" + os.sep) for home in homes)):
+        value = value.replace(known + os.sep, short)
+    return value
+
+
+def located(text: str, folder: Path) -> Path:
+    """The path that ``portable`` made a text of, from the folder of the record that has it."""
+    return Path(os.path.normpath(Path(os.path.realpath(folder)) / Path(text).expanduser()))
+
+
+def _spellings(path: str | Path) -> list[str]:
+    """A folder's absolute path, as it is named and with its links followed."""
+    return [os.path.abspath(path), os.path.realpath(path)]
 
 
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:

@@ -228,9 +228,11 @@ TRANSFORMS: dict[str, dict[str, Any]] = {
     "frames of numbers": {"frames": [3]},
     "frames missing": {"frames": None},
     "frames empty": {"frames": []},
-    "k1": {"k1": 0.1},
-    "k5": {"k5": 0.1},
-    "fisheye": {"camera_model": "OPENCV_FISHEYE"},
+    "k1 vast": {"k1": 1e9},
+    "k5 NaN": {"k5": NAN},
+    "p2 a list": {"p2": [0.1]},
+    "fisheye, k4 infinite": {"camera_model": "OPENCV_FISHEYE", "k4": INF},
+    "a lens of no name": {"camera_model": "EQUIRECTANGULAR"},
 }
 
 MATRICES: dict[str, Any] = {

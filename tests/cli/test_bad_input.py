@@ -236,3 +236,13 @@ def test_what_the_machine_refuses_is_stated(scene, monkeypatch, error, code):
 
     monkeypatch.setattr("fragprune_plugins.measure.measure", refuse)
     refused(("profile", path, "--data", data), code, "")
+
+
+@pytest.mark.parametrize("command", ["render", "export", "profile", "compare", "finetune"])
+def test_a_name_that_no_file_can_have_is_no_model(scene, tmp_path, command):
+    names = ["x" * 300] * (2 if command == "compare" else 1)
+    more = [] if command == "export" else ["--data", scene[0]]
+    more += ["--iters", 1] if command == "finetune" else []
+    result = run(command, *names, *more, "--out", tmp_path / "new.ply")
+    assert result.exit_code == 1
+    assert "cannot be opened (File name too long)" in result.stderr

@@ -29,7 +29,8 @@ def finetuned(tmp_path_factory):
 @pytest.fixture
 def folder(finetuned, tmp_path):
     out, data, figures = finetuned
-    return shutil.copytree(out, tmp_path / "out"), data, figures
+    whole = shutil.copytree(out.parent, tmp_path / "all")  # a record names files beside its folder
+    return whole / "out", whole / data.relative_to(out.parent), figures
 
 
 def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
@@ -89,6 +90,64 @@ def test_without_the_photographs_there_are_curves_and_the_reason(folder, tmp_pat
     refused = run("report", out, "--data", tmp_path / "nowhere", "--json")
     assert refused.exit_code == 1
     assert json.loads(refused.stdout)["error"]["code"] == "dataset"
+
+
+def test_what_a_fine_tuning_leaves_names_no_folder_of_the_machine(finetuned, tmp_path):
+    out, data, _ = finetuned
+    whole = shutil.copytree(out.parent, tmp_path / "elsewhere")
+    page = whole / "page.html"
+    run_json("report", whole / "out", "--data", whole / "data", "--out", page)
+    run_json("compare", *[whole / "out/pruned.ply"] * 2, "--out", whole / "pictures")
+    for file in (each for each in whole.rglob("*") if each.is_file()):
+        content = file.read_bytes()
+        assert str(data.parent).encode() not in content, file
+        assert str(tmp_path).encode() not in content, file
+
+
+def test_models_and_photographs_are_found_where_the_whole_tree_was_moved_to(finetuned, tmp_path):
+    out, _, figures = finetuned
+    whole = shutil.copytree(out.parent, tmp_path / "elsewhere")
+    same = run_json("compare", whole / "model.ply", whole / "out/pruned.ply")
+    assert same["scene"]["folder"] == str(whole / "data")
+    assert same["b"]["psnr"] == pytest.approx(figures["after"]["psnr"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "written"),
+    [
+        ("{home}/out/a.ply", "a.ply"),
+        ("{home}/scene", "../scene"),
+        ("{tmp}/data/scene", "../../../data/scene"),
+        ("Wrote {home}/out/a.ply.", "Wrote a.ply."),
+        ("{home}/x: no such file; {home}/y", None),
+        ("out/a.ply", "out/a.ply"),
+    ],
+)
+def test_a_record_in_the_home_folder_names_neither_it_nor_a_user(
+    tmp_path, monkeypatch, text, written
+):
+    home = tmp_path / "home/jo"
+    (home / "out").mkdir(parents=True)
+    monkeypatch.setenv("HOME", str(home))
+    text = text.format(home=home, tmp=tmp_path)
+    data = {"model": text, "files": [text], "nothing": None, "psnr": 1.5}
+    path = records.leave(home / "out/a.ply", "run", data)
+    (record,) = records.find(path.parent)
+    assert "jo" not in path.read_text()
+    assert record.data["files"] == [record.data["model"]]
+    assert (record.data["psnr"], record.data["nothing"]) == (1.5, None)
+    assert written in (record.data["model"], None)
+    if text.startswith("/") and " " not in text:
+        assert str(records.located(record.data["model"], path.parent)) == text
+
+
+def test_a_record_elsewhere_finds_the_home_folder_of_whoever_reads_it(tmp_path, monkeypatch):
+    (tmp_path / "link").symlink_to(tmp_path / "home")
+    monkeypatch.setenv("HOME", str(tmp_path / "link/jo"))
+    for spelled in ("link/jo", "home/jo"):
+        assert records.portable(str(tmp_path / spelled / "scene"), tmp_path / "out") == "~/scene"
+    monkeypatch.setenv("HOME", str(tmp_path / "home/al"))
+    assert records.located("~/scene", tmp_path / "out") == tmp_path / "home/al/scene"
 
 
 def test_a_loss_that_is_not_known_leaves_a_gap_in_the_curves(folder, tmp_path):

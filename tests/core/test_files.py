@@ -1,12 +1,24 @@
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 
 import pytest
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.storage.atomic import digest, replacing, writable_folder
+from fragprune_plugins.storage import atomic
+from fragprune_plugins.storage.atomic import (
+    all_in_flight,
+    digest,
+    in_flight,
+    locked,
+    put,
+    rename,
+    replacing,
+    staging,
+    writable_folder,
+)
 
 
 def test_the_new_file_appears_whole_under_its_name(tmp_path):
@@ -59,6 +71,113 @@ def test_a_folder_without_permission_is_stated(tmp_path):
             pass
     finally:
         tmp_path.chmod(0o700)
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077])
+@pytest.mark.parametrize("way", ["put", "durable", "plain"])
+def test_permissions_follow_the_users_mask_and_the_mask_stays(tmp_path, mask, way):
+    before = os.umask(mask)
+    try:
+        if way == "put":
+            (tmp_path / "new").touch(0o600)
+            put(tmp_path / "new", tmp_path / "a")
+        else:
+            with replacing(tmp_path / "a", durable=way == "durable") as new:
+                new.touch(0o600)
+        assert os.umask(mask) == mask
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+def test_what_is_on_its_way_lies_beside_the_file_under_a_name_of_its_own(tmp_path):
+    one, other = in_flight(tmp_path / "a.ply", "new"), in_flight(tmp_path / "b.ply", "new")
+    assert one.parent == other.parent == tmp_path
+    assert one.name != other.name
+    key = hashlib.sha256(b"a.ply").hexdigest()[:12]
+    assert one.name == f".fragprune-{key}-new"
+    assert in_flight(tmp_path / "A.PLY", "new") == one  # some systems take them for one
+    in_flight(tmp_path / "\udcff", "new")  # a name that is no text
+    for name in ("for-2", "for-1", "lock"):
+        in_flight(tmp_path / "a.ply", name).touch()
+    in_flight(tmp_path / "b.ply", "for-3").touch()
+    found = [each.name[-5:] for each in all_in_flight(tmp_path / "a.ply", "for-*")]
+    assert found == ["for-1", "for-2"]
+    assert all_in_flight(tmp_path / "none" / "a.ply", "*") == []
+
+
+def test_a_lock_is_for_one_at_a_time_and_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(atomic, "WAIT", 0.0)
+    path = tmp_path / "a.txt"
+    with locked(path) as alone:
+        assert alone
+        with locked(path, what="another"), locked(tmp_path / "b.txt"):
+            pass
+        with pytest.raises(OutputError, match="another process") as caught, locked(path):
+            pass
+        assert caught.value.where == str(path)
+    with locked(path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_whose_file_was_removed_meanwhile_is_no_lock(tmp_path):
+    with open(tmp_path / "lock", "w") as file:
+        assert atomic._is_named(file.fileno(), tmp_path / "lock") is True
+        (tmp_path / "other").touch()
+        assert atomic._is_named(file.fileno(), tmp_path / "other") is False
+        (tmp_path / "lock").unlink()
+        assert atomic._is_named(file.fileno(), tmp_path / "lock") is False
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EIO])
+def test_where_there_are_no_locks_writing_goes_on_without(tmp_path, monkeypatch, number):
+    def flock(*_):
+        raise OSError(number, "no")
+
+    monkeypatch.setattr(atomic.fcntl, "flock", flock)
+    left = in_flight(tmp_path / "a.txt", "new-left")
+    left.mkdir()
+    if number == errno.EIO:
+        with pytest.raises(OSError, match="no"), locked(tmp_path / "a.txt"):
+            pass
+        return
+    with locked(tmp_path / "a.txt") as alone:
+        assert alone is False
+    with replacing(tmp_path / "a.txt") as new:
+        new.write_text("whole")
+    assert left.exists()  # of whom, nobody can tell
+    assert sorted(tmp_path.iterdir()) == [left, tmp_path / "a.txt"]
+
+
+def test_a_folder_that_a_dead_process_left_is_removed_by_the_next(tmp_path):
+    left = in_flight(tmp_path / "a.txt", "new-left")
+    left.mkdir()
+    (left / "half").write_text("x")
+    with staging(tmp_path / "a.txt") as folder:
+        assert folder.parent == tmp_path
+        assert list(folder.iterdir()) == []
+        assert not left.exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rename_replaces_what_was_there(tmp_path):
+    (tmp_path / "old").write_text("content")
+    (tmp_path / "new").write_text("before")
+    rename(tmp_path / "old", tmp_path / "new")
+    assert (tmp_path / "new").read_text() == "content"
+    assert list(tmp_path.iterdir()) == [tmp_path / "new"]
+
+
+def test_a_writable_folder_is_made_and_left_empty(tmp_path):
+    for _ in range(2):
+        assert writable_folder(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
+    assert list((tmp_path / "a" / "b").iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError) as caught:
+        writable_folder(tmp_path / "file" / "x")
+    assert caught.value.where == str(tmp_path / "file" / "x")
+    assert caught.value.found == "cannot be written (Not a directory)"
 
 
 def test_digest_is_sha256(tmp_path):

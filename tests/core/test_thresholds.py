@@ -361,3 +361,10 @@ def test_a_limit_of_alpha_is_the_same_alpha_at_every_rim():
     for none in (0.0, 1.0, math.nan):
         with pytest.raises(InputError):
             ThresholdStore.from_alpha(none, opacities)
+
+
+def test_every_step_is_counted():
+    store = ThresholdStore(2)
+    for _ in range(3):
+        store.step()
+    assert store.steps == 3

@@ -1,0 +1,96 @@
+"""A session's state over a host that is three lines long, to call its handlers by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+
+from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
+from fragprune_plugins.injection.state import ModelState, SessionState
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+
+
+class Model:
+    """Rows of one number each, in one optimizer."""
+
+    def __init__(self, count: int) -> None:
+        self.xyz = torch.nn.Parameter(torch.arange(count * 3.0).reshape(count, 3))
+        self.opacity = torch.nn.Parameter(torch.arange(float(count))[:, None])
+        groups = [{"params": [self.xyz], "name": "xyz"}, {"params": [self.opacity], "name": "o"}]
+        self.optimizer = torch.optim.SGD(groups, lr=1.0)
+
+    def rows(self) -> dict[str, torch.Tensor]:
+        return {"xyz": self.xyz.detach(), "o": self.opacity.detach()}
+
+
+class Adapter:
+    """Describes it."""
+
+    name, inherited = "three-lines", ("xyz", "o")
+
+    def dialect(self, repo):
+        return f"dialect of {repo.root}"
+
+    def rows(self, model):
+        return len(model.xyz)
+
+    def means(self, model):
+        return model.xyz
+
+    def model_of(self, call):
+        return call.instance
+
+    def group_name(self, model, group):
+        return group["name"]
+
+
+class Plugins:
+    """Notes what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, dict]] = []
+
+    def tell(self, hook, **about) -> None:
+        self.told.append((hook.__name__, about))
+
+
+def state(*, learn=True, **options) -> SessionState:
+    repo = SimpleNamespace(root=Path("host"), commit="abc")
+    options = {"schedule": SimpleNamespace(), "settings": Settings()} | options
+    return SessionState(Adapter(), repo, Plugins(), learn=learn, **options)
+
+
+def follow(session: SessionState, count: int = 6) -> tuple[Model, ModelState]:
+    """A model that the session knows, each row with a threshold and moments of its own."""
+    model = Model(count)
+    store = ThresholdStore(count)
+    numbers = torch.arange(float(count))
+    store.load_state_dict(
+        {
+            "logits": -3 + numbers / 8,
+            "exp_avg": 1 + numbers,
+            "exp_avg_sq": 1 + numbers,
+            "adam_step": 2.0,
+            "steps": 2,
+        }
+    )
+    import weakref
+
+    known = session.models[model] = ModelState(store)
+    session.optimizers[model] = [weakref.ref(model.optimizer)]
+    return model, known
+
+
+def call(model, role, function, *args, how=None) -> SeamCall:
+    """A call of a host's function, with its first parameter as what the seam needs."""
+    import inspect
+
+    needs = tuple(inspect.signature(function).parameters)
+    how = how or (lambda call: None)
+    return SeamCall(Seam(role, "host", "f", needs, how=how), function, model, args, {}, model=model)
+
+
+__all__ = ["Model", "Role", "call", "follow", "state"]

@@ -1,0 +1,265 @@
+"""What a session does with a host's rows, handler by handler. Whole hosts: tests/conformance."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+import torch
+from core.sessions import Model, Role, call, follow, state
+
+from fragprune_plugins.constants import NEUTRAL_LOGIT
+from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.hosts.seams import RowTrace
+from fragprune_plugins.injection.aligning import OF_MODELS
+
+LOGITS = -3 + torch.arange(6.0) / 8
+
+
+@pytest.fixture
+def session():
+    return state(freeze=False)
+
+
+@pytest.fixture
+def frozen():
+    return state(freeze=True)
+
+
+def told(session):
+    return [
+        (about["change"].operation, about["change"].before, about["change"].after)
+        for name, about in session.plugins.told
+        if name == "fragprune_population_changed"
+    ]
+
+
+def append(session, model, rows, expected="appended"):
+    """The host appends rows of the model by their numbers."""
+    tensors = {name: each[rows].clone() for name, each in model.rows().items()}
+    result = OF_MODELS[Role.APPEND](
+        session, call(model, Role.APPEND, lambda tensors: "appended", tensors)
+    )
+    assert result == expected
+
+
+def parents(session, model, rows, body):
+    """Inside a call that chooses parents, ``body`` runs."""
+    seam = call(model, Role.PARENTS, lambda: body() or "chosen", how=lambda _: rows)
+    return OF_MODELS[Role.PARENTS](session, seam)
+
+
+def test_rows_without_parents_are_neutral(session):
+    model, known = follow(session)
+    append(session, model, torch.tensor([1, 2]))
+    assert torch.equal(known.store.logits[:6], LOGITS)
+    assert known.store.logits[6:].tolist() == [NEUTRAL_LOGIT] * 2
+    assert told(session) == [("append", 6, 8)]
+    assert session.plugins.told[0][1]["store"] is known.store
+
+
+def test_children_inherit_in_as_many_appends_as_the_host_makes(session):
+    model, known = follow(session)
+    rows = torch.tensor([4, 1, 5])
+
+    def body():
+        append(session, model, rows[:1])
+        append(session, model, rows[1:])
+
+    assert parents(session, model, rows, body) == "chosen"
+    assert torch.equal(known.store.logits, LOGITS[torch.tensor([0, 1, 2, 3, 4, 5, 4, 1, 5])])
+    assert known.store.numbers["their moments"].tolist() == [1, 2, 3, 4, 5, 6, 0, 0, 0]
+    assert told(session) == [("append", 6, 7), ("append", 7, 9)]
+    assert known.pending_parents is None
+
+
+def test_a_parent_without_a_child_is_refused_with_their_number(session):
+    model, known = follow(session)
+    rows = torch.tensor([4, 1, 5])
+    with pytest.raises(AlignmentError, match="2 selected parents without a child") as caught:
+        parents(session, model, rows, lambda: append(session, model, rows[:1]))
+    assert caught.value.where == "host:f"
+    assert known.pending_parents is None
+
+
+@pytest.mark.parametrize("rows", [[4, 2, 5], [4, 1, 5, 3]])
+def test_what_is_no_copy_of_its_parent_is_refused_before_the_host_appends(session, rows):
+    model, known = follow(session)
+    appended = []
+
+    def body():
+        tensors = {name: each[rows].clone() for name, each in model.rows().items()}
+        OF_MODELS[Role.APPEND](session, call(model, Role.APPEND, appended.append, tensors))
+
+    with pytest.raises(AlignmentError, match=f"{len(rows)} new rows that are not copies"):
+        parents(session, model, torch.tensor([4, 1, 5]), body)
+    assert appended == []
+    assert len(known.store) == 6
+    assert known.pending_parents is None
+
+
+def test_a_row_that_differs_in_one_inherited_group_is_no_copy(session):
+    model, _ = follow(session)
+    tensors = {name: each[[2]].clone() for name, each in model.rows().items()}
+    tensors["o"] += 1
+
+    def body():
+        OF_MODELS[Role.APPEND](session, call(model, Role.APPEND, lambda tensors: None, tensors))
+
+    with pytest.raises(AlignmentError, match="not copies"):
+        parents(session, model, torch.tensor([2]), body)
+
+
+@pytest.mark.parametrize("role", OF_MODELS)
+def test_a_model_that_is_not_followed_is_the_hosts_own_business(session, role):
+    seam = call(Model(3), role, lambda tensors: f"done with {tensors}", "these")
+    assert OF_MODELS[role](session, seam) == "done with these"
+    assert session.plugins.told == []
+
+
+def test_chosen_rows_are_kept_as_they_were(session):
+    model, known = follow(session)
+    rows = torch.tensor([3, 3])
+    result = OF_MODELS[Role.CHOICE](session, call(model, Role.CHOICE, lambda rows: "drawn", rows))
+    assert result == "drawn"
+    rows += 1
+    assert known.pending_parents.tolist() == [3, 3]
+
+
+def relocate(session, model, mask, chosen, becomes=None):
+    """The host draws rows and overwrites those of a mask with what ``becomes`` says."""
+
+    def host(mask):
+        if chosen is not None:
+            OF_MODELS[Role.CHOICE](session, call(model, Role.CHOICE, lambda rows: None, chosen))
+            with torch.no_grad():
+                for parameter in (model.xyz, model.opacity):
+                    parameter[mask] = parameter[chosen if becomes is None else becomes]
+        return "moved"
+
+    return OF_MODELS[Role.COPY](session, call(model, Role.COPY, host, mask))
+
+
+def test_overwritten_rows_take_the_thresholds_of_what_they_became(session):
+    model, known = follow(session)
+    mask = torch.tensor([False, True, False, False, True, False])
+    assert relocate(session, model, mask, torch.tensor([5, 0])) == "moved"
+    assert torch.equal(known.store.logits, LOGITS[torch.tensor([0, 5, 2, 3, 0, 5])])
+    assert told(session) == [("copy", 6, 6)]
+    assert known.pending_parents is None
+
+
+def test_where_nothing_was_drawn_nothing_is_copied(session):
+    model, known = follow(session)
+    known.pending_parents = torch.tensor([1])  # of an earlier choice, which is not this call's
+    assert relocate(session, model, torch.ones(6, dtype=torch.bool), None) == "moved"
+    assert torch.equal(known.store.logits, LOGITS)
+    assert (known.pending_parents, told(session)) == (None, [])
+
+
+def test_a_group_without_a_name_takes_no_part_in_a_copy(session):
+    model, known = follow(session)
+    model.optimizer.add_param_group({"params": [torch.zeros(1)], "name": ""})
+    mask = torch.tensor([False, True, False, False, False, False])
+    relocate(session, model, mask, torch.tensor([5]))
+    assert float(known.store.logits[1].detach()) == LOGITS[5]
+
+
+@pytest.mark.parametrize(("chosen", "becomes"), [([5, 0], [4, 0]), ([5], [5])])
+def test_a_relocation_that_copied_other_rows_is_refused(session, chosen, becomes):
+    model, known = follow(session)
+    mask = torch.tensor([False, True, False, False, True, False])
+    said = f"2 overwritten rows that are not copies of the {len(chosen)} sampled"
+    with pytest.raises(AlignmentError, match=said) as caught:
+        relocate(session, model, mask, torch.tensor(chosen), torch.tensor(becomes))
+    assert caught.value.where == "host:f"
+    assert torch.equal(known.store.logits, LOGITS)
+
+
+def test_a_host_that_fails_while_it_relocates_leaves_no_parents_behind(session):
+    model, known = follow(session)
+
+    def host(mask):
+        OF_MODELS[Role.CHOICE](session, call(model, Role.CHOICE, lambda rows: None, mask))
+        raise KeyError("in the host")
+
+    with pytest.raises(KeyError, match="in the host"):
+        OF_MODELS[Role.COPY](session, call(model, Role.COPY, host, torch.tensor([1])))
+    assert known.pending_parents is None
+
+
+def test_moments_are_forgotten_where_the_host_forgets_its_own(session):
+    model, known = follow(session)
+    seam = call(model, Role.FORGET, lambda inds: "forgot", torch.tensor([0, 3]))
+    assert OF_MODELS[Role.FORGET](session, seam) == "forgot"
+    assert known.store.numbers["their moments"].tolist() == [0, 2, 3, 0, 5, 6]
+    assert torch.equal(known.store.logits, LOGITS)
+
+
+def test_thresholds_of_removed_rows_go_with_them(session):
+    model, known = follow(session)
+    mask = torch.tensor([True, False, True, True, False, False])
+    seam = call(model, Role.KEEP, lambda mask: "kept", mask)
+    assert OF_MODELS[Role.KEEP](session, seam) == "kept"
+    assert torch.equal(known.store.logits, LOGITS[mask])
+    assert told(session) == [("keep", 6, 3)]
+
+
+def rearrange(session, model, trace, rows=None):
+    events = []
+
+    @contextlib.contextmanager
+    def tracing(_):
+        events.append("begun")
+        yield trace
+        events.append("over")
+
+    def host():
+        events.append("host")
+        if rows is not None:
+            model.xyz = torch.nn.Parameter(model.xyz.detach()[rows])
+        return "rearranged"
+
+    result = OF_MODELS[Role.REARRANGE](session, call(model, Role.REARRANGE, host, how=tracing))
+    return result, events
+
+
+def test_one_operation_keeps_copies_and_appends(session):
+    model, known = follow(session)
+    known.views[3] = print
+    origins = torch.tensor([5, 0, 0])
+    trace = RowTrace(origins, torch.tensor([False, False, True]))
+    assert rearrange(session, model, trace, origins) == (
+        "rearranged",
+        ["begun", "host", "over"],
+    )
+    assert torch.equal(known.store.logits, LOGITS[origins])
+    assert known.store.numbers["their moments"].tolist() == [6, 1, 0]
+    assert known.views == {}
+    assert told(session) == [("rearrange", 6, 3)]
+
+
+@pytest.mark.parametrize("trace", [RowTrace(), RowTrace(torch.tensor([0])), RowTrace(None, None)])
+def test_an_operation_that_did_nothing_changes_nothing(session, trace):
+    model, known = follow(session)
+    known.views[3] = print
+    assert rearrange(session, model, trace)[0] == "rearranged"
+    assert torch.equal(known.store.logits, LOGITS)
+    assert (list(known.views), told(session)) == ([3], [])
+
+
+def test_an_operation_whose_rows_nobody_traced_is_refused(session):
+    model, _ = follow(session)
+    with pytest.raises(AlignmentError, match="4 Gaussians") as caught:
+        rearrange(session, model, RowTrace(), torch.arange(4))
+    assert caught.value.where == "host:f"
+
+
+@pytest.mark.parametrize("role", [Role.COPY, Role.REARRANGE, Role.STILL])
+def test_a_frozen_model_stands_still(frozen, role):
+    model, known = follow(frozen)
+    ran = []
+    seam = call(model, role, ran.append, torch.ones(6, dtype=torch.bool), how=lambda _: "instead")
+    assert OF_MODELS[role](frozen, seam) == ("instead" if role is Role.STILL else None)
+    assert ran == []
+    assert torch.equal(known.store.logits, LOGITS)
