@@ -39,7 +39,6 @@ from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.storage import checkpoints
 from fragprune_plugins.storage.atomic import digest
 
 log = logging.getLogger("fragprune")
@@ -319,6 +318,7 @@ class _Runner:
         """Options of a session that keeps an unfinished stage 2, and goes on from a kept one."""
         from fragprune_plugins.finetuning.resuming import SUFFIX, Checkpoints, deciding, differences
         from fragprune_plugins.plugins.hooks import schedule_for
+        from fragprune_plugins.storage import checkpoints
 
         options, seconds = self.options, self.options.checkpoint_every
         if self.output is None or not seconds:
