@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.hosts import seams
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 
@@ -53,6 +55,16 @@ class Detour(TorchFunctionMode):
     def __torch_function__(self, func, types, args=(), kwargs=None):
         self.calls += 1
         return func(*args, **(kwargs or {}))
+
+
+def test_signatures_are_read_once(monkeypatch):
+    with joint(Settings(iterations=30)) as host:
+        model, camera = host.model(ROWS), host.camera()
+        host.step(model, camera, 1)
+        read = Mock(side_effect=seams.signature)
+        monkeypatch.setattr(seams, "signature", read)
+        host.step(model, camera, 2)
+    assert not read.called
 
 
 @pytest.mark.parametrize("iterations", [0, 1], ids=["without thresholds", "with"])
