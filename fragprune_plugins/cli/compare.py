@@ -42,6 +42,14 @@ if TYPE_CHECKING:
 @click.option("--out", type=FILE, help="Folder for side-by-side pictures.")
 @views_option
 @truncation_option
+@click.option(
+    "--enlarge",
+    type=click.IntRange(1, 16),
+    default=1,
+    show_default=True,
+    help="Time frames this many times as wide and high as the photographs. All other figures are "
+    "still those at the photographs' size.",
+)
 @engine_options
 @click.pass_context
 def command(
@@ -55,6 +63,7 @@ def command(
     out: Path | None,
     views: str,
     no_truncation: bool,
+    enlarge: int,
     engine: str,
     device: str,
     threads: int | None,
@@ -69,6 +78,7 @@ def command(
     Examples:
       fragprune compare point_cloud.ply pruned.ply --data scene --out pictures
       fragprune compare out/point_cloud/iteration_{30000,35001}/point_cloud.ply
+      fragprune compare point_cloud.ply pruned.ply --data scene --enlarge 4 --threads 1
     """
     from fragprune_plugins.cli.profile import draw_panels
     from fragprune_plugins.datasets.photographs import Resolution
@@ -94,7 +104,7 @@ def command(
         model = models.load(path, truncation=not no_truncation, filtered=filtered, device=where)
         columns[label] = Candidate(*model, drawing)
     shots = load_shots(scene, views, where)
-    first, second = measure(list(columns.values()), shots, engine=rasterizer)
+    first, second = measure(list(columns.values()), shots, engine=rasterizer, enlarge=enlarge)
     report: dict[str, Any] = {
         "a": {"model": str(a)} | first,
         "b": {"model": str(b)} | second,
@@ -103,14 +113,16 @@ def command(
         "ssim_change": second["ssim"] - first["ssim"],
         "engine": rasterizer.name,
         "device": first["device"],
+        "enlarge": enlarge,
         "scene": scene.as_dict(),
         "warnings": nothing_drawn([each["fragments_per_pixel"] for each in (first, second)])
         + strangers(first, second),
     }
-    size = f"{shots[0].view.width}x{shots[0].view.height} pixels"
+    width, height = shots[0].view.width, shots[0].view.height
     lines = [
-        f"A: {a}\nB: {b}\nPhotographs: {scene.folder}, the first of {size}\n",
+        f"A: {a}\nB: {b}\nPhotographs: {scene.folder}, the first of {width}x{height} pixels\n",
         describe({"A": first, "B": second}),
+        *([f"Frames of {enlarge * width}x{enlarge * height} pixels."] if enlarge > 1 else []),
         f"\nB against A: {gain(first, second)}.",
         *(f"Warning: {each}" for each in report["warnings"]),
     ]

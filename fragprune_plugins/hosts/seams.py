@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
-from inspect import signature
+from inspect import Signature, signature
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 from fragprune_plugins.reprs import one_line
 
@@ -107,6 +108,11 @@ class Seam:
         return f"{self.module}:{self.attribute}"
 
 
+_signatures: WeakKeyDictionary[Callable[..., Any], Signature] = WeakKeyDictionary()
+_signatures_of_methods: WeakKeyDictionary[Callable[..., Any], Signature] = WeakKeyDictionary()
+"""By function; a bound method's lacks the instance."""
+
+
 @dataclass
 class SeamCall:
     """A call of the host's function at a seam.
@@ -132,9 +138,18 @@ class SeamCall:
     @cached_property
     def arguments(self) -> dict[str, Any]:
         """All arguments by name, with defaults for omitted ones."""
-        bound = signature(self.function).bind(*self.args, **self.kwargs)
+        bound = self._signature.bind(*self.args, **self.kwargs)
         bound.apply_defaults()
         return bound.arguments
+
+    @property
+    def _signature(self) -> Signature:
+        """The function's, read once: a view is drawn in a few times as long as it takes."""
+        plain = getattr(self.function, "__func__", self.function)
+        known = _signatures if plain is self.function else _signatures_of_methods
+        if plain not in known:
+            known[plain] = signature(self.function)
+        return known[plain]
 
     @property
     def first(self) -> Any:
@@ -148,7 +163,7 @@ class SeamCall:
             changed: arguments by name, in place of the host's.
         """
         if changed:
-            bound = signature(self.function).bind(*self.args, **self.kwargs)
+            bound = self._signature.bind(*self.args, **self.kwargs)
             bound.arguments.update(changed)
             self.result = self.function(*bound.args, **bound.kwargs)
         else:

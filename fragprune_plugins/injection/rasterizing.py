@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -123,22 +124,33 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     presses = stage is not None and stage.learning and session.settings.portable
     if state.store.neutral and not presses:
         return by_host()
-    inputs, engine = unpack(session, drawn)
-    thresholds = (
-        session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
-    )
-    if thresholds is None and not presses:
-        return by_host()
-    if thresholds is not None and rows is not None:
-        thresholds = thresholds[rows]
-    truncated = partial(rasterize, engine, state, rendering[1], thresholds)
-    return session.dialect.answer(drawn, inputs, truncated)
+    with directly():
+        inputs, engine = unpack(session, drawn)
+        thresholds = (
+            session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
+        )
+        if thresholds is not None or presses:
+            if thresholds is not None and rows is not None:
+                thresholds = thresholds[rows]
+            truncated = partial(rasterize, engine, state, rendering[1], thresholds)
+            return session.dialect.answer(drawn, inputs, truncated)
+    return by_host()
 
 
 def draw(session: SessionState, call: HostCall) -> Any:
     """Draw a call without thresholds, by our engine."""
-    inputs, engine = unpack(session, call)
-    return session.dialect.answer(call, inputs, lambda each, _=0: engine.rasterize(each, None))
+    with directly():
+        inputs, engine = unpack(session, call)
+        return session.dialect.answer(call, inputs, lambda each, _=0: engine.rasterize(each, None))
+
+
+def directly() -> AbstractContextManager[None]:
+    """Inside, torch functions skip the detour by which ``--device cpu`` redirects a host's.
+
+    It is a Python function around each torch call, and takes as long as a small picture.
+    """
+    context: AbstractContextManager[None] = torch._C.DisableTorchFunction()
+    return context
 
 
 def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Engine]:

@@ -74,6 +74,7 @@ def measure(
     *,
     engine: str | Engine = "auto",
     repeats: int = REPEATS,
+    enlarge: int = 1,
 ) -> list[dict[str, Any]]:
     """Measure splats against the same pictures, timing them in turns.
 
@@ -86,6 +87,7 @@ def measure(
         shots: the views. Figures are means over them.
         engine: a name or an engine.
         repeats: number of timed frames for each view and candidate.
+        enlarge: timed frames are this many times as wide and high as the pictures.
 
     Returns:
         One dict a candidate: target ("photographs", or "itself" for a model's own pictures), psnr
@@ -132,7 +134,11 @@ def measure(
             }
         )
 
-    frames = frame_times(candidates, [shot.view for shot in shots], engine, repeats=repeats)
+    views = [
+        replace(view, width=enlarge * view.width, height=enlarge * view.height)
+        for view in (shot.view for shot in shots)
+    ]
+    frames = frame_times(candidates, views, engine, repeats=repeats)
     for report, frame in zip(reports, frames, strict=True):
         report |= frame | {"engine": engine.name, "device": str(device), "views": len(shots)}
     return reports

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +21,8 @@ from fragprune_vanilla_3dgs import Vanilla3DGS
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 every_rt = each_of(RT4DGS())
+
+FRAMES = Path(__file__).parents[2] / "docs" / "how-to" / "rt_4dgs_frames.py"
 
 NEEDS = ("omegaconf", "imagesize", "kornia", "torchmetrics", "torchvision")
 
@@ -107,6 +113,7 @@ with contextlib.redirect_stdout(sys.stderr):
         "moved": [names[i] if i < 7 else i for i in (*range(7), 13, 14, 15, 18) if i not in kept],
         "rows": [len(before[1]), len(after[1]), len(learned["logits"])],
         "steps": [summary.iterations, learned["steps"]],
+        "models": [str(summary.model_before), str(summary.model_after)],
         "fragments": [summary.fragments_before, summary.fragments_after],
     }
 print(json.dumps(report))
@@ -133,3 +140,14 @@ def test_training_then_fine_tuning(host, recording, tmp_path, python, rot, pytho
     assert report["steps"] == [10, 10]
     before, after = report["fragments"]
     assert after < before
+    frames = [sys.executable, str(FRAMES), str(host), str(config), *report["models"]]
+    drawn = subprocess.run(
+        [*frames, "--rounds", "1", "--enlarge", "2", "--device", "cpu"],
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+    first, second = re.findall(r"(\d+) Gaussians, .* dB, SSIM", drawn)
+    assert first == second == str(report["rows"][0])
+    assert "frames of 96x96 pixels" in drawn
+    assert len(re.findall(r"ms, least .*x$", drawn, re.MULTILINE)) == 2
