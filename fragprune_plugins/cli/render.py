@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -24,6 +25,19 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.storage import models
 
 
+def _direction(
+    ctx: click.Context, param: click.Parameter, value: str
+) -> tuple[float, float, float]:
+    """Three numbers that are not all 0."""
+    try:
+        x, y, z = (float(part) for part in value.split(","))
+    except ValueError as error:
+        raise click.BadParameter(f"{value!r} is not a direction such as 0,-1,0.") from error
+    if not 0 < x * x + y * y + z * z < float("inf"):
+        raise click.BadParameter(f"{value!r} has no direction.")
+    return x, y, z
+
+
 @click.command("render", cls=Command)
 @click.argument("model", type=MODEL)
 @click.option(
@@ -33,7 +47,36 @@ from fragprune_plugins.storage import models
     "Default: the cameras.json that the training of MODEL wrote.",
 )
 @click.option("--data", type=FILE, help="Scene folder whose cameras draw, instead of --cameras.")
-@click.option("--out", type=FILE, required=True, help="Folder for the PNG files.")
+@click.option(
+    "--out",
+    type=FILE,
+    required=True,
+    help="Folder for the PNG files; or a film in .mp4, whose camera goes through the cameras in "
+    "their order.",
+)
+@click.option("--orbit", is_flag=True, help="Go around MODEL instead, once; it suits an object.")
+@click.option(
+    "--up",
+    default="0,-1,0",
+    show_default=True,
+    metavar="X,Y,Z",
+    callback=_direction,
+    help="With --orbit: what is up in MODEL's world.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=0.1, max=3600),
+    default=8.0,
+    show_default=True,
+    help="Of a film, or of --orbit.",
+)
+@click.option(
+    "--fps",
+    type=click.IntRange(1, 240),
+    default=30,
+    show_default=True,
+    help="Frames a second of a film, or of --orbit.",
+)
 @click.option("--heatmap", is_flag=True, help="Also draw fragments per pixel, on one shared scale.")
 @views_option
 @image_options
@@ -44,6 +87,10 @@ def command(
     cameras: Path | None,
     data: Path | None,
     out: Path,
+    orbit: bool,
+    up: tuple[float, float, float],
+    seconds: float,
+    fps: int,
     heatmap: bool,
     views: str,
     images: str,
@@ -54,65 +101,95 @@ def command(
     device: str,
     threads: int | None,
 ) -> Report:
-    """Render MODEL from many cameras, with one PNG for each camera.
+    """Render MODEL from many cameras, with one PNG for each camera, or as a film.
 
-    The thresholds beside MODEL apply, if there are any; --no-truncation ignores them.
+    The thresholds beside MODEL apply, if there are any; --no-truncation ignores them. A film needs
+    the extra [video].
 
     \b
     Examples:
       fragprune render pruned.ply --data scene --out renders --heatmap
       fragprune render pruned.ply --cameras out/cameras.json --out renders
       fragprune render out --out renders                (the output folder of a training)
+      fragprune render statue.ply --orbit --out statue.mp4
+      fragprune render pruned.ply --cameras camera_path.json --out flight.mp4 --seconds 20
     """
-    if cameras is not None and data is not None:
-        raise UsageError("options", "both of --cameras and --data", "one of them", "Pass one.")
-    if cameras is None and data is None:
+    film = out.suffix.lower() == ".mp4"
+    if film and heatmap:
+        raise UsageError("options", "--heatmap with a film", "a folder for --out", "Name one.")
+    if sum((cameras is not None, data is not None, orbit)) > 1:
+        raise UsageError(
+            "options",
+            "more than one of --cameras, --data and --orbit",
+            "one of them",
+            "Pass one.",
+        )
+    if cameras is None and data is None and not orbit:
         cameras = cameras_of(model)
         if cameras is None:
             raise UsageError(
                 "options",
-                "neither --cameras nor --data, and no cameras.json of a training around MODEL",
+                "neither --cameras, --data nor --orbit, and no cameras.json of a training around "
+                "MODEL",
                 "cameras to draw from",
-                "Pass --cameras FILE or --data FOLDER.",
+                "Pass --cameras FILE, --data FOLDER or --orbit.",
             )
 
     import torch
+    from tqdm import tqdm
 
-    from fragprune_plugins.datasets.cameras import load_cameras
+    from fragprune_plugins.datasets.cameras import divided, load_cameras
+    from fragprune_plugins.measure import filming
     from fragprune_plugins.measure.pictures import save_heatmap, save_image, stems
     from fragprune_plugins.measure.wording import nothing_drawn
     from fragprune_plugins.plugins.hooks import thresholds_for
     from fragprune_plugins.storage.atomic import writable_folder
-    from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.types import RasterInputs, RasterOutputs, View
 
     rasterizer, where = open_engine(engine, device, threads)
-    writable_folder(out)
+    writable_folder(out.parent if film else out)
     splat, store = models.load(model, truncation=not no_truncation, device=where)
+    frames = max(1, round(seconds * fps))
     if data is not None:
         scene = photographs_for(model, data, images, resolution, white_background)
-        shots = load_shots(scene, views)
-        named = [(shot.name, shot.view) for shot in shots]
-    else:
-        assert cameras is not None
+        named = [(shot.name, shot.view) for shot in load_shots(scene, views)]
+    elif cameras is not None:
         named = load_cameras(cameras, white_background=white_background)
+    else:
+        named = divided(filming.orbit(splat, frames, up), resolution)
+        background = torch.full((3,), float(white_background))
+        named = [(name, replace(view, background=background)) for name, view in named]
+    if film and not orbit:
+        named = filming.along(named, frames)
     splats = splat.splats()
     files, fragments, maps = [], [], []
-    with torch.no_grad():
-        for stem, (_, view) in zip(stems([name for name, _ in named]), named, strict=True):
-            inputs = RasterInputs(view.to(where), splats, counts=heatmap, planes=())
+
+    def draw(view: View) -> RasterOutputs:
+        inputs = RasterInputs(view.to(where), splats, counts=heatmap, planes=())
+        with torch.no_grad():
             outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, store))
-            file = out / f"{stem}.png"
-            save_image(file, outputs.image)
-            files.append(file)
-            fragments.append(float(outputs.fragments_per_pixel))
-            if outputs.fragments is not None:
-                maps.append((file.with_name(file.stem + "_fragments.png"), outputs.fragments.cpu()))
+        fragments.append(float(outputs.fragments_per_pixel))
+        return outputs
+
+    if film:
+        bar = tqdm([view for _, view in named], desc="filming", unit="frame", leave=None)
+        filming.write_mp4(out, (draw(view).image for view in bar), fps)
+        files.append(out)
+        named = []
+    for stem, (_, view) in zip(stems([name for name, _ in named]), named, strict=True):
+        outputs = draw(view)
+        file = out / f"{stem}.png"
+        save_image(file, outputs.image)
+        files.append(file)
+        if outputs.fragments is not None:
+            maps.append((file.with_name(file.stem + "_fragments.png"), outputs.fragments.cpu()))
     limit = max((float(counts.max()) for _, counts in maps), default=0.0)
     for file, counts in maps:
         save_heatmap(file, counts, limit)
         files.append(file)
     mean = sum(fragments) / len(fragments)
     warnings = nothing_drawn(fragments)
+    wrote = f"{out}, {len(fragments)} frames" if film else f"{len(files)} pictures to {out}"
     return Report(
         {
             "model": str(model),
@@ -126,7 +203,7 @@ def command(
         },
         "\n".join(
             [
-                f"Wrote {len(files)} pictures to {out} ({mean:.1f} fragments per pixel, "
+                f"Wrote {wrote} ({mean:.1f} fragments per pixel, "
                 f"{'truncated' if store is not None else 'not truncated'}).",
                 *(f"Warning: {each}" for each in warnings),
             ]

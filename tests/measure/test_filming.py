@@ -1,0 +1,127 @@
+"""Films: where the camera is in each frame, and what the file holds."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+
+from fragprune_plugins.datasets.generated import bounds
+from fragprune_plugins.measure.filming import along, orbit, write_mp4
+from fragprune_plugins.storage.ply import write_ply
+
+
+def frames_of(path):
+    """Size, frames a second, and the pictures of a film."""
+    program = imageio_ffmpeg.get_ffmpeg_exe()
+    said = subprocess.run([program, "-i", str(path)], capture_output=True, text=True).stderr
+    width, height = map(int, re.search(r" (\d+)x(\d+)[ ,]", said).groups())
+    fps = float(re.search(r"([\d.]+) fps", said)[1])
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run([program, "-i", str(path), *raw], capture_output=True, check=True)
+    pictures = np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
+    return (width, height), fps, pictures
+
+
+@pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 2.0, -0.5)])
+def test_an_orbit_goes_once_around_at_one_height_and_distance(up):
+    splat = tiny.random_model()
+    centre, _ = bounds(splat)
+    axis = torch.nn.functional.normalize(torch.tensor(up), dim=0)
+    away = torch.stack([view.campos - centre for _, view in orbit(splat, 12, up, width=64)])
+    heights = away @ axis
+    assert float(heights.std()) < 1e-4 * float(heights.abs().mean())
+    assert float(heights.mean()) > 0
+    distances = away.norm(dim=1)
+    assert float(distances.std()) < 1e-4 * float(distances.mean())
+    flat = torch.nn.functional.normalize(away - heights[:, None] * axis, dim=1)
+    turns = (flat * flat.roll(1, 0)).sum(dim=1)
+    torch.testing.assert_close(turns, torch.full((12,), 3**0.5 / 2), atol=1e-4, rtol=0)
+
+
+def test_a_path_begins_and_ends_at_its_cameras_and_passes_the_others():
+    cameras = [(str(i), camera.view()) for i, camera in enumerate(tiny.cameras()[:3])]
+    found = along(cameras, 9)
+    for at, (_, camera) in zip((0, 4, 8), cameras, strict=True):
+        torch.testing.assert_close(found[at][1].viewmatrix, camera.viewmatrix, atol=1e-5, rtol=0)
+        torch.testing.assert_close(found[at][1].projmatrix, camera.projmatrix, atol=1e-4, rtol=0)
+    halfway = (cameras[0][1].campos + cameras[1][1].campos) / 2
+    torch.testing.assert_close(found[2][1].campos, halfway, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_path_of_one_camera_stands_still(count):
+    cameras = [("a", tiny.cameras()[0].view())]
+    for _, view in along(cameras, count):
+        torch.testing.assert_close(view.viewmatrix, cameras[0][1].viewmatrix)
+
+
+def test_a_film_holds_the_pictures_in_their_order(tmp_path):
+    greys = [0.1, 0.5, 0.9]
+    pictures = [torch.full((3, 49, 65), grey) for grey in greys]
+    assert write_mp4(tmp_path / "a.mp4", pictures, 10) == 3
+    size, fps, found = frames_of(tmp_path / "a.mp4")
+    assert size == (64, 48)
+    assert fps == 10
+    assert len(found) == 3
+    for picture, grey in zip(found, greys, strict=True):
+        assert abs(float(picture.mean()) - 255 * grey) < 4  # H.264 loses a little
+
+
+def test_a_failed_film_leaves_the_earlier_one(tmp_path):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"earlier")
+
+    def frames():
+        yield torch.zeros(3, 32, 32)
+        raise RuntimeError("no more")
+
+    with pytest.raises(RuntimeError, match="no more"):
+        write_mp4(path, frames(), 10)
+    assert path.read_bytes() == b"earlier"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_render_films_an_orbit_and_a_path(tmp_path):
+    data, model, splat = tiny.scene(tmp_path)
+    film = tmp_path / "a.mp4"
+    words = ("--seconds", 0.5, "--fps", 8)
+    report = run_json("render", model, "--orbit", *words, "--resolution", 16, "--out", film)
+    assert report["files"] == [str(film)]
+    size, fps, pictures = frames_of(film)
+    assert (size, fps, len(pictures)) == ((80, 44), 8, 4)
+    run_json("render", model, "--data", data, "--views", "train", *words, "--out", film)
+    size, _, pictures = frames_of(film)
+    assert (size, len(pictures)) == ((tiny.SIDE, tiny.SIDE), 4)
+    assert max(float(picture.std()) for picture in pictures) > 5
+    write_ply(model, splat, torch.full((len(splat),), 0.5))  # thresholds apply to films, too
+    assert run_json("render", model, "--orbit", *words, "--out", film)["truncated"]
+
+
+def test_an_orbit_can_be_pictures(tmp_path):
+    _, model, _ = tiny.scene(tmp_path)
+    out = tmp_path / "pictures"
+    words = ("--seconds", 0.5, "--fps", 8, "--resolution", 16)
+    assert len(run_json("render", model, "--orbit", *words, "--out", out)["files"]) == 4
+
+
+def test_without_the_library_the_message_says_what_to_install(tmp_path, monkeypatch):
+    _, model, _ = tiny.scene(tmp_path)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    result = run("render", model, "--orbit", "--seconds", 0.1, "--out", tmp_path / "a.mp4")
+    assert result.exit_code == 2
+    assert "fragprune-plugins[video]" in result.stderr
+    assert not (tmp_path / "a.mp4").exists()
+
+
+@pytest.mark.parametrize("up", ["1,2", "a,b,c", "0,0,0", "nan,0,1", "inf,0,0"])
+def test_a_direction_that_is_none_is_a_usage_error(tmp_path, up):
+    words = ("render", "a.ply", "--orbit", "--up", up, "--out", tmp_path / "a.mp4")
+    assert run(*words).exit_code == 2
