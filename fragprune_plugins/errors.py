@@ -180,6 +180,12 @@ class DivergedError(FragpruneError):
     code = "not-finite"
 
 
+class ResetError(FragpruneError):
+    """Thresholds would begin to learn right after the host has reset its opacities."""
+
+    code = "opacity-reset"
+
+
 class UsageError(FragpruneError):
     """Options that contradict each other; exit code 2."""
 

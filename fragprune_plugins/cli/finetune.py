@@ -208,7 +208,7 @@ def command(
     asked |= {"drop_invisible": drop, "keep": keep, "max_drop": max_drop}
     if again:
         checkpoints.clear()
-    elif (finished := finetuned.finished(out, asked, curves)) is not None:
+    elif (finished := finetuned.finished(model, out, asked, curves)) is not None:
         checkpoints.clear()
         return finished
     with sigterm_interrupts():

@@ -172,7 +172,7 @@ class Finetuned:
         return "\n".join(lines)
 
 
-def finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
+def finished(model: Path, out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
     """The report of the same command, if it has written ``out`` already; else None."""
     from fragprune_plugins.storage import models, sidecar
 
@@ -203,7 +203,8 @@ def finished(out: Path, asked: dict[str, Any], curves: Path | None) -> Report | 
         f"{record.data['text']}\n{out} was finished before: nothing was done. "
         "--again fine-tunes again."
     )
-    return Report(data | {"already_finished": True}, text)
+    given = {"model": str(model), "out": str(out)}  # the record names them from its own folder
+    return Report(data | given | {"already_finished": True}, text)
 
 
 def terminated(model: Path, out: Path, result: FinetuneResult, found: Bounded | None) -> Report:

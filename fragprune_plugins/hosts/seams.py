@@ -147,9 +147,13 @@ class SeamCall:
         """The function's, read once: a view is drawn in a few times as long as it takes."""
         plain = getattr(self.function, "__func__", self.function)
         known = _signatures if plain is self.function else _signatures_of_methods
-        if plain not in known:
-            known[plain] = signature(self.function)
-        return known[plain]
+        try:
+            found = known.get(plain)
+        except TypeError:  # functions of C take no weak reference
+            return signature(self.function)
+        if found is None:
+            found = known[plain] = signature(self.function)
+        return found
 
     @property
     def first(self) -> Any:

@@ -30,7 +30,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import DivergedError, UsageError
+from fragprune_plugins.errors import DivergedError, ResetError, UsageError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.finite import are_finite, expect_finite, not_finite
 from fragprune_plugins.learning.pressure import (
@@ -46,11 +46,14 @@ from fragprune_plugins.learning.pressure import (
     calibrate_measured,
     numbers_of,
 )
-from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
+from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")
+
+RESET, MOSTLY = 0.0101, 0.9
+"""Opacity that a host's reset leaves at most, and the share of Gaussians that have no more then."""
 
 LOOK_EVERY = 10
 """Steps from one look at predicted frame times to the next."""
@@ -203,6 +206,9 @@ class Stage2:
 
         Args:
             opacities: gives the activated opacities, (N,) or (N, 1), when they are needed.
+
+        Raises:
+            ResetError: thresholds would begin to learn right after a reset of opacities.
         """
         self.close()
         self.steps += 1
@@ -212,9 +218,31 @@ class Stage2:
         self._open |= self.plan.learn
         if self.plan.learn and self.settings.opens:
             if not self.store.opened:
-                self.store.open(opacities())
+                known = opacities()
+                self._expect_no_reset(known)
+                self.store.open(known)
             self._meet_target(self.plan.progress)
         return self.plan
+
+    def _expect_no_reset(self, opacities: Tensor) -> None:
+        """A picture of Gaussians that are hardly there teaches nothing: it has no fragments to cut.
+
+        Its loss is so large beside its fragments that the pressure would end what is left of it.
+        """
+        share = float((opacities <= RESET).float().mean()) if opacities.numel() else 0.0
+        if share < MOSTLY:
+            return
+        error = ResetError(
+            "stage 2",
+            f"opacities of at most 0.01 in {share:.0%} of {opacities.numel():,} Gaussians, as a "
+            "reset of opacities leaves them",
+            "a model that has trained on since its last reset",
+            "Train on before stage 2, or let densification, which resets, end earlier (3DGS: "
+            "--densify_until_iter below the last iteration); then --stage finetune.",
+        )
+        if not isinstance(self.schedule, JointSchedule):
+            raise error
+        log.warning("%s", error)  # the host's training goes on, and may recover
 
     def thresholds(self, inputs: RasterInputs) -> Tensor | None:
         """(N,) to draw a rasterization with, or None; with gradients where they will be used."""

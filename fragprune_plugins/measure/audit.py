@@ -30,6 +30,7 @@ from fragprune_plugins.measure.evaluate import Candidate, frame_times
 from fragprune_plugins.measure.extents import CUTS, SQRT8, VIEWERS, covered, honouring, shaded
 from fragprune_plugins.measure.metrics import psnr
 from fragprune_plugins.plugins.hooks import thresholds_for
+from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage.models import Model
 from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import Splats, View
@@ -82,6 +83,8 @@ class Idle:
         classes: (2, 3, 3) drawn, and idle together, by opacity and radius.
         reasons: (2, 4) likewise by ``REASONS``.
     """
+
+    __repr__ = one_line
 
     pixels: int = 0
     drawn: int = 0
@@ -137,6 +140,8 @@ class Weighed:
         reasons: index into ``REASONS``.
     """
 
+    __repr__ = one_line
+
     drawn: Tensor
     weights: Tensor
     alone: Tensor
@@ -185,6 +190,8 @@ class Shown:
         fragments: (H, W) drawn per pixel.
         overdraw: (H, W) ellipses of sqrt(8) standard deviations over each pixel.
     """
+
+    __repr__ = one_line
 
     name: str
     image: Tensor

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import ResetError, UsageError
 from fragprune_plugins.learning.pressure import ELASTICITY
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import FrameClock, Stage2, evenly
@@ -304,3 +304,33 @@ def test_chosen_views_are_spread_over_all_of_them(count):
     assert count == 0 or chosen[0] == 0
     gaps = [b - a for a, b in pairwise([*chosen, count])]
     assert max(gaps, default=0) <= math.ceil(count / 3)
+
+
+def reset(share: float) -> torch.Tensor:
+    """Opacities of 100 Gaussians, of which a host's reset has just lowered a share to 0.01."""
+    return torch.where(torch.arange(100) < 100 * share, 0.01, 0.3)
+
+
+def test_thresholds_do_not_begin_right_after_a_reset_of_opacities():
+    it = Stage2(ThresholdStore(100), Settings(iterations=10))
+    with pytest.raises(ResetError, match=r"at most 0.01 in 95% of 100 Gaussians"):
+        it.begin(lambda: reset(0.95))
+
+
+def test_a_model_with_many_faint_gaussians_is_not_taken_for_a_reset_one():
+    it = Stage2(ThresholdStore(100), Settings(iterations=10))
+    it.begin(lambda: reset(0.8))
+    assert it.store.opened
+
+
+def test_a_control_may_begin_after_a_reset():
+    it = Stage2(ThresholdStore(100), Settings(iterations=10, truncate=False))
+    it.begin(lambda: reset(1.0))
+
+
+def test_joint_learning_warns_of_a_reset_and_goes_on_with_the_training(caplog):
+    settings = Settings(iterations=10)
+    it = Stage2(ThresholdStore(100), settings, JointSchedule(settings, from_step=1))
+    it.begin(lambda: reset(1.0))
+    assert "[opacity-reset]" in caplog.text
+    assert it.store.opened
