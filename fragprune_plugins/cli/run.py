@@ -117,7 +117,7 @@ def command(
     \b
     Examples:
       fragprune run -- python train.py -s scene -m out --eval
-      fragprune run --quick --device cpu -- train.py -s scene -m out --iterations 3000
+      fragprune run --quick --device cpu -- train.py -s scene -m out --iterations 7000
       fragprune run --stage finetune -- train.py -s scene -m out     (already trained)
       fragprune run --stage joint -- python train.py -s scene -m out   (no added iterations)
       fragprune run -- python render.py -m out                       (renders with thresholds)
