@@ -65,6 +65,7 @@ class Viewer {
         this.last = 0; // when the last frame began, while moving
         this.before = 0; // and the one before it
         this.movedAt = -Infinity;
+        this.seenAt = -Infinity; // when the last frame while moving was there
         this.counted = null; // what was counted: of which camera
         this.paused = false;
         this.frame = 0;
@@ -80,8 +81,13 @@ class Viewer {
 
     addLayers(layers) {
         this.layers.push(...layers);
-        for (const { splats } of layers) splats.onsorted = () => this.change(false);
+        for (const { splats } of layers) splats.onsorted = () => this.#sorted();
         this.change();
+    }
+
+    // An order that is one movement old will do, until the camera rests: it is drawn sharp then.
+    #sorted() {
+        if (this.firstFrame === null || !this.moving) this.change(false);
     }
 
     // Something to show has changed; a movement, too, lowers the quality on slow machines.
@@ -135,7 +141,10 @@ class Viewer {
         });
     }
 
-    get moving() { return performance.now() - this.movedAt < REST || this.keys.size > 0; }
+    // A hand that goes on may do so only when it sees the frame that it waits for.
+    get moving() {
+        return this.keys.size > 0 || performance.now() - Math.max(this.movedAt, this.seenAt) < REST;
+    }
 
     #frame(now) {
         this.frame = 0;
@@ -181,6 +190,7 @@ class Viewer {
                 $("#loading").hidden = true;
                 return;
             }
+            this.seenAt = performance.now();
             $("#ms").textContent = milliseconds.toFixed(milliseconds < 10 ? 1 : 0);
             const period = this.before ? Math.max(milliseconds, now - this.before) : 0;
             this.before = this.last && now;
