@@ -60,8 +60,13 @@ def test_the_picture_is_our_engines(browser, tmp_path, degree):
         assert tab.errors == tab.strangers == []
 
 
-def boxes(model: Model, view: View, *, truncated: bool) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) counts of boxes and octagons around ellipses, and of ellipses, over pixel centres."""
+def boxes(
+    model: Model, view: View, *, truncated: bool, large: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) counts of shapes around ellipses, and of ellipses, over pixel centres.
+
+    Shapes are boxes, or octagons around ellipses of more than ``large`` square pixels.
+    """
     splat = model.splat.splats()
     front = (model.splat.xyz @ view.viewmatrix[:3, :3] + view.viewmatrix[3, :3])[:, 2] > 0.2
     camera = Camera(**{name: getattr(view, name) for name in Camera.__dataclass_fields__})
@@ -90,20 +95,24 @@ def boxes(model: Model, view: View, *, truncated: bool) -> tuple[np.ndarray, np.
         offsets = np.stack([x - mean[0], y - mean[1]], axis=-1) @ axes * np.sqrt(precision)
         reaches = np.abs(offsets) / np.sqrt(cutoff)
         covered = (reaches <= 1).all(axis=-1)
-        if 4 * cutoff / np.sqrt(precision.prod()) > 36:
+        if 4 * cutoff / np.sqrt(precision.prod()) > large:
             covered &= reaches.sum(axis=-1) <= np.sqrt(2)
         quads += covered
         ellipses += (offsets**2).sum(axis=-1) <= cutoff
     return quads, ellipses
 
 
+@pytest.mark.parametrize("large", [36, float("inf")])
 @pytest.mark.parametrize("truncated", [True, False])
-def test_quads_and_fragments_are_those_of_the_ellipses(browser, tmp_path, truncated):
+def test_quads_and_fragments_are_those_of_the_ellipses(browser, tmp_path, truncated, large):
     model, view = a_model(), a_view()
     write_page(tmp_path, [model], view)
-    quads, ellipses = boxes(model, view, truncated=truncated)
+    quads, ellipses = boxes(model, view, truncated=truncated, large=large)
     with viewing(browser, tmp_path) as tab:
         hold(tab, view)
+        tab.run(
+            f"() => {{ viewer.drawing.options.large = {str(large).replace('inf', 'Infinity')}; }}"
+        )
         shown = frame(tab, view, 0 if truncated else 1, stop=False)
         # The rasterizer rounds corners to fractions of a pixel: a pixel on an edge may differ.
         for counted, expected in ((shown.quads, quads), (shown.fragments, ellipses)):

@@ -24,16 +24,21 @@ export class Drawing {
         this.format = software ? gl.RGBA32F : gl.RGBA16F;
         this.gl = gl;
         this.canvas = canvas;
-        this.options = { fixed: false, stop: true, marks: 16, large: 36 };
+        // Ellipses of more square pixels get octagons. In software two triangles less are worth more.
+        const large = /swiftshader|llvmpipe/i.test(this.renderer) ? Infinity : 36;
+        this.options = { fixed: false, stop: true, marks: 16, large };
         this.programs = new Map();
         gl.disable(gl.DITHER);
         gl.bindVertexArray(gl.createVertexArray());
-        // Corners 0 to 7 go around. Where pairs of them fall together, two triangles are left.
-        const octagon = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 7, 4, 5, 6, 4, 6, 7];
-        const corners = new Uint16Array(PORTION * 18);
-        for (let i = 0; i < PORTION; i++) corners.set(octagon.map(each => i * 8 + each), i * 18);
-        gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-        gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+        // Corners 0 to 7 go around an octagon; every second one is a rectangle's.
+        this.shapes = [[0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 7, 4, 5, 6, 4, 6, 7], [0, 2, 4, 0, 4, 6]].map(shape => {
+            const corners = new Uint16Array(PORTION * shape.length), buffer = gl.createBuffer();
+            for (let i = 0; i < PORTION; i++)
+                corners.set(shape.map(each => i * 8 + each), i * shape.length);
+            gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
+            gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+            return { buffer, length: shape.length };
+        });
         this.tableRows = 0;
         this.width = this.height = 0;
     }
@@ -175,7 +180,10 @@ export class Drawing {
         gl.enable(gl.BLEND);
         // Alpha is the light that is left. What is counted has alpha 0, and so adds up.
         gl.blendFuncSeparate(gl.DST_ALPHA, gl.ONE, gl.ZERO, gl.ONE_MINUS_SRC_ALPHA);
-        const { stop, marks } = this.options;
+        const { stop, marks, fixed } = this.options;
+        const large = fixed ? Infinity : this.options.large;
+        const { buffer, length } = this.shapes[large === Infinity ? 1 : 0];
+        gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
         const portion = stop ? Math.min(PORTION, Math.max(1024, Math.ceil(count / marks))) : PORTION;
         for (let first = 0; first < count; first += portion) {
             if (stop && first) this.#mark();
@@ -187,9 +195,9 @@ export class Drawing {
             this.#bind(1, this.paint, use("u_paint"));
             gl.uniform2f(use("u_size"), this.width, this.height);
             gl.uniform1i(use("u_first"), first);
-            gl.uniform1f(use("u_large"), this.options.fixed ? Infinity : this.options.large);
+            gl.uniform1f(use("u_large"), large);
             const quads = Math.min(portion, count - first);
-            gl.drawElements(gl.TRIANGLES, quads * 18, gl.UNSIGNED_SHORT, 0);
+            gl.drawElements(gl.TRIANGLES, quads * length, gl.UNSIGNED_SHORT, 0);
         }
         gl.disable(gl.DEPTH_TEST);
         gl.disable(gl.BLEND);
