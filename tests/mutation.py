@@ -8,6 +8,7 @@ if less than the wanted share of any module's was noticed.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import math
 import os
@@ -38,6 +39,8 @@ def main() -> int:
     parser.add_argument("--wanted", type=float, default=0.85, help="share of each module (0.85)")
     parser.add_argument("--table", action="store_true", help="run nothing, print what is known")
     words = parser.parse_args()
+    if not words.table and importlib.util.find_spec("mutmut") is None:
+        parser.error("mutmut is not installed: pip install 'mutmut>=3.8,<4'")
     if not words.table:
         if _is_stale():
             _mutmut(words.processes, [PROBE])  # makes all of them, where a module has changed
