@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.errors import InputError, ModelFileError
-from fragprune_plugins.storage.ply import SplatFile, read_ply, write_ply
+from fragprune_plugins.storage.ply import SplatFile, expect_drawable, read_ply, write_ply
 
 
 def same(a: SplatFile, b: SplatFile) -> bool:
@@ -221,3 +221,30 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         write_ply(path, tiny.random_model(5))
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["m.ply"]
+
+
+def test_kept_rows_stay_in_their_order_with_all_that_they_have():
+    model = replace(
+        tiny.random_model(6), thresholds=torch.linspace(0.1, 0.6, 6), filter_3d=torch.rand(6, 1)
+    )
+    mask = torch.tensor([True, False, True, True, False, False])
+    kept = model.keep(mask)
+    assert len(kept) == 3
+    for each in fields(SplatFile):
+        assert torch.equal(getattr(kept, each.name), getattr(model, each.name)[mask])
+    assert tiny.random_model(6).keep(mask).thresholds is None
+
+
+def test_a_checkpoint_is_told_from_a_broken_ply(tmp_path):
+    path = tmp_path / "chkpnt7000.pth"
+    path.write_bytes(b"PK")
+    with pytest.raises(ModelFileError, match="checkpoint"):
+        read_ply(path)
+
+
+def test_a_value_that_cannot_be_drawn_names_the_file(tmp_path):
+    model = tiny.random_model(4)
+    model.opacity[2] = torch.nan
+    with pytest.raises(ModelFileError, match="opacity") as stated:
+        expect_drawable(tmp_path / "a.spz", model)
+    assert stated.value.where == str(tmp_path / "a.spz")
