@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fragprune_plugins.cli.common import (
+    CAMERAS_HELP,
     FILE,
     MODEL,
     Command,
@@ -36,8 +37,7 @@ LARGEST = 1600
 @click.option(
     "--cameras",
     type=FILE,
-    help="cameras.json of a 3DGS model, transforms*.json, or nerfstudio's camera_path.json. "
-    "Default: the cameras.json that the training of MODEL wrote, if there is one.",
+    help=f"{CAMERAS_HELP}, if there is one.",
 )
 @click.option("--data", type=FILE, help="Scene folder whose cameras look; no image is needed.")
 @click.option("--orbit", "side", flag_value="orbit", help="Generate cameras all around it.")

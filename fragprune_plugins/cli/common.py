@@ -362,6 +362,11 @@ DATA_HELP = (
     "(transforms.json)."
 )
 
+CAMERAS_HELP = (
+    "cameras.json of a 3DGS model, transforms*.json, or nerfstudio's camera_path.json. "
+    "Default: the cameras.json that the training of MODEL wrote"
+)
+
 TRAINED_ON = "Default: the photographs that MODEL was trained on, by the cfg_args of its host."
 
 image_options = together(

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from fragprune_plugins.cli.common import (
+    CAMERAS_HELP,
     FILE,
     MODEL,
     Command,
@@ -43,8 +44,7 @@ def _direction(
 @click.option(
     "--cameras",
     type=FILE,
-    help="cameras.json of a 3DGS model, transforms*.json, or nerfstudio's camera_path.json. "
-    "Default: the cameras.json that the training of MODEL wrote.",
+    help=f"{CAMERAS_HELP}.",
 )
 @click.option("--data", type=FILE, help="Scene folder whose cameras draw, instead of --cameras.")
 @click.option(

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fragprune_plugins.cli.common import FILE, MODEL, Command, Report
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.cli.common import CAMERAS_HELP, FILE, MODEL, Command, Report
+from fragprune_plugins.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
     from fragprune_plugins.viewer.site import Shown, Site
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 @click.option(
     "--cameras",
     type=FILE,
-    help="cameras.json of a 3DGS model, transforms*.json, or nerfstudio's camera_path.json. "
-    "Default: the cameras.json that the training of MODEL wrote, if there is one.",
+    help=f"{CAMERAS_HELP}, if there is one.",
 )
 @click.option("--out", type=FILE, help="Write the viewer into this folder instead of serving it.")
 @click.option("--single-file", is_flag=True, help="With --out: one HTML file that holds it all.")
@@ -74,6 +73,7 @@ def command(
     from fragprune_plugins.viewer.site import Layer, make_site, save_site, single_page
 
     if out is not None:
+        _spare_other_pages(out)
         writable_folder(out)
     loaded = [models.load(each) for each in (model, compare) if each is not None]
     truncated = [each.thresholds is not None for each in loaded]
@@ -161,3 +161,19 @@ def _serve(site: Site, port: int, *, browse: bool) -> str:
         except KeyboardInterrupt:
             click.echo("", err=True)
         return where
+
+
+def _spare_other_pages(out: Path) -> None:
+    """Raise OutputError if the folder has a page of somebody else's under our page's name."""
+    page = out / "index.html"
+    if not page.is_file():
+        return
+    with open(page, "rb") as file:
+        ours = b'content="fragprune view"' in file.read(4096)
+    if not ours:
+        raise OutputError(
+            str(page),
+            "a page that fragprune view did not write",
+            "a folder of its own",
+            "Name one.",
+        )

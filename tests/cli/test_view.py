@@ -35,6 +35,21 @@ def test_a_folder_with_cameras_and_photographs(scene, tmp_path):
     assert report["truncated"] == [True]
 
 
+@pytest.mark.parametrize("single", [(), ("--single-file",)])
+def test_a_page_of_somebody_else_is_not_overwritten(scene, tmp_path, single):
+    _, path = scene
+    run_json("view", path, "--out", tmp_path / "page", *single)
+    run_json("view", path, "--out", tmp_path / "page", *single)  # our own may be
+    own = tmp_path / "website" / "index.html"
+    own.parent.mkdir()
+    own.write_text("<!doctype html><title>My site</title>")
+    result = run("view", path, "--out", own.parent, *single)
+    assert result.exit_code == 1
+    assert "did not write" in result.stderr
+    assert own.read_text().endswith("My site</title>")
+    assert list(own.parent.iterdir()) == [own]
+
+
 def test_two_models_are_two_sides(scene, tmp_path):
     _, path = scene
     other = tmp_path / "other.ply"
