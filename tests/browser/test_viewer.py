@@ -225,6 +225,43 @@ def test_hands_and_keys(browser, tmp_path):
         assert tab.errors == tab.strangers == []
 
 
+def test_slow_frames_stay_small_while_the_camera_turns(browser, tmp_path):
+    """A hand waits for the frame it sees; the wait is no rest, which would be drawn in full size."""
+    write_page(tmp_path, [a_model()], a_view())
+    with viewing(browser, tmp_path) as tab:
+        tab.page.wait_for_function("viewer.counted")
+        sizes = tab.run(
+            """async () => {
+                const { gl } = viewer.drawing, until = new Map(), sizes = [];
+                const real = { fence: gl.fenceSync, state: gl.getSyncParameter };
+                gl.fenceSync = (...given) => {
+                    const fence = real.fence.call(gl, ...given);
+                    until.set(fence, performance.now() + 400);  // longer than a hand may rest
+                    return fence;
+                };
+                gl.getSyncParameter = (fence, name) =>
+                    performance.now() < until.get(fence) ? 0 : real.state.call(gl, fence, name);
+                const draw = viewer.draw.bind(viewer);
+                viewer.draw = (quality = 1) => { sizes.push(quality); draw(quality); };
+                const pause = (time = 10) => new Promise(done => setTimeout(done, time));
+                viewer.quality = 0.5;
+                for (let turn = 0; turn < 4; turn++) {
+                    const { position } = viewer.camera, drawn = sizes.length;
+                    viewer.go({ ...viewer.camera, position: position.map(each => each + 0.01) });
+                    while (sizes.length === drawn || viewer.pending) await pause();
+                    await pause(60);  // to see it, and to go on
+                }
+                const turning = sizes.slice();
+                while (!viewer.sharp) await pause();
+                return { turning, resting: sizes.at(-1) };
+            }"""
+        )
+        assert len(sizes["turning"]) >= 4
+        assert max(sizes["turning"]) <= 0.5
+        assert sizes["resting"] == 1
+        assert tab.errors == []
+
+
 def test_one_page_from_disk(browser, tmp_path):
     model, view = a_model(), a_view()
     layers = [Layer("it", 0, False)]
