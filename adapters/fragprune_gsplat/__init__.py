@@ -6,29 +6,36 @@ and draws; strategies change rows through a handful of functions that treat ever
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapting import (
-    Dialect,
     Finding,
     HostAdapter,
     HostInfo,
     HostRepo,
     Role,
     RowTrace,
+    ScriptAdapter,
     Seam,
     SeamCall,
     SessionError,
     hookimpl,
+    revised,
 )
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from fragprune_gsplat.dialect import GsplatDialect
+
 PACKAGE = "gsplat"
 RENDERING, OPERATIONS = f"{PACKAGE}.rendering", f"{PACKAGE}.strategy.ops"
+EXPORTER = f"{PACKAGE}.exporter"
 DEFAULT, MCMC = f"{PACKAGE}.strategy.default", f"{PACKAGE}.strategy.mcmc"
 ROWS = "fragprune_rows"
 """Key under which row numbers ride along while a strategy changes rows."""
@@ -50,19 +57,21 @@ def optimizers(call: SeamCall) -> list[Any]:
 
 @contextmanager
 def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Store row numbers under one more key; gsplat treats a key without an optimizer as frozen.
+    """Store row numbers under one more key, with an optimizer: 1.4 asks every key for one.
 
     float64 holds every row number exactly.
     """
     import torch
 
-    model, trace = call.model, RowTrace()
+    model, trace, optimizers = call.model, RowTrace(), call.arguments["optimizers"]
     rows = len(model["means"])
     numbers = torch.arange(rows, dtype=torch.float64, device=model["means"].device)
     model[ROWS] = torch.nn.Parameter(numbers, requires_grad=False)
+    optimizers[ROWS] = torch.optim.SGD([model[ROWS]])
     try:
         yield trace
     finally:
+        del optimizers[ROWS]
         origins = model.pop(ROWS).detach().long()
     places = torch.arange(len(origins), device=origins.device)
     fresh = torch.zeros_like(places, dtype=torch.bool)
@@ -76,6 +85,36 @@ def tracing(call: SeamCall) -> Iterator[RowTrace]:
     trace.origins, trace.fresh = origins, fresh
 
 
+def answered(name: str) -> Callable[[SeamCall], Any]:
+    """Our answer to a function, imported when it is first called: it loads torch."""
+
+    def how(call: SeamCall) -> Any:
+        return getattr(import_module("fragprune_gsplat.answers"), name)(call)
+
+    return how
+
+
+def splats_in(saved: Any) -> Tensor | None:
+    """(N, 3) the means in what ``torch.save`` and ``torch.load`` are given; None without any.
+
+    They are in a dict of parameters, or under "splats" as gsplat's own trainer has it.
+    """
+    import torch
+
+    found = saved.get("splats", saved) if isinstance(saved, Mapping) else None
+    if not isinstance(found, Mapping) or not {"means", "quats", "opacities"} <= found.keys():
+        return None
+    return found["means"] if isinstance(found["means"], torch.Tensor) else None
+
+
+def read_again(call: SeamCall) -> tuple[Path, Tensor] | None:
+    """The file and its means, if ``torch.load`` read parameters from one."""
+    file, means = call.arguments["f"], splats_in(call.result)
+    if means is None or not isinstance(file, str | os.PathLike):
+        return None
+    return Path(file), means.detach().cpu()
+
+
 def _operation(name: str, *needs: str) -> Seam:
     return Seam(Role.REARRANGE, OPERATIONS, name, ("params", "optimizers", *needs), how=tracing)
 
@@ -87,19 +126,24 @@ class Gsplat(HostAdapter):
     info = HostInfo(
         "gsplat",
         repo="nerfstudio-project/gsplat",
-        states="1.5, 1.6 (pinhole cameras)",
+        states="1.4, 1.5, 1.6 (pinhole cameras)",
         limits=(
             "Refused by name: other cameras, distortion, the unscented transform, distributed, "
             "batches, channels other than three, tiles other than 16 pixels.",
-            "absgrad is refused while positions train; MCMCStrategy of 1.6 needs a GPU until "
-            "stage 2.",
+            "absgrad is refused while positions train; so are several GPUs in one training.",
+            "Its own examples/simple_trainer.py cannot resume: both stages are one run.",
         ),
     )
     installed = (PACKAGE,)
     steps_by_rendering = True
     appearance = HostAdapter.appearance | {"colors"}
-    seams = (
-        Seam(Role.RASTERIZE, RENDERING, "rasterization", ("means", "opacities", "viewmats", "Ks")),
+    seams: tuple[Seam, ...] = (
+        Seam(
+            Role.RASTERIZE,
+            RENDERING,
+            "rasterization",
+            ("means", "opacities", "viewmats", "Ks", "covars"),
+        ),
         Seam(Role.VIEW, RENDERING, "rasterization", ("viewmats",)),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(
@@ -119,8 +163,30 @@ class Gsplat(HostAdapter):
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_pre_backward", ("params",)),
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_post_backward", ("params",)),
         Seam(Role.STILL, MCMC, "MCMCStrategy.step_post_backward", ("params",)),
-        Seam(Role.SAVE, f"{PACKAGE}.exporter", "export_splats", ("save_to", "means", "format")),
+        Seam(
+            Role.ANSWER,
+            f"{PACKAGE}.relocation",
+            "compute_relocation",
+            ("opacities", "scales", "ratios", "binoms"),
+            how=answered("relocation"),
+        ),
+        Seam(
+            Role.ANSWER,
+            f"{PACKAGE}.cuda._wrapper",
+            "quat_scale_to_covar_preci",
+            ("quats", "scales", "compute_covar", "compute_preci", "triu"),
+            how=answered("covariance"),
+        ),
+        Seam(Role.ANSWER, f"{PACKAGE}.distributed", "cli", ("fn", "args"), how=answered("alone")),
+        Seam(Role.SAVE, "torch", "save", ("f", "obj"), external=True),
+        Seam(Role.UNPACK, "torch", "load", ("f",), external=True, how=read_again),
+        Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format")),
     )
+
+    def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
+        """All; versions before 1.5.1 export nothing."""
+        exports = repo.path(EXPORTER) is not None
+        return self.seams if exports else revised(self.seams, {"export_splats": None})
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check that this is the installed package."""
@@ -137,19 +203,34 @@ class Gsplat(HostAdapter):
             )
         ]
 
-    def dialect(self, repo: HostRepo) -> Dialect:
-        """The version's dialect: until 1.5 alpha's cap is 0.999, and antialiasing has no floor."""
+    def dialect(self, repo: HostRepo) -> GsplatDialect:
+        """The version's dialect, read off its source.
+
+        Until 1.4 the extents are squares of 3 sigma. Until 1.5 alpha's cap is 0.999, and
+        antialiasing has no floor.
+        """
         from fragprune_gsplat.dialect import GsplatDialect
 
-        if "1.6" in repo.commit or repo.path(f"{PACKAGE}.cuda._constants"):
-            return GsplatDialect(alpha_max=0.99, floor=0.005)
-        return GsplatDialect(alpha_max=0.999, floor=0.0)
+        if repo.path(f"{PACKAGE}.cuda._constants"):
+            return GsplatDialect(alpha_max=0.99, floor=0.005, tight=True)
+        projects = repo.parameters(f"{PACKAGE}.cuda._wrapper", "fully_fused_projection") or ()
+        return GsplatDialect(alpha_max=0.999, floor=0.0, tight="opacities" in projects)
+
+    def trainer(self, script: Path) -> ScriptAdapter | None:
+        """The adapter of gsplat's own training script, if this is it."""
+        from fragprune_gsplat import trainer
+
+        return trainer.SimpleTrainer(script) if trainer.recognised(script) else None
 
     def model_of(self, call: SeamCall) -> Any:
         """The dict that a strategy changes, or the means if a call has only them."""
         import torch
 
-        params = call.arguments.get("params", call.arguments.get("means"))
+        given = call.arguments
+        if "obj" in given:  # of torch.save
+            to_file = isinstance(given["f"], str | os.PathLike)
+            return splats_in(given["obj"]) if to_file else None
+        params = given.get("params", given.get("means"))
         if isinstance(params, dict):
             raise SessionError(
                 "params",
@@ -157,7 +238,7 @@ class Gsplat(HostAdapter):
                 "torch.nn.ParameterDict",
                 "Convert it: params = torch.nn.ParameterDict(params).",
             )
-        if call.arguments.get("format", "ply") != "ply":
+        if given.get("format", "ply") != "ply":
             return None  # other formats sort their rows
         return params if isinstance(params, torch.nn.ParameterDict | torch.Tensor) else None
 

@@ -29,12 +29,15 @@ def photographs(tmp_path_factory):
 
 @pytest.fixture
 def session_on():
-    """``session_on(adapter, settings)``: the installed host under a session, its modules fresh."""
+    """``session_on(adapter, settings)``: the installed host under a session, its modules fresh.
+
+    ``path`` is another folder that holds the host's package.
+    """
 
     @contextmanager
-    def begin(adapter, settings=None, **options):
+    def begin(adapter, settings=None, path=None, **options):
         driver = DRIVERS[adapter.name]()
-        path = HostRepo.installed(driver.package).root
+        path = path or HostRepo.installed(driver.package).root
         with running(settings, adapter=adapter, path=path, driver=driver, **options) as host:
             yield host.session
 
@@ -43,6 +46,6 @@ def session_on():
 
 def pytest_ignore_collect(collection_path):
     """Where a host is not installed there is nothing to test it with."""
-    needs = {"test_gaussian_splatting.py": "gaussian_splatting", "test_gsplat.py": "gsplat"}
-    package = needs.get(collection_path.name)
+    needs = {"test_gaussian_splatting.py": "gaussian_splatting"}
+    package = needs.get(collection_path.name, "gsplat")
     return True if package and find_spec(package) is None else None
