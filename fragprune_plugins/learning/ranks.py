@@ -7,6 +7,7 @@ summed over all of them, and each takes the same optimizer step, so replicas sta
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +25,6 @@ PATIENCE = 600.0
 """Seconds to wait for the other processes before this one ends with an error."""
 
 _PIECE = 1 << 22  # numbers of a tensor that are summed at once
-_SAID = "fragprune-said"
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,9 @@ def joined(device: torch.device) -> Iterator[Ranks]:
         ) from error
     try:
         yield ranks
+    except BaseException:
+        speaks()  # before the others notice that this process is gone
+        raise
     finally:
         dist.destroy_process_group()
 
@@ -174,20 +177,20 @@ def speaks() -> bool:
     """
     if not launched().several or os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
         return True
+    asked = ("MASTER_ADDR", "MASTER_PORT", "TORCHELASTIC_RESTART_COUNT")
+    return _asks_first(*(os.environ.get(name, "0") for name in asked))
+
+
+@functools.cache
+def _asks_first(address: str, port: str, attempt: str) -> bool:
     from datetime import timedelta
 
     from torch.distributed import TCPStore  # type: ignore[attr-defined]
 
-    key = f"{_SAID}-{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}"
     try:
-        store = TCPStore(
-            os.environ["MASTER_ADDR"],
-            int(os.environ["MASTER_PORT"]),
-            is_master=False,
-            timeout=timedelta(seconds=5),
-        )
-        return int(store.add(key, 1)) == 1
-    except (RuntimeError, ValueError, KeyError):
+        store = TCPStore(address, int(port), is_master=False, timeout=timedelta(seconds=5))
+        return int(store.add(f"fragprune-said-{attempt}", 1)) == 1
+    except (RuntimeError, ValueError):
         return True
 
 
