@@ -6,6 +6,10 @@ import csv
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -167,3 +171,38 @@ def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):
     result = run(*words(scene, tmp_path / "out.ply"))
     assert result.exit_code == 1
     assert "Start them with torchrun" in result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [2, 4])
+def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(scene, tmp_path, size):
+    """The same, with the real launcher, whose exit code is 1 then."""
+    out, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    launcher += ["--nproc_per_node", str(size), "-m", "fragprune_plugins"]
+    line = [*launcher, *map(str, words(scene, out, "--iters", 300, "--checkpoint-every", 0.001))]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run_:
+        children = Path(f"/proc/{run_.pid}/task/{run_.pid}/children")
+        while not out.with_suffix(".fragprune-unfinished").exists():
+            assert run_.poll() is None, run_.stderr.read()
+            time.sleep(0.1)
+        last = max(map(int, children.read_text().split()))
+        os.kill(last, signal.SIGKILL)
+        said, error = run_.communicate(timeout=60)
+    assert run_.returncode == 1
+    assert said == ""
+    assert error.count("[ranks]") == 1
+    assert f"exitcode  : -9 (pid: {last})" in error
+    assert not out.exists()
+    done = subprocess.run(line, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert "resuming at step" in done.stderr
+    assert done.stdout.count("PSNR, dB") == 1
+    run_json(*words(scene, whole, "--iters", 300, "--views-per-step", size))
+    if size == 2:
+        assert pair(out) == pair(whole)
+    assert {name for name in names(tmp_path) if "out" in name or name[0] == "."} == {
+        "out.ply",
+        "out.fragprune.safetensors",
+        "out.fragprune.json",
+    }
