@@ -140,6 +140,7 @@ def joined(device: torch.device) -> Iterator[Ranks]:
         return
     from datetime import timedelta
 
+    import torch
     import torch.distributed as dist
 
     if not dist.is_available():
@@ -149,6 +150,8 @@ def joined(device: torch.device) -> Iterator[Ranks]:
             "a torch with it",
             "Install the torch of pytorch.org, or start one process.",
         )
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
     try:
         dist.init_process_group(
             "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",

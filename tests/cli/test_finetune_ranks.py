@@ -164,6 +164,12 @@ def test_max_drop_trains_again_and_again_together(scene, tmp_path):
     assert pair(one) == pair(two)
 
 
+def test_the_default_sees_as_many_views_in_fewer_steps(scene, tmp_path):
+    data, path = scene
+    asked = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--quick")
+    assert run_json(*asked, "--views-per-step", 50)["iterations"] == 20
+
+
 def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):
@@ -206,3 +212,19 @@ def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(scene, tmp_path, si
         "out.fragprune.safetensors",
         "out.fragprune.json",
     }
+
+
+@pytest.mark.gpu
+def test_two_gpus_learn_what_one_does_with_two_views_a_step(scene, tmp_path):
+    """Replicas are compared at the end; sums on a GPU have no fixed order, so figures are near."""
+    if torch.cuda.device_count() < 2:
+        pytest.skip("needs two GPUs")
+    one, two = tmp_path / "one.ply", tmp_path / "two.ply"
+    whole = run_json(*words(scene, one, "--views-per-step", 2, "--device", "cuda:0"))
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    launcher += ["--nproc_per_node", "2", "-m", "fragprune_plugins"]
+    line = [*launcher, *map(str, words(scene, two, "--device", "cuda", "--json"))]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["after"]["psnr"] == pytest.approx(whole["after"]["psnr"], abs=0.05)

@@ -64,9 +64,9 @@ def test_two_processes_learn_what_one_does_with_as_many_views_to_the_bit(model, 
 
 
 def require_near(one, other):
-    """Equal but for the order in which gradients were summed, in float32."""
-    for name in ("opacity", "f_dc", "xyz", "logits"):
-        assert torch.allclose(one[0][name], other[0][name], rtol=0, atol=2e-4), name
+    """Equal but for the order in which gradients were summed, in float32: a few last bits."""
+    for name, tensor in one[0].items():
+        assert torch.allclose(tensor, other[0][name], rtol=1e-6, atol=1e-6), name
 
 
 def test_four_processes_are_replicas_and_near_one_with_four_views(model, dataset):
