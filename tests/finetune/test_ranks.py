@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.finetuning import finetune, loop
+from fragprune_plugins.finetuning import Checkpoints, finetune, loop
 from fragprune_plugins.learning import ranks as module
 from fragprune_plugins.learning.ranks import Ranks, fingerprint, launched, speaks
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -112,6 +112,21 @@ def test_processes_with_other_photographs_are_refused_before_a_step(model, datas
     one, other = messages(learn(2, work))
     assert "process 1 of 2 with other photographs than process 0" in one
     assert one == other
+
+
+def test_a_process_that_does_not_see_the_checkpoint_is_noticed(model, dataset, tmp_path):
+    settings = Settings(iterations=4, views_per_step=2)
+    kept = Checkpoints(tmp_path / "0", None, 2)
+    finetune(model, dataset, settings, engine="cpu", checkpoints=kept)
+
+    def work(ranks):
+        own = Checkpoints(tmp_path / str(ranks.rank), None, 2)
+        return finetune(model, dataset, settings, engine="cpu", checkpoints=own, ranks=ranks)
+
+    one, other = messages(learn(2, work))
+    assert "process 1 of 2 with other checkpoint than process 0" in one
+    assert one == other
+    assert not (tmp_path / "1").exists()
 
 
 def test_replicas_that_part_are_noticed_and_named(model, dataset, monkeypatch):
