@@ -115,7 +115,7 @@ class SessionError(FragpruneError):
 
 
 class RanksError(FragpruneError):
-    """Several processes train one model together (torchrun, DDP); thresholds learn in one only."""
+    """Several processes (torchrun, DDP) that cannot learn one model together, or parted."""
 
     code = "ranks"
 

@@ -28,6 +28,7 @@ from fragprune_plugins.errors import (
     printable,
 )
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
+from fragprune_plugins.learning.ranks import launched, local_rank, speaks
 from fragprune_plugins.storage.records import strict
 
 if TYPE_CHECKING:
@@ -78,7 +79,8 @@ class ModelFile(click.Path):
             found = newest_model(path)
         except ModelFileError as error:
             self.fail(f"'{path}' is {error.found}. {error.remedy}", param, ctx)
-        click.echo(f"Model: {found}", err=True)
+        if launched().first:
+            click.echo(f"Model: {found}", err=True)
         return found
 
 
@@ -113,7 +115,7 @@ def log_option(function: Function) -> Function:
     )
     @functools.wraps(function)
     def logged(*args: Any, logs: tuple[tuple[str, str], ...], **kwargs: Any) -> Any:
-        if not logs:
+        if not logs or not launched().first:
             return function(*args, **kwargs)
         from fragprune_plugins.plugins.logs import logging_steps
 
@@ -239,6 +241,8 @@ class Report:
 class Command(click.Command):
     """A command whose function returns a ``Report``: prints it and sets the exit code.
 
+    Of several processes one prints; None says that another one reports.
+
     A ``FragpruneError`` gives exit code 1, a usage error 2, Ctrl-C 130, SIGTERM during learning
     143. Any other exception keeps its traceback.
     """
@@ -270,12 +274,11 @@ class Command(click.Command):
         as_json = ctx.meta[JSON] = bool(ctx.params.pop("as_json"))
         try:
             with _machine_stated(ctx.command_path):
-                report: Report = super().invoke(ctx)
+                report: Report | None = super().invoke(ctx)
         except FragpruneError as error:
-            if as_json:
-                click.echo(json.dumps({"error": error.as_dict()}))
-            else:
-                click.echo(str(error), err=True)
+            if speaks():
+                said = json.dumps({"error": error.as_dict()}) if as_json else str(error)
+                click.echo(said, err=not as_json)
             codes: dict[type[FragpruneError], int] = {
                 UsageError: 2,
                 Interrupted: 130,
@@ -283,8 +286,11 @@ class Command(click.Command):
             }
             ctx.exit(codes.get(type(error), 1))
         except KeyboardInterrupt as error:
-            click.echo("Interrupted.", err=True)
+            if speaks():
+                click.echo("Interrupted.", err=True)
             ctx.exit(EXIT_CODE if isinstance(error, Terminate) else 130)
+        if report is None:
+            ctx.exit(0)
         click.echo(json.dumps(strict(report.data)) if as_json else printable(report.text))
         ctx.exit(report.exit_code)
 
@@ -337,6 +343,8 @@ def usage_error(error: click.UsageError, words: list[str]) -> Exception:
         error: click's error.
         words: words of the command line. Words after ``--`` belong to the host's command.
     """
+    if not speaks():
+        return click.exceptions.Exit(2)
     ours = words[: words.index("--")] if "--" in words else words
     if "--json" not in ours:
         return error
@@ -506,6 +514,20 @@ def bound_threads(threads: int | None) -> None:
         torch.set_num_threads(threads)
 
 
+@contextlib.contextmanager
+def one_voice() -> Iterator[None]:
+    """Inside, only the first of several processes prints."""
+    if launched().first:
+        yield
+        return
+    with (
+        open(os.devnull, "w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+    ):
+        yield
+
+
 def open_engine(engine: str, device: str, threads: int | None) -> tuple[Engine, torch.device]:
     """Open the engine of the options.
 
@@ -526,6 +548,8 @@ def open_engine(engine: str, device: str, threads: int | None) -> tuple[Engine, 
 
     bound_threads(threads)
     where = device_for(device, engine)
+    if launched().several and device in ("auto", "cuda") and where.type == "cuda":
+        where = device_for(f"cuda:{local_rank()}", engine)
     return engine_for(engine, where), where
 
 

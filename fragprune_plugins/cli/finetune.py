@@ -21,6 +21,7 @@ from fragprune_plugins.cli.common import (
     engine_options,
     image_options,
     log_option,
+    one_voice,
     open_engine,
     photographs_for,
     require_place,
@@ -28,6 +29,7 @@ from fragprune_plugins.cli.common import (
 from fragprune_plugins.cli.learning import learning_options
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.interruption import sigterm_interrupts
+from fragprune_plugins.learning.ranks import Ranks, joined, launched
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import formats, models
 from fragprune_plugins.storage.atomic import locked
@@ -96,6 +98,16 @@ def _share(
     "--target-speedup counts from what is left.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")
+@click.option(
+    "--views-per-step",
+    type=click.IntRange(min=1),
+    default=lambda: launched().size,
+    show_default="one for each process",
+    metavar="N",
+    help="Views whose mean loss a step descends on. Without --iters, steps are N times fewer; "
+    "learning rates are the square root of N times higher. More than one serves several "
+    "processes under torchrun, which draw them side by side.",
+)
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
 @click.option(
     "--curves", type=OutFile(".png"), help="File for a picture of the learning curves (.png)."
@@ -120,6 +132,7 @@ def _share(
     "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
 )
 @engine_options
+@one_voice()
 def command(
     model: Path,
     out: Path,
@@ -141,7 +154,7 @@ def command(
     engine: str,
     device: str,
     threads: int | None,
-) -> Report:
+) -> Report | None:
     """Learn how far each Gaussian of MODEL must reach.
 
     Thresholds and all other parameters adapt to each other on the photographs in --data. With
@@ -175,8 +188,9 @@ def command(
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
     _require_sense(data, itself, cameras, settings, max_drop, keep)
-    require_place(out, model, thresholds=settings.truncate and not settings.portable)
-    click.get_current_context().with_resource(locked(out, wait=0, what="run"))
+    if launched().first:
+        require_place(out, model, thresholds=settings.truncate and not settings.portable)
+        click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
     from copy import deepcopy
 
@@ -206,14 +220,22 @@ def command(
     checkpoints = Checkpoints(resuming.path_beside(out), every or None, tell=_say)
     asked = resuming.configuration(*whole, dataset, settings, rasterizer.name)
     asked |= {"drop_invisible": drop, "keep": keep, "max_drop": max_drop}
-    if again:
-        checkpoints.clear()
-    elif (finished := finetuned.finished(model, out, asked, curves)) is not None:
-        checkpoints.clear()
-        return finished
     with sigterm_interrupts():
-        kept = _keep(whole, keep, dataset.to(where), rasterizer)
-        result, found = _learn(kept, dataset, settings, max_drop, rasterizer, checkpoints)
+        with joined(where) as ranks:
+            finished = None
+            if again and ranks.first:
+                checkpoints.clear()
+            elif ranks.first:
+                finished = finetuned.finished(model, out, asked, curves)
+            if ranks.gather(finished is not None)[0]:
+                checkpoints.clear()
+                return finished
+            kept = _keep(whole, keep, dataset.to(where), rasterizer)
+            result, found = _learn(
+                kept, dataset, settings, max_drop, rasterizer, checkpoints, ranks
+            )
+        if not ranks.first:
+            return None
         save(out, result)
     if result.terminated:  # after SIGTERM there is no time for measurements
         return finetuned.terminated(model, out, result, found)
@@ -255,6 +277,7 @@ def _learn(
     max_drop: float | None,
     engine: Engine,
     checkpoints: Checkpoints,
+    ranks: Ranks,
 ) -> tuple[FinetuneResult, Bounded | None]:
     """Fine-tune once, or as often as --max-drop needs."""
     from fragprune_plugins.bench.calibration import prices_of
@@ -264,7 +287,15 @@ def _learn(
     splat, store = model
     if max_drop is not None:
         found = strongest(
-            splat, dataset, settings, max_drop, store=store, engine=engine, progress=True, say=_say
+            splat,
+            dataset,
+            settings,
+            max_drop,
+            store=store,
+            engine=engine,
+            progress=True,
+            say=_say,
+            ranks=ranks,
         )
         return found.result, found
     timed = settings.target_time is not None
@@ -277,6 +308,7 @@ def _learn(
         engine=engine,
         progress=True,
         checkpoints=checkpoints,
+        ranks=ranks,
     )
     return result, None
 

@@ -10,7 +10,12 @@ import click
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE, PORTABLE_ELASTICITY
-from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
+from fragprune_plugins.learning.schedule import (
+    FINETUNE_ITERATIONS,
+    QUICK_ITERATIONS,
+    Settings,
+    steps_of,
+)
 
 _OPTIONS = (
     click.option(
@@ -99,8 +104,8 @@ _EXCLUDE = (
 def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of learning to a command.
 
-    The command gets their values, and its own ``seed`` and ``itself`` if it has them, as
-    ``settings``; ``max_drop`` apart, because it is a bound for several trainings.
+    The command gets their values, and its own ``seed``, ``itself`` and ``views_per_step`` if it has
+    them, as ``settings``; ``max_drop`` apart, because it is a bound for several trainings.
 
     Raises:
         UsageError: options contradict each other, or a value is out of range.
@@ -135,8 +140,9 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 raise UsageError("options", f"{one} with {other}", "one of the two", "Remove one.")
         itself = kwargs.get("itself", False)
         default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
+        views = kwargs.pop("views_per_step", 1)
         settings = Settings(
-            iterations=default if iters is None else iters,
+            iterations=steps_of(default, views) if iters is None else iters,
             train=train,
             pressure=pressure,
             target_speedup=target_speedup,
@@ -145,6 +151,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
             portable=portable,
             truncate=not control,
             seed=kwargs.get("seed", 0),
+            views_per_step=views,
             nonfinite=nonfinite,
         )
         return function(*args, settings=settings, **kwargs)

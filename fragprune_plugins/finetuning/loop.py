@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import random
+import signal
 import statistics
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import accumulate, islice
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,10 @@ from fragprune_plugins.errors import AlignmentError, CheckpointError, SidecarErr
 from fragprune_plugins.finetuning.resuming import Checkpoints, configuration
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.learning.interruption import Terminate, between_steps
+from fragprune_plugins.learning.interruption import Terminate, Waiting, between_steps
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.pressure import CALIBRATION_VIEWS, FEWEST
+from fragprune_plugins.learning.ranks import Ranks, fingerprint
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2, evenly
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -45,9 +47,11 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs
 # tenth of these rates for shapes cut fewer fragments at no better PSNR.
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _UNFIT = (KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError)
 _POSTFIXES = 100  # times in a run that the bar says how it goes
+_COMPARE = 100  # steps from one comparison of replicas to the next
 _ROUNDS, _SECONDS = 7, 1.5  # at least, of timing frames for a target; a view's least time counts
 
 
@@ -99,6 +103,7 @@ def finetune(
     engine: str | Engine = "auto",
     progress: bool = False,
     checkpoints: Checkpoints | None = None,
+    ranks: Ranks | None = None,
 ) -> FinetuneResult:
     """Learn the thresholds of a trained splat on its photographs; portable, its shapes.
 
@@ -122,6 +127,9 @@ def finetune(
         checkpoints: where the unfinished fine-tuning is kept. If there is one of the same
             configuration, this goes on from it; on the cpu engine the result is then the same to
             the bit. Whoever saves the result clears them.
+        ranks: the processes that learn together (``ranks.joined``), each of which calls this with
+            equal arguments and gets the same result; only the first writes checkpoints, draws the
+            bar and tells observers. This one alone when None.
 
     Raises:
         EngineError: no such engine here.
@@ -129,9 +137,12 @@ def finetune(
         PluginError: a plugin raised, or gave an answer that cannot be used.
         AlignmentError: store and model differ in length.
         UsageError: a target time without prices, or one that no thresholds reach; portable with
-            thresholds, in the store or by a rule.
+            thresholds, in the store or by a rule; a target time, or views that cannot be divided,
+            in several processes.
+        RanksError: another process is gone, or differs.
         DivergedError: NaN or infinity in what trains.
     """
+    ranks = ranks or Ranks()
     settings, device = settings or Settings(), model.xyz.device
     if rule is not None:
         settings = replace(
@@ -153,6 +164,7 @@ def finetune(
             "a model without any: it is for viewers that know none",
             "Pass --no-truncation to ignore thresholds stored with the model.",
         )
+    _expect_divisible(settings, ranks)
     run = _Run(
         model,
         dataset,
@@ -162,11 +174,12 @@ def finetune(
         rule,
         cost,
         engine_for(engine, device) if isinstance(engine, str) else engine,
+        ranks,
     )
     run.start_keeping(checkpoints)
     resumed, interrupted, terminated = run.done, False, False
     try:
-        run.learn(progress)
+        run.learn(progress and ranks.first)
     except KeyboardInterrupt as error:
         interrupted, terminated = True, isinstance(error, Terminate)
         if run.between:
@@ -214,6 +227,26 @@ def save(path: Path, result: FinetuneResult) -> Path | None:
     return models.save(path, model, settings=result.settings.as_dict())
 
 
+def _expect_divisible(settings: Settings, ranks: Ranks) -> None:
+    """Check that several processes can share these settings' work."""
+    if not ranks.several:
+        return
+    if settings.target_time is not None:
+        raise UsageError(
+            "target time",
+            f"{ranks.size} processes, which would disturb each other's measurements",
+            "one process",
+            "Use --target-speedup, or start one process.",
+        )
+    if settings.views_per_step % ranks.size:
+        raise UsageError(
+            "views per step",
+            f"{settings.views_per_step} for {ranks.size} processes",
+            f"a multiple of {ranks.size}",
+            "Change --views-per-step.",
+        )
+
+
 class _Run:
     """One fine-tuning under way: drives stage 2 over the photographs of a data set."""
 
@@ -227,8 +260,10 @@ class _Run:
         rule: Callable[[Tensor], Tensor] | None,
         cost: Cost | None,
         engine: Engine,
+        ranks: Ranks,
     ) -> None:
         self.dataset, self.settings, self.engine = dataset, settings, engine
+        self.ranks = ranks
         self.start, self.rule = model, rule
         clock = None
         if settings.target_time is not None and cost is not None:
@@ -240,6 +275,7 @@ class _Run:
         }
         self.curves: list[StepStats] = []
         self.done, self.between = 0, True
+        self.ending = True  # a signal may end the run after this step
         self._started = time.perf_counter()
         self.checkpoints: Checkpoints | None = None
         again = {shot: partial(self._draw, shot) for shot in dataset.train}
@@ -262,9 +298,10 @@ class _Run:
             name: getattr(model, name).detach().clone().requires_grad_(True) for name in rates
         }
         self.model = replace(model, **parameters, thresholds=None)
-        self.rates = rates
+        self.rates = {name: rate * settings.rate for name, rate in rates.items()}
         self.optimizer = torch.optim.Adam(
-            [{"params": [parameters[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15
+            [{"params": [each], "lr": self.rates[name]} for name, each in parameters.items()],
+            eps=1e-15,
         )
 
     def result_model(self) -> SplatFile:
@@ -321,9 +358,8 @@ class _Run:
 
     def start_keeping(self, checkpoints: Checkpoints | None) -> None:
         """Go on from a checkpoint, if there is one, and write one from time to time."""
-        if checkpoints is None:
+        if checkpoints is None and not self.ranks.several:
             return
-        self.checkpoints = checkpoints
         self.asked = configuration(
             self.start,
             self.stage.store,
@@ -334,6 +370,12 @@ class _Run:
         )
         self.asked |= self.others
         del self.asked["nonfinite"]  # a run that such a step stopped may go on and skip it
+        if checkpoints is not None:
+            self._go_on(checkpoints)
+        self.ranks.agree({**self.asked, "checkpoint": self.done}, "fine-tuning, before step 1")
+
+    def _go_on(self, checkpoints: Checkpoints) -> None:
+        self.checkpoints = checkpoints if self.ranks.first else None
         tensors, values = checkpoints.load(self.asked, self.start.xyz.device)
         if not values:
             return
@@ -408,31 +450,36 @@ class _Run:
                 unit="it",
                 leave=None,
             ) as bar,
-            between_steps() as interrupted,
+            between_steps() as waiting,
         ):
-            for shot in islice(self._order(), self.done, None):
+            for shots in islice(self._order(), self.done, None):
                 self.between = False
-                self._learn_from(shot)
+                self._learn_from(shots, waiting)
                 self.between = True
-                interrupted()
+                if self.ending:
+                    waiting()
                 if self.checkpoints is not None and self.checkpoints.due(self.done):
                     self.keep()
                 bar.update()
                 if self.curves and self.done % max(1, total // _POSTFIXES) == 0:
-                    last = self.curves[-len(self.dataset.train) :]  # views differ more than steps
+                    views = len(self.dataset.train)  # they differ more than steps do
+                    last = self.curves[-max(1, views // self.settings.views_per_step) :]
                     loss, drawn = (
                         sum(getattr(point, name) for point in last) / len(last)
                         for name in ("loss", "fragments_per_pixel")
                     )
                     bar.set_postfix(loss=f"{loss:.4f}", fragments=f"{drawn:.1f}/px")
         self.stage.close()
+        if self.ranks.several:
+            self._compare()
         if self.rule is not None:
             self._follow(self.rule, torch.sigmoid(self.model.opacity[:, 0].detach()))
 
     def _watched(self, stats: StepStats) -> None:
         """Keep a finished step for the curves, and tell observers."""
         self.curves.append(stats)
-        installed().tell(hookspecs.fragprune_step, stats=stats)
+        if self.ranks.first:
+            installed().tell(hookspecs.fragprune_step, stats=stats)
 
     def _follow(self, rule: Callable[[Tensor], Tensor], opacities: Tensor) -> None:
         """Put what the rule gives for these opacities (N,) into the store."""
@@ -445,24 +492,31 @@ class _Run:
         self._follow(self.rule, inputs.splats.opacities.detach())
         return store.values.detach()
 
-    def _order(self) -> Iterator[Shot]:
-        """Permutations of the training views, one after the other, for all steps."""
+    def _order(self) -> Iterator[Sequence[Shot]]:
+        """For each step its views, from permutations of all training views one after the other."""
         stream = random.Random(self.settings.seed)
         queue: list[Shot] = []
         for _ in range(self.settings.iterations):
-            if not queue:
-                queue = list(self.dataset.train)
-                stream.shuffle(queue)
-            yield queue.pop()
+            shots: list[Shot] = []
+            for _ in range(self.settings.views_per_step):
+                if not queue:
+                    queue = list(self.dataset.train)
+                    stream.shuffle(queue)
+                shots.append(queue.pop())
+            yield shots
 
-    def _learn_from(self, shot: Shot) -> None:
+    def _learn_from(self, shots: Sequence[Shot], waiting: Waiting) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
-        stage.picture = shot.name
-        outputs, pressure = self._draw(shot)
-        loss = photometric_loss(shot.looked_at(outputs.image), shot.image)
-        stage.lost(loss)
-        torch.autograd.backward(loss if pressure is None else loss + pressure)
+        for shot in self.ranks.share(shots):
+            stage.picture = shot.name
+            outputs, pressure = self._draw(shot)
+            loss = photometric_loss(shot.looked_at(outputs.image), shot.image) / len(shots)
+            stage.lost(loss)
+            torch.autograd.backward(loss if pressure is None else loss + pressure)
+        stage.picture = ", ".join(shot.name for shot in shots)
+        if self.ranks.several:
+            self._exchange(shots, waiting)
         rates = self.rates.items()
         for group, (name, base) in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = stage.rate(name, base)
@@ -473,6 +527,46 @@ class _Run:
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()
         self.done += 1
+        if self.ranks.several and self.done % _COMPARE == 0:
+            self._compare()
+
+    def _compare(self) -> None:
+        """Stop unless all replicas are equal to the bit."""
+        tensors = {name: getattr(self.model, name) for name in self.rates}
+        tensors["thresholds"] = self.stage.store.logits
+        known = {name: fingerprint(tensor) for name, tensor in tensors.items()}
+        self.ranks.agree(known, f"fine-tuning, after step {self.done}")
+
+    @torch.no_grad()
+    def _exchange(self, shots: Sequence[Shot], waiting: Waiting) -> None:
+        """Sum the gradients over all processes; tell each all figures, and whether to end.
+
+        One reduction of one tensor: the gradients, a row of figures for each view, whether each
+        gradient is there, and whether Ctrl-C and SIGTERM wait.
+        """
+        leaves = [*(getattr(self.model, name) for name in self.rates), self.stage.store.logits]
+        rows, table = self.stage.figures(), leaves[0].new_zeros(len(shots), 4)
+        if rows:
+            table[self.ranks.rank :: self.ranks.size] = table.new_tensor(rows)
+        there = table.new_tensor([leaf.grad is not None for leaf in leaves])
+        signals = table.new_tensor([waiting.number == number for number in _SIGNALS])
+        gradients = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
+        parts = [*gradients, table, there, signals]
+        flat = torch.cat([part.reshape(-1) for part in parts])
+        self.ranks.sum(flat)
+        ends = accumulate(part.numel() for part in parts)
+        *sums, table, there, signals = (
+            flat[end - part.numel() : end].view_as(part)
+            for end, part in zip(ends, parts, strict=True)
+        )
+        for leaf, total, some in zip(leaves, sums, there.tolist(), strict=True):
+            leaf.grad = total if some else None
+        if rows:
+            self.stage.share(shots, table)
+        came = [number for number, some in zip(_SIGNALS, signals.tolist(), strict=True) if some]
+        self.ending = bool(came)  # one that comes later waits for the next exchange
+        if came and not waiting.number:
+            signal.raise_signal(came[0])  # it came to another process: all end after this step
 
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
         """Draw a view with its thresholds; also return the pressure."""

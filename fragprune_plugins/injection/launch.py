@@ -150,6 +150,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     from fragprune_plugins.plugins.hooks import engine_for, select_adapter
 
     options = options or RunOptions()
+    ranks.expect_no_launcher(command)
     script, arguments, module = split(command)
     plugins = installed()
     tie = partial(select_adapter, plugins=plugins)

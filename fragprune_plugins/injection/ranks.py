@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from fragprune_plugins.errors import RanksError
+from fragprune_plugins.learning.ranks import launched
+
+_LAUNCHERS = {"torchrun", "torch.distributed.run", "torch.distributed.launch", "accelerate"}
 
 
 def expect_one() -> None:
@@ -19,9 +23,7 @@ def expect_one() -> None:
     """
     import torch
 
-    said = os.environ.get("WORLD_SIZE", "")
-    ranks = int(said) if said.isdigit() else 1
-    found = f"WORLD_SIZE={said} in the environment"
+    ranks, found = launched().size, f"WORLD_SIZE={os.environ.get('WORLD_SIZE')} in the environment"
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         ranks = torch.distributed.get_world_size()
         found = f"torch.distributed with {ranks} processes"
@@ -30,6 +32,25 @@ def expect_one() -> None:
             "learning",
             found,
             "one process that trains the model",
-            "Train in several processes without fragprune. Then learn in one process: "
-            "fragprune run --stage finetune without torchrun, or fragprune finetune.",
+            "Train in several processes without fragprune. Then learn: fragprune run --stage "
+            "finetune without torchrun; or torchrun -m fragprune_plugins finetune, in several.",
+        )
+
+
+def expect_no_launcher(command: list[str]) -> None:
+    """Check that a host's command does not start several processes.
+
+    Raises:
+        RanksError: it is torchrun's, or another launcher's.
+    """
+    words = [Path(word).name for word in command[:3]]
+    if words and words[0].startswith("python") and words[1:2] == ["-m"]:
+        words = words[2:]
+    if words and words[0] in _LAUNCHERS:
+        raise RanksError(
+            "command",
+            f"{words[0]}, which starts several processes",
+            "the host's own script, in one process",
+            "Leave the launcher out: -- python train.py ... To use several GPUs, train without "
+            "fragprune, then torchrun -m fragprune_plugins finetune.",
         )

@@ -43,36 +43,51 @@ def sigterm_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+class Waiting:
+    """Signals that wait for the end of a step. Called, it lets the last of them act."""
+
+    def __init__(self, handlers: dict[int, Callable[[int, FrameType | None], object]]) -> None:
+        self._handlers, self._process = handlers, os.getpid()
+        self._came: list[tuple[int, FrameType | None]] = []
+
+    @property
+    def number(self) -> int:
+        """Of the signal that waits; 0 if none does."""
+        return self._came[-1][0] if self._came else 0
+
+    def __call__(self) -> None:
+        """Let the signal act that waits, if any does."""
+        if self._came:
+            number, frame = self._came.pop()
+            self._came.clear()
+            self._handlers[number](number, frame)
+
+    def take(self, number: int, frame: FrameType | None) -> None:
+        """Let a signal wait, unless it is the second."""
+        again = bool(self._came)
+        self._came.append((number, frame))
+        if again or os.getpid() != self._process:  # a worker that was forked off has no steps
+            self()
+
+
 @contextlib.contextmanager
-def between_steps() -> Iterator[Callable[[], None]]:
-    """Inside, Ctrl-C and SIGTERM wait until the yielded function is called, between two steps.
+def between_steps() -> Iterator[Waiting]:
+    """Inside, Ctrl-C and SIGTERM wait until the yielded object is called, between two steps.
 
     So what is kept then is the state after a whole step. A second signal does not wait. Outside the
     main thread the block changes nothing.
     """
-    process, waiting = os.getpid(), list[tuple[int, FrameType | None]]()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     main = threading.current_thread() is threading.main_thread()
-    known = {n: each for n, each in before.items() if main and callable(each)}
-
-    def wait(number: int, frame: FrameType | None) -> None:
-        again = bool(waiting)
-        waiting.append((number, frame))
-        if again or os.getpid() != process:  # a worker that was forked off has no steps
-            now()
-
-    def now() -> None:
-        if waiting:
-            number, frame = waiting.pop()
-            waiting.clear()
-            known[signal.Signals(number)](number, frame)
-
+    known = {int(n): each for n, each in before.items() if main and callable(each)}
+    waiting = Waiting(known)
+    take = waiting.take  # one object, to be known again
     for number in known:
-        signal.signal(number, wait)
+        signal.signal(number, take)
     try:
-        yield now
+        yield waiting
     finally:
         for number, handler in known.items():
-            if signal.getsignal(number) is wait:
+            if signal.getsignal(number) is take:
                 signal.signal(number, handler)
-    now()
+    waiting()

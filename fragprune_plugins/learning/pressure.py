@@ -185,6 +185,12 @@ class StepViews:
         if self._losses:
             self._losses[-1] = loss
 
+    def rows(self) -> list[list[float]]:
+        """Of each view so far: fragments, untruncated, pressed, loss."""
+        losses = [math.nan if loss is None else loss for loss in self._losses]
+        columns = (self._fragments, self._untruncated, self._pressed, losses)
+        return [[float(each) for each in row] for row in zip(*columns, strict=True)]
+
     @property
     def drawn(self) -> int:
         """Number of views so far."""

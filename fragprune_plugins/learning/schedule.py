@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -31,8 +32,9 @@ class _Recipe:
     """What suits one choice of what moves; docs/results.md has the runs that chose it.
 
     Attributes:
-        steps: thresholds learn in the last so many; None for all. Where shapes follow, truncating
-            for longer still improves the training views and no longer the others.
+        steps: thresholds learn in the last so many, of one view each; None for all. Where shapes
+            follow, truncating for longer still improves the training views and no longer the
+            others.
         elasticity: of the default pressure. Shapes that follow repair deeper cuts.
     """
 
@@ -70,6 +72,8 @@ class Settings:
             on, and shapes must move.
         truncate: False trains without thresholds or pressure: the control to compare with.
         seed: of the order of views in ``finetune``; hosts have their own.
+        views_per_step: that ``finetune`` draws in each step, whose loss is their mean; hosts have
+            their own.
         nonfinite: what to do with a step whose gradients are NaN or infinite: "stop" with an error,
             or "skip" it.
     """
@@ -85,11 +89,16 @@ class Settings:
     portable: bool = False
     truncate: bool = True
     seed: int = 0
+    views_per_step: int = 1
     nonfinite: Literal["stop", "skip"] = "stop"
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise UsageError("iterations", str(self.iterations), "1 or more", "Raise --iters.")
+        if self.views_per_step < 1:
+            raise UsageError(
+                "views per step", str(self.views_per_step), "1 or more", "Raise --views-per-step."
+            )
         if self.pressure is not None and not 0 <= self.pressure < 1:
             raise UsageError(
                 "pressure", f"{self.pressure:g}", "0 <= X < 1 (1e-4 is usual)", "Change --pressure."
@@ -166,7 +175,21 @@ class Settings:
         learning = _RECIPES[self.train].steps
         if learning is None or self.itself or self.portable:
             return 0
-        return max(0, self.iterations - learning)
+        return max(0, self.iterations - steps_of(learning, self.views_per_step))
+
+    @property
+    def rate(self) -> float:
+        """Factor of all learning rates in ``finetune``: the square root of the views a step.
+
+        Adam's steps have the size of the rate, whatever the gradient's. Where views disagree, V of
+        them one by one move a parameter by about sqrt(V) rates, and V together by one.
+        """
+        return math.sqrt(self.views_per_step)
+
+
+def steps_of(views: int, views_per_step: int) -> int:
+    """Steps that see about so many views, one or more."""
+    return max(1, round(views / views_per_step))
 
 
 @dataclass(frozen=True)
@@ -218,8 +241,8 @@ class Schedule:
         over = _share(step - 1 - self.warmup, settings.iterations - 1 - self.warmup)
         return StepPlan(
             learn=_on(step - 1 - self.warmup, self.every),
-            threshold_lr=settings.threshold_lr * _DECAY**over,
-            opacity_lr=settings.opacity_lr * decay,
+            threshold_lr=settings.threshold_lr * settings.rate * _DECAY**over,
+            opacity_lr=settings.opacity_lr * settings.rate * decay,
             progress=over,
             decay=decay,
         )

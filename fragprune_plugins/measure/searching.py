@@ -21,6 +21,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.finetuning import FinetuneResult, finetune
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.pressure import FEWEST
+from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.measure.evaluate import Candidate
@@ -94,6 +95,7 @@ def strongest(
     engine: str | Engine = "auto",
     progress: bool = False,
     say: Callable[[str], None] = lambda _: None,
+    ranks: Ranks | None = None,
 ) -> Bounded:
     """Train the control, then with ever better chosen pressures.
 
@@ -109,6 +111,7 @@ def strongest(
         engine: a name or an engine.
         progress: draw a bar for each training on stderr.
         say: called with a line of text before each training.
+        ranks: the processes that learn together; this one alone when None.
 
     Raises:
         UsageError: the bound is no number from 0 to 10.
@@ -121,8 +124,9 @@ def strongest(
         engine = engine_for(engine, model.xyz.device)
 
     def train(each: Settings) -> FinetuneResult:
+        start = deepcopy(store)
         return finetune(
-            model, dataset, each, store=deepcopy(store), engine=engine, progress=progress
+            model, dataset, each, store=start, engine=engine, progress=progress, ranks=ranks
         )
 
     say("Training the control, without truncation.")

@@ -334,3 +334,30 @@ def test_joint_learning_warns_of_a_reset_and_goes_on_with_the_training(caplog):
     it.begin(lambda: reset(1.0))
     assert "[opacity-reset]" in caplog.text
     assert it.store.opened
+
+
+def drawn_by_one(it: Stage2, names: str) -> list[list[float]]:
+    """A step begins, and these views are drawn; what another process is told of them."""
+    it.begin(lambda: OPACITIES)
+    for name in names:
+        size = 1.0 + "ab".index(name)
+        it.drew(name, drawing(None, 8 * size), lambda size=size: drawing(None, 20 * size))
+        it.lost(torch.tensor(size / 8))
+    return it.figures()
+
+
+@pytest.mark.parametrize("own", ["a", "b"])
+def test_what_other_processes_drew_counts_like_ones_own_and_in_the_same_order(own):
+    settings, told = Settings(iterations=10, pressure=1e-2, views_per_step=2), ([], [])
+    whole, it = (
+        stage(views={"a": None, "b": None}, settings=settings, watch=each.append) for each in told
+    )
+    for _ in range(2):
+        rows = drawn_by_one(whole, "ab")
+        assert drawn_by_one(it, own) == [rows["ab".index(own)]]
+        it.share("ab", torch.tensor(rows))
+    (tensors, plain), (others, other) = whole.state_dict(), it.state_dict()
+    assert told[0] == told[1]
+    assert plain == other
+    for name in ("before", "after"):
+        assert torch.equal(tensors[name], others[name])

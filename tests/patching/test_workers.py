@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from finetune import several
 from miniatures.runs import OPTIONS, command, edit, written
 
 from fragprune_plugins.demo.scene import SceneSettings, make_scene
@@ -127,6 +128,28 @@ def test_under_torchrun_learning_is_refused_before_the_host_runs(
         run(words, RunOptions(stage=stage, device="cpu"))
     assert caught.value.found == "WORLD_SIZE=2 in the environment"
     assert "--stage finetune without torchrun" in caught.value.remedy
+
+
+def test_under_torchrun_run_says_once_why_it_learns_in_one_process(scene, tmp_path):
+    script = written(Host, tmp_path / "host") / "train.py"
+    words = command(script, scene, tmp_path / "out", 12)
+    ended = several.command(2, "run", "--device", "cpu", "--", *words)
+    left = [each.left for each in ended]
+    assert [code for code, _, _ in left] == [1, 1]
+    said = "".join(out + err for _, out, err in left)
+    assert said.count("[ranks]") == 1
+    assert "torchrun -m fragprune_plugins finetune" in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "launcher",
+    ["torchrun --nproc_per_node 2", "/opt/bin/torchrun", "python -m torch.distributed.run",
+     "python3.11 -m torch.distributed.launch", "accelerate launch"],
+)  # fmt: skip
+def test_a_command_that_starts_several_processes_is_refused(launcher):
+    with pytest.raises(RanksError, match=r"starts several processes; .* Leave the launcher"):
+        run([*launcher.split(), "train.py", "-s", "scene"], RunOptions(device="cpu"))
 
 
 @pytest.mark.parametrize("said", ["1", "", "many"])

@@ -1,0 +1,210 @@
+"""Several processes that learn one model together, as ``torchrun`` starts them: its ranks.
+
+Each holds a replica of the whole model and draws its share of every step's views. The gradients are
+summed over all of them, and each takes the same optimizer step, so replicas stay equal to the bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from fragprune_plugins.errors import RanksError
+
+if TYPE_CHECKING:
+    import torch
+
+Each = TypeVar("Each")
+
+PATIENCE = 600.0
+"""Seconds to wait for the other processes before this one ends with an error."""
+
+_PIECE = 1 << 22  # numbers of a tensor that are summed at once
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """All processes of one learning, seen from one of them; by default there is one.
+
+    Attributes:
+        rank: of this process, from 0.
+        size: number of processes.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this process prints, and writes files."""
+        return self.rank == 0
+
+    @property
+    def several(self) -> bool:
+        """Whether there are others."""
+        return self.size > 1
+
+    def share(self, views: Sequence[Each]) -> Sequence[Each]:
+        """The views of a step that this process draws."""
+        return views[self.rank :: self.size]
+
+    def sum(self, tensor: torch.Tensor) -> None:
+        """Add up a tensor over all processes, in place; each gets the same bits.
+
+        Raises:
+            RanksError: another process is gone.
+        """
+        import torch.distributed as dist
+
+        with self._together():
+            dist.all_reduce(tensor)
+
+    def gather(self, value: Any) -> list[Any]:
+        """A plain value of each process, by rank.
+
+        Raises:
+            RanksError: another process is gone.
+        """
+        import torch.distributed as dist
+
+        if not self.several:
+            return [value]
+        values: list[Any] = [None] * self.size
+        with self._together():
+            dist.all_gather_object(values, value)
+        return values
+
+    def agree(self, what: Mapping[str, Any], where: str) -> None:
+        """Check that all processes have the same values by the same names.
+
+        Raises:
+            RanksError: they differ, in every process; or another process is gone.
+        """
+        known = self.gather(dict(what))
+        for rank, other in enumerate(known):
+            names = known[0].keys() | other.keys()
+            if differ := sorted(n for n in names if known[0].get(n) != other.get(n)):
+                raise RanksError(
+                    where,
+                    f"process {rank} of {self.size} with other {', '.join(differ)} than process 0",
+                    "processes that are equal to the bit",
+                    "Nothing of it was saved. Start all with the same command, versions, files and "
+                    "kind of processor or GPU; --out must be in a folder that all of them see.",
+                )
+
+    @contextlib.contextmanager
+    def _together(self) -> Iterator[None]:
+        """State what a collective operation raises."""
+        try:
+            yield
+        except RuntimeError as error:  # of gloo, NCCL or the store; each has words of its own
+            said = re.sub(r"^\[.*?\] ", "", str(error).strip()).split(". ")[0][:200]
+            raise RanksError(
+                f"process {self.rank} of {self.size}",
+                f"another process ended, or gave no answer for {PATIENCE:g} s ({said})",
+                "all processes, to the end of learning",
+                "Nothing of this step was saved. Look for the process that ended first; the same "
+                "command goes on from the last checkpoint, if there is one.",
+            ) from error
+
+
+def launched() -> Ranks:
+    """What a launcher such as ``torchrun`` says in the environment."""
+    rank, size = os.environ.get("RANK", ""), os.environ.get("WORLD_SIZE", "")
+    if not size.isdigit() or int(size) < 2:
+        return Ranks()
+    return Ranks(int(rank) if rank.isdigit() else 0, int(size))
+
+
+def local_rank() -> int:
+    """The number of this process among those of its machine: which GPU it takes."""
+    said = os.environ.get("LOCAL_RANK", "")
+    return int(said) if said.isdigit() else 0
+
+
+@contextlib.contextmanager
+def joined(device: torch.device) -> Iterator[Ranks]:
+    """Inside, the processes that were launched together can exchange tensors of a device.
+
+    Raises:
+        RanksError: they do not find each other.
+    """
+    ranks = launched()
+    if not ranks.several:
+        yield ranks
+        return
+    from datetime import timedelta
+
+    import torch
+    import torch.distributed as dist
+
+    if not dist.is_available():
+        raise RanksError(
+            "learning",
+            f"{ranks.size} processes, and a torch that was built without torch.distributed",
+            "a torch with it",
+            "Install the torch of pytorch.org, or start one process.",
+        )
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    try:
+        dist.init_process_group(
+            "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",
+            timeout=timedelta(seconds=PATIENCE),
+        )
+    except (RuntimeError, ValueError) as error:
+        raise RanksError(
+            "learning",
+            f"{ranks.size} processes that do not find each other ({str(error)[:200]})",
+            "the environment that torchrun sets",
+            "Start them with torchrun; see docs/how-to/several-gpus.md.",
+        ) from error
+    try:
+        yield ranks
+    except BaseException:
+        speaks()  # before the others notice that this process is gone
+        raise
+    finally:
+        dist.destroy_process_group()
+
+
+def speaks() -> bool:
+    """Whether this process is the first of all that asks: it says why they end, and others do not.
+
+    Without a launcher whose store outlives its processes everyone speaks.
+    """
+    if not launched().several or os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
+        return True
+    asked = ("MASTER_ADDR", "MASTER_PORT", "TORCHELASTIC_RESTART_COUNT")
+    return _asks_first(*(os.environ.get(name, "0") for name in asked))
+
+
+@functools.cache
+def _asks_first(address: str, port: str, attempt: str) -> bool:
+    from datetime import timedelta
+
+    from torch.distributed import TCPStore  # type: ignore[attr-defined]
+
+    try:
+        store = TCPStore(address, int(port), is_master=False, timeout=timedelta(seconds=5))
+        return int(store.add(f"fragprune-said-{attempt}", 1)) == 1
+    except (RuntimeError, ValueError):
+        return True
+
+
+def fingerprint(tensor: torch.Tensor) -> int:
+    """A number that is another one if any bit of a float32 tensor is another one, or moves."""
+    import torch
+
+    bits = tensor.detach().contiguous().view(torch.int32).reshape(-1)
+    places = torch.arange(1, min(len(bits), _PIECE) + 1, device=bits.device)
+    total = 0
+    for start in range(0, len(bits), _PIECE):
+        piece = bits[start : start + _PIECE]
+        total = 31 * total + int((piece * places[: len(piece)]).sum())  # int64, modulo 2**64
+    return total % 2**64

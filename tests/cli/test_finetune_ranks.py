@@ -1,0 +1,230 @@
+"""``torchrun -m fragprune_plugins finetune``: one writes and prints, and they end together."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from cli.commands import run, run_json
+from finetune import tiny
+from finetune.several import command
+
+from fragprune_plugins.datasets.dataset import Photograph
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.finetuning import loop
+from fragprune_plugins.storage import sidecar
+
+
+@pytest.fixture
+def scene(tmp_path, single_thread):
+    data, path, _ = tiny.scene(tmp_path)
+    return data, path
+
+
+def words(scene, out, *more):
+    data, path = scene
+    return ("finetune", path, "--data", data, "--out", out, "--iters", 20, *more)
+
+
+def pair(out):
+    store, info = sidecar.load(out)
+    state = {k: v.tolist() if torch.is_tensor(v) else v for k, v in store.state_dict().items()}
+    return out.read_bytes(), state, info
+
+
+def names(folder):
+    return {each.name for each in folder.iterdir()}
+
+
+def at_step(number, do):
+    """Do something when this process is in the midst of a step."""
+    begin = loop.Stage2.begin
+
+    def beginning(stage, opacities):
+        if stage.steps == number:
+            do()
+        return begin(stage, opacities)
+
+    loop.Stage2.begin = beginning
+
+
+def test_the_first_process_writes_and_reports_and_the_others_say_nothing(scene, tmp_path):
+    one, two, log = tmp_path / "one.ply", tmp_path / "two.ply", tmp_path / "log.csv"
+    whole = run_json(*words(scene, one, "--views-per-step", 2))
+    first, second = command(2, *words(scene, two, "--json", "--log", f"csv:{log}"))
+    assert (first.code, second.code) == (0, 0)
+    code, out, err = first.left
+    report = json.loads(out)
+    assert code == 0
+    assert "fine-tuning: 100%" in err
+    assert second.left == (0, "", "")
+    assert pair(one) == pair(two)
+    assert report["settings"] == whole["settings"]
+    assert report["settings"]["views_per_step"] == 2
+    assert report["after"]["psnr"] == whole["after"]["psnr"]
+    with open(log) as file:
+        assert [row["step"] for row in csv.DictReader(file)] == [str(n + 1) for n in range(20)]
+    again, other = command(2, *words(scene, two))
+    assert "nothing was done" in again.left[1]
+    assert other.left == (0, "", "")
+
+
+@pytest.mark.parametrize(("size", "killed"), [(2, 0), (2, 1), (4, 2)])
+def test_a_kill_of_one_ends_all_with_one_error_and_leaves_what_was_saved(
+    scene, tmp_path, size, killed
+):
+    out = tmp_path / "out.ply"
+    run_json(*words(scene, out, "--iters", 3))
+    before, files = pair(out), names(tmp_path)
+
+    def prepare(rank):
+        if rank == killed:
+            at_step(7, lambda: os.kill(os.getpid(), signal.SIGKILL))
+
+    ended = command(size, *words(scene, out, "--again"), prepare=prepare)
+    assert ended[killed].code == -signal.SIGKILL
+    left = [each.left for rank, each in enumerate(ended) if rank != killed]
+    assert [code for code, _, _ in left] == [1] * (size - 1)
+    said = "".join(out + err for _, out, err in left)
+    assert said.count("[ranks]") == 1
+    assert said.count("another process ended") == 1
+    assert pair(out) == before
+    locks = {name for name in names(tmp_path) - files if name.endswith("-run")}
+    assert names(tmp_path) - files == (locks if killed == 0 else set())
+
+
+def test_a_process_that_raises_takes_all_down_with_its_own_words(scene, tmp_path):
+    def unreadable():
+        def image(shot):
+            raise DatasetError(shot.name, "a torn page", "a photograph", "Scan it again.")
+
+        Photograph.image = property(image)
+
+    files = names(tmp_path)
+    ended = command(
+        2,
+        *words(scene, tmp_path / "out.ply", "--json"),
+        prepare=lambda rank: at_step(5, unreadable) if rank == 1 else None,
+    )
+    (first, silent, _), (second, out, _) = (each.left for each in ended)
+    assert (first, second) == (1, 1)
+    assert json.loads(silent + out)["error"]["found"] == "a torn page"
+    assert names(tmp_path) == files
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_to_one_ends_all_after_the_same_step_and_one_goes_on(
+    scene, tmp_path, number, code
+):
+    whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
+    run_json(*words(scene, whole, "--views-per-step", 2))
+    ended = command(
+        2,
+        *words(scene, out),
+        prepare=lambda rank: at_step(6, lambda: signal.raise_signal(number)) if rank == 1 else None,
+    )
+    (first, text, _), second = (each.left for each in ended)
+    assert (first, second) == (code, (0, "", ""))
+    assert "7 of 20 iterations" in text
+    report = run_json(*words(scene, out, "--views-per-step", 2))
+    assert report["resumed_at"] == 7
+    assert pair(out) == pair(whole)
+
+
+@pytest.mark.parametrize(
+    ("more", "found"),
+    [
+        (("--target-time", 1.2), "2 processes"),
+        (("--views-per-step", 3), "3 for 2 processes"),
+        (("--quick",), "--quick with --iters"),
+        (("--no-such-option",), "No such option"),
+    ],
+)
+def test_what_is_refused_is_said_once(scene, tmp_path, more, found):
+    ended = command(2, *words(scene, tmp_path / "out.ply", *more))
+    assert [each.left[0] for each in ended] == [2, 2]
+    said = "".join(out + err for _, out, err in (each.left for each in ended))
+    assert said.count(found) == 1
+
+
+def test_max_drop_trains_again_and_again_together(scene, tmp_path):
+    one, two = tmp_path / "one.ply", tmp_path / "two.ply"
+    more = ("--max-drop", 0.5, "--keep", 0.9, "--iters", 3)
+    run_json(*words(scene, one, *more, "--views-per-step", 2))
+    first, second = command(2, *words(scene, two, *more, "--json"))
+    assert (first.left[0], second.left) == (0, (0, "", ""))
+    assert pair(one) == pair(two)
+
+
+def test_the_default_sees_as_many_views_in_fewer_steps(scene, tmp_path):
+    data, path = scene
+    asked = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--quick")
+    assert run_json(*asked, "--views-per-step", 50)["iterations"] == 20
+
+
+def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    result = run(*words(scene, tmp_path / "out.ply"))
+    assert result.exit_code == 1
+    assert "Start them with torchrun" in result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [2, 4])
+def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(scene, tmp_path, size):
+    """The same, with the real launcher, whose exit code is 1 then."""
+    out, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    launcher += ["--nproc_per_node", str(size), "-m", "fragprune_plugins"]
+    line = [*launcher, *map(str, words(scene, out, "--iters", 300, "--checkpoint-every", 0.001))]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run_:
+        children = Path(f"/proc/{run_.pid}/task/{run_.pid}/children")
+        while not out.with_suffix(".fragprune-unfinished").exists():
+            assert run_.poll() is None, run_.stderr.read()
+            time.sleep(0.1)
+        last = max(map(int, children.read_text().split()))
+        os.kill(last, signal.SIGKILL)
+        said, error = run_.communicate(timeout=60)
+    assert run_.returncode == 1
+    assert said == ""
+    assert error.count("[ranks]") == 1
+    assert f"exitcode  : -9 (pid: {last})" in error
+    assert not out.exists()
+    done = subprocess.run(line, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert "resuming at step" in done.stderr
+    assert done.stdout.count("PSNR, dB") == 1
+    run_json(*words(scene, whole, "--iters", 300, "--views-per-step", size))
+    if size == 2:
+        assert pair(out) == pair(whole)
+    assert {name for name in names(tmp_path) if "out" in name or name[0] == "."} == {
+        "out.ply",
+        "out.fragprune.safetensors",
+        "out.fragprune.json",
+    }
+
+
+@pytest.mark.gpu
+def test_two_gpus_learn_what_one_does_with_two_views_a_step(scene, tmp_path):
+    """Replicas are compared at the end; sums on a GPU have no fixed order, so figures are near."""
+    if torch.cuda.device_count() < 2:
+        pytest.skip("needs two GPUs")
+    one, two = tmp_path / "one.ply", tmp_path / "two.ply"
+    whole = run_json(*words(scene, one, "--views-per-step", 2, "--device", "cuda:0"))
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    launcher += ["--nproc_per_node", "2", "-m", "fragprune_plugins"]
+    line = [*launcher, *map(str, words(scene, two, "--device", "cuda", "--json"))]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["after"]["psnr"] == pytest.approx(whole["after"]["psnr"], abs=0.05)

@@ -1,0 +1,128 @@
+"""Several processes as ``torchrun`` starts them, but forked: they need no second to import torch.
+
+A child of its own keeps the store, as torchrun's agent does, so that it outlives any of them.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from cli.commands import run as run_command
+
+from fragprune_plugins.errors import FragpruneError
+from fragprune_plugins.learning.ranks import joined
+
+LONGEST = 60  # seconds that a child may live
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a process ended: its exit code, minus a signal's number, and what it left behind."""
+
+    code: int
+    left: Any
+
+
+def _forked(work: Callable[[], None]) -> int:
+    pid = os.fork()
+    if pid == 0:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(LONGEST)
+        torch.set_num_threads(1)
+        try:
+            work()
+        except BaseException:
+            traceback.print_exc()
+            os._exit(99)
+        os._exit(0)
+    return pid
+
+
+def _keep_store(pipe: int) -> None:
+    from torch.distributed import TCPStore
+
+    store = TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
+    os.write(pipe, str(store.port).encode())
+    signal.pause()
+
+
+def launch(size: int, work: Callable[[int], Any]) -> list[Ended]:
+    """Call ``work(rank)`` in each of so many processes; what it returns is what that one left."""
+    read, write = os.pipe()
+    agent = _forked(lambda: _keep_store(write))
+    try:
+        port = os.read(read, 16).decode()
+        with tempfile.TemporaryDirectory() as folder:
+
+            def rank_of(rank: int) -> Callable[[], None]:
+                def one() -> None:
+                    os.environ |= {
+                        "RANK": str(rank),
+                        "LOCAL_RANK": str(rank),
+                        "WORLD_SIZE": str(size),
+                        "MASTER_ADDR": "localhost",
+                        "MASTER_PORT": port,
+                        "TORCHELASTIC_USE_AGENT_STORE": "True",
+                    }
+                    torch.save(work(rank), Path(folder) / str(rank))
+
+                return one
+
+            children = [_forked(rank_of(rank)) for rank in range(size)]
+            codes = [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in children]
+            files = [Path(folder) / str(rank) for rank in range(size)]
+            lefts = [torch.load(f, weights_only=False) if f.exists() else None for f in files]
+            return [Ended(code, left) for code, left in zip(codes, lefts, strict=True)]
+    finally:
+        os.close(read)
+        os.close(write)
+        os.kill(agent, signal.SIGKILL)
+        os.waitpid(agent, 0)
+
+
+@dataclass(frozen=True)
+class Raised:
+    """A stated error, by its code and its words."""
+
+    code: str
+    text: str
+
+
+def learn(size: int, work: Callable[[Any], Any]) -> list[Any]:
+    """What ``work(ranks)`` returned, or the stated error, in each of so many processes."""
+
+    def one(rank: int) -> Any:
+        with joined(torch.device("cpu")) as ranks:
+            try:
+                return work(ranks)
+            except FragpruneError as error:
+                return Raised(error.code, str(error))
+
+    ended = launch(size, one)
+    assert [each.code for each in ended] == [0] * size
+    return [each.left for each in ended]
+
+
+def command(
+    size: int, *words: object, prepare: Callable[[int], object] = lambda _: None
+) -> list[Ended]:
+    """The command line in each process: it leaves its exit code, stdout and stderr.
+
+    ``prepare(rank)`` is called in each before.
+    """
+
+    def one(rank: int) -> Any:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        prepare(rank)
+        result = run_command(*words)
+        return result.exit_code, result.stdout, result.stderr
+
+    return launch(size, one)

@@ -1,0 +1,232 @@
+"""Several processes learn what one learns that draws as many views a step."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+from finetune.several import launch, learn
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.finetuning import Checkpoints, finetune, loop
+from fragprune_plugins.learning import ranks as module
+from fragprune_plugins.learning.ranks import Ranks, fingerprint, launched, speaks
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+
+ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+STEPS = 12
+
+CASES = {
+    "all": Settings(iterations=STEPS, views_per_step=2),
+    "target": Settings(iterations=STEPS, views_per_step=2, train="opacity", target_speedup=1.3),
+    "control": Settings(iterations=STEPS, views_per_step=2, truncate=False, seed=3),
+    "portable": Settings(iterations=STEPS, views_per_step=2, portable=True),
+    "two views each": Settings(iterations=STEPS, views_per_step=4, train="appearance"),
+}
+
+
+@pytest.fixture(autouse=True)
+def one_thread(single_thread):
+    """Forked processes must not inherit threads."""
+
+
+def learned(model, dataset, settings, ranks=None):
+    """Everything that a fine-tuning leaves, as plain values."""
+    store = ThresholdStore(len(model))
+    result = finetune(model, dataset, settings, store=store, engine="cpu", ranks=ranks)
+    tensors = {name: getattr(result.model, name) for name in ALL}
+    tensors |= {k: v for k, v in store.state_dict().items() if torch.is_tensor(v)}
+    return tensors, str(result.curves), result.progress
+
+
+def require_same(one, other):
+    for name, tensor in one[0].items():
+        assert torch.equal(tensor, other[0][name]), name
+    assert one[1:] == other[1:]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_two_processes_learn_what_one_does_with_as_many_views_to_the_bit(model, dataset, case):
+    settings = CASES[case]
+    whole = learned(model, dataset, settings)
+    first, second = learn(2, lambda ranks: learned(model, dataset, settings, ranks))
+    require_same(first, second)
+    if settings.views_per_step == 2:  # a + b is b + a
+        require_same(whole, first)
+    else:  # (a + c) + (b + d) is not ((a + b) + c) + d in its last bits
+        require_near(whole, first)
+
+
+def require_near(one, other):
+    """Equal but for the order in which gradients were summed, in float32: a few last bits."""
+    for name, tensor in one[0].items():
+        assert torch.allclose(tensor, other[0][name], rtol=1e-6, atol=1e-6), name
+
+
+def test_four_processes_are_replicas_and_near_one_with_four_views(model, dataset):
+    settings = Settings(iterations=STEPS, views_per_step=4)
+    whole = learned(model, dataset, settings)
+    first, *others = learn(4, lambda ranks: learned(model, dataset, settings, ranks))
+    for other in others:
+        require_same(first, other)
+    require_near(whole, first)
+
+
+def test_a_view_more_a_step_costs_no_step_more(model, dataset):
+    """Learning rates grow with the square root of the views, and the warm-up shrinks with them."""
+    one, four = Settings(iterations=4000), Settings(iterations=1000, views_per_step=4)
+    assert (one.warmup, four.warmup) == (2000, 500)
+    assert four.rate == 2.0
+    for step, other in ((1, 1), (4000, 1000)):
+        plan, wide = Schedule(one).at(step), Schedule(four).at(other)
+        assert wide.threshold_lr == pytest.approx(2 * plan.threshold_lr)
+        assert wide.opacity_lr == pytest.approx(2 * plan.opacity_lr)
+        assert wide.decay == pytest.approx(plan.decay)
+
+
+def test_the_mean_of_one_view_twice_is_that_view(model, dataset):
+    twice = replace(dataset, train=[dataset.train[0]])
+    one = Settings(iterations=STEPS, train="opacity", pressure=1e-3)
+    two = replace(one, views_per_step=2, threshold_lr=0.05 / 2**0.5, opacity_lr=0.01 / 2**0.5)
+    alone, doubled = (learned(model, twice, each) for each in (one, two))
+    for name in ("opacity", "logits"):
+        assert torch.allclose(alone[0][name], doubled[0][name], atol=1e-5), name
+
+
+def messages(errors):
+    assert {error.code for error in errors} == {"ranks"}
+    return [error.text for error in errors]
+
+
+def test_processes_with_other_photographs_are_refused_before_a_step(model, dataset):
+    def work(ranks):
+        mine = replace(dataset, train=dataset.train[ranks.rank :])
+        return learned(model, mine, Settings(iterations=4, views_per_step=2), ranks)
+
+    one, other = messages(learn(2, work))
+    assert "process 1 of 2 with other photographs than process 0" in one
+    assert one == other
+
+
+def test_a_process_that_does_not_see_the_checkpoint_is_noticed(model, dataset, tmp_path):
+    settings = Settings(iterations=4, views_per_step=2)
+    kept = Checkpoints(tmp_path / "0", None, 2)
+    finetune(model, dataset, settings, engine="cpu", checkpoints=kept)
+
+    def work(ranks):
+        own = Checkpoints(tmp_path / str(ranks.rank), None, 2)
+        return finetune(model, dataset, settings, engine="cpu", checkpoints=own, ranks=ranks)
+
+    one, other = messages(learn(2, work))
+    assert "process 1 of 2 with other checkpoint than process 0" in one
+    assert one == other
+    assert not (tmp_path / "1").exists()
+
+
+def test_replicas_that_part_are_noticed_and_named(model, dataset, monkeypatch):
+    monkeypatch.setattr(loop, "_COMPARE", 4)
+
+    def work(ranks):
+        real = torch.optim.Adam.step
+
+        def step(optimizer):
+            real(optimizer)
+            if ranks.rank == 1:
+                optimizer.param_groups[0]["params"][0].data[3] += 1e-6  # one number's last bits
+
+        torch.optim.Adam.step = step
+        return learned(
+            model, dataset, Settings(iterations=9, views_per_step=2, truncate=False), ranks
+        )
+
+    one, other = messages(learn(2, work))
+    assert "after step 4: process 1 of 2 with other opacity than process 0" in one
+    assert one == other
+
+
+def test_a_gradient_that_is_not_finite_stops_all_with_the_same_words(model, dataset):
+    def work(ranks):
+        real = loop.photometric_loss
+
+        def loss(image, target):
+            return real(image, target) * (math.nan if ranks.rank == 1 else 1.0)
+
+        loop.photometric_loss = loss
+        return learned(model, dataset, Settings(iterations=4, views_per_step=2), ranks)
+
+    one, other = learn(2, work)
+    assert one == other
+    assert one.code == "not-finite"
+    assert "stage 2, step 1, view view" in one.text
+
+
+def test_a_process_that_gives_no_answer_is_not_waited_for_without_end(model, dataset, monkeypatch):
+    monkeypatch.setattr(module, "PATIENCE", 0.5)
+
+    def work(ranks):
+        real = loop.photometric_loss
+
+        def loss(*args):
+            if ranks.rank == 1:
+                time.sleep(2)
+            return real(*args)
+
+        loop.photometric_loss = loss
+        return learned(model, dataset, Settings(iterations=4, views_per_step=2), ranks)
+
+    waited, _ = messages(learn(2, work))
+    assert "process 0 of 2: another process ended, or gave no answer for 0.5 s" in waited
+
+
+@pytest.mark.parametrize(
+    ("settings", "found"),
+    [
+        (Settings(target_time=1.2, views_per_step=2), "disturb each other's measurements"),
+        (Settings(views_per_step=3), "3 for 2 processes"),
+    ],
+)
+def test_what_several_processes_cannot_share_is_refused(model, dataset, settings, found):
+    with pytest.raises(UsageError, match=found):
+        finetune(model, dataset, settings, ranks=Ranks(0, 2))
+
+
+@given(
+    st.lists(st.floats(width=32, allow_nan=False), min_size=1, max_size=20),
+    st.integers(0, 19),
+    st.integers(0, 31),
+)
+def test_a_fingerprint_knows_every_bit(numbers, place, bit):
+    tensor = torch.tensor(numbers)
+    other = tensor.clone()
+    other.view(torch.int32)[place % len(numbers)] ^= -(2**31) if bit == 31 else 1 << bit
+    assert fingerprint(tensor) == fingerprint(tensor.clone())
+    assert fingerprint(tensor) != fingerprint(other)
+
+
+def test_a_fingerprint_knows_the_order_across_pieces(monkeypatch):
+    monkeypatch.setattr(module, "_PIECE", 3)
+    tensor = torch.arange(8, dtype=torch.float32)
+    prints = {fingerprint(tensor.roll(k)) for k in range(8)}
+    assert len(prints) == 8
+    assert isinstance(fingerprint(torch.zeros(0, 3)), int)
+
+
+@pytest.mark.parametrize(
+    ("size", "rank", "expected"),
+    [("4", "2", Ranks(2, 4)), ("1", "0", Ranks()), ("", "", Ranks()), ("many", "1", Ranks())],
+)
+def test_a_launcher_is_known_by_the_environment(monkeypatch, size, rank, expected):
+    monkeypatch.setenv("WORLD_SIZE", size)
+    monkeypatch.setenv("RANK", rank)
+    assert launched() == expected
+
+
+def test_one_of_all_processes_speaks_whoever_asks_first():
+    assert sorted(each.left for each in launch(3, lambda _: speaks())) == [False, False, True]
+    assert speaks()
