@@ -22,7 +22,7 @@ from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.engines.cost import Cost, work_of
-from fragprune_plugins.errors import AlignmentError, CheckpointError, SidecarError, UsageError
+from fragprune_plugins.errors import AlignmentError, CheckpointError, UsageError
 from fragprune_plugins.finetuning.resuming import Checkpoints, configuration
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
@@ -38,6 +38,7 @@ from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage import models
+from fragprune_plugins.storage.checkpoints import UNFIT
 from fragprune_plugins.storage.models import Model
 from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import RasterInputs, RasterOutputs
@@ -49,7 +50,6 @@ _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _MOMENTS = ("exp_avg", "exp_avg_sq")
-_UNFIT = (KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError)
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 _COMPARE = 100  # steps from one comparison of replicas to the next
 _ROUNDS, _SECONDS = 7, 1.5  # at least, of timing frames for a target; a view's least time counts
@@ -381,7 +381,7 @@ class _Run:
             return
         try:
             self._load(tensors, values)
-        except (*_UNFIT, SidecarError) as error:
+        except UNFIT as error:
             raise CheckpointError(
                 str(checkpoints.path),
                 f"parts that do not fit together ({error})",
@@ -424,17 +424,22 @@ class _Run:
         self.stage.load_state_dict(tensors, values)
         if len(self.stage.store) != len(self.model):
             raise ValueError(f"{len(self.stage.store)} thresholds of {len(self.model)} Gaussians")
+        adam_step, seconds = values["adam_step"], values["seconds"]
+        if min(adam_step, seconds) < 0:
+            raise ValueError(f"{adam_step} steps in {seconds} seconds")
         for name in self.rates:
             parameter = getattr(self.model, name)
             parameter.data.copy_(tensors[f"model.{name}"])
-            state: dict[str, Tensor] = {"step": torch.tensor(values["adam_step"])}
+            state: dict[str, Tensor] = {"step": torch.tensor(float(adam_step))}
             for moment in _MOMENTS:
                 state[moment] = torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
             self.optimizer.state[parameter] = state
         for row in tensors["curves"].tolist():
             self.curves.append(StepStats(int(row[0]), *row[1:]))
         self.done = int(values["done"])
-        self._started -= values["seconds"]
+        if not 0 <= self.done == self.stage.steps <= self.settings.iterations:
+            raise ValueError(f"{self.done} steps, of which the thresholds took {self.stage.steps}")
+        self._started -= seconds
 
     def learn(self, progress: bool) -> None:
         """All steps that are not done yet."""

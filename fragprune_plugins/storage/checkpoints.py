@@ -9,12 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import CheckpointError
+from fragprune_plugins.errors import CheckpointError, SidecarError
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.storage.atomic import replacing
 from fragprune_plugins.storage.reading import Door, parse_json
 
 FORMAT = "fragprune-checkpoint-1"
+UNFIT = (
+    *(KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError, OverflowError),
+    SidecarError,
+)
+"""What is raised where the parts of a checkpoint do not fit what they are loaded into."""
+
 _REMEDY = "Remove it, or begin anew with --again."
 _DOOR = Door(CheckpointError, "unreadable", f"a file of format {FORMAT}", _REMEDY)
 
@@ -71,5 +77,5 @@ def _is_broken(name: str, tensor: Tensor) -> bool:
     """Whether a tensor holds NaN or infinity, or is a negative second moment."""
     if name == "curves":  # a loss that is not known is NaN
         return False
-    negative = name.startswith("exp_avg_sq") and bool((tensor < 0).any())
+    negative = "exp_avg_sq" in name and bool((tensor < 0).any())
     return negative or not bool(tensor.isfinite().all())
