@@ -18,7 +18,7 @@ from fragprune_plugins.engines.cuda.frame import (
 )
 from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.types import RasterOutputs
+from fragprune_plugins.types import RasterOutputs, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         RasterInputs,
         Sliced,
         SpacetimeSplats,
-        Splats,
     )
 
 _FIRST_CAPACITY = 1 << 20
@@ -107,8 +106,16 @@ class CudaEngine:
 
         Raises:
             InputError: the Gaussians are not on a GPU, or there is not one threshold for each.
+            EngineError: they are surfels, for which there are no kernels.
         """
         inputs.check_thresholds(thresholds)
+        if isinstance(inputs.splats, Splats) and inputs.splats.flat:
+            raise EngineError(
+                "engine 'cuda'",
+                "surfels (2 scales each)",
+                "3D Gaussians: there are no kernels for surfels",
+                "Run on the CPU (--device cpu), or draw small pictures with --engine reference.",
+            )
         self._on_device(inputs.splats)
         drawing = Drawing(self._device, inputs, thresholds)
         tensors = {
