@@ -226,7 +226,7 @@ def test_hands_and_keys(browser, tmp_path):
 
 
 def test_slow_frames_stay_small_while_the_camera_turns(browser, tmp_path):
-    """A hand waits for the frame it sees; the wait is no rest, which would be drawn in full size."""
+    """A hand waits for the frame it sees. The wait is no rest, which is drawn in full size."""
     write_page(tmp_path, [a_model()], a_view())
     with viewing(browser, tmp_path) as tab:
         tab.page.wait_for_function("viewer.counted")
