@@ -357,7 +357,10 @@ class _Run:
         return time.perf_counter() - self._started
 
     def start_keeping(self, checkpoints: Checkpoints | None) -> None:
-        """Go on from a checkpoint, if there is one, and write one from time to time."""
+        """Go on from a checkpoint, if there is one, and write one from time to time.
+
+        Several processes see first whether they were asked for the same.
+        """
         if checkpoints is None and not self.ranks.several:
             return
         self.asked = configuration(
@@ -372,9 +375,11 @@ class _Run:
         del self.asked["nonfinite"]  # a run that such a step stopped may go on and skip it
         if checkpoints is not None:
             self._go_on(checkpoints)
-        self.ranks.agree({**self.asked, "checkpoint": self.done}, "fine-tuning, before step 1")
+        known = {**self.asked, "checkpoint": self.done, "torch": torch.__version__}
+        self.ranks.agree(known, "fine-tuning, before its first step")
 
     def _go_on(self, checkpoints: Checkpoints) -> None:
+        """Take over what a checkpoint holds, if there is one; the first process writes the next."""
         self.checkpoints = checkpoints if self.ranks.first else None
         tensors, values = checkpoints.load(self.asked, self.start.xyz.device)
         if not values:

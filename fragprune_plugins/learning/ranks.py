@@ -162,7 +162,8 @@ def joined(device: torch.device) -> Iterator[Ranks]:
             "learning",
             f"{ranks.size} processes that do not find each other ({str(error)[:200]})",
             "the environment that torchrun sets",
-            "Start them with torchrun; see docs/how-to/several-gpus.md.",
+            "Start them with torchrun; see docs/how-to/several-gpus.md. To learn in this process "
+            "alone, unset WORLD_SIZE.",
         ) from error
     try:
         yield ranks

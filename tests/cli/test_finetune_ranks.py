@@ -155,19 +155,14 @@ def test_what_is_refused_is_said_once(scene, tmp_path, more, found):
     assert said.count(found) == 1
 
 
-def test_max_drop_trains_again_and_again_together(scene, tmp_path):
+@pytest.mark.parametrize("more", [("--max-drop", 0.5, "--keep", 0.9), ("--self",)])
+def test_what_goes_before_and_around_learning_is_the_same_in_both(scene, tmp_path, more):
     one, two = tmp_path / "one.ply", tmp_path / "two.ply"
-    more = ("--max-drop", 0.5, "--keep", 0.9, "--iters", 3)
+    more = (*more, "--iters", 3)
     run_json(*words(scene, one, *more, "--views-per-step", 2))
     first, second = command(2, *words(scene, two, *more, "--json"))
     assert (first.left[0], second.left) == (0, (0, "", ""))
     assert pair(one) == pair(two)
-
-
-def test_the_default_sees_as_many_views_in_fewer_steps(scene, tmp_path):
-    data, path = scene
-    asked = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--quick")
-    assert run_json(*asked, "--views-per-step", 50)["iterations"] == 20
 
 
 def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):

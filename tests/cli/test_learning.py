@@ -1,7 +1,11 @@
 """``run`` and ``finetune`` understand the options of learning alike."""
 
+import click
 import pytest
 from cli.commands import run
+from click.testing import CliRunner
+
+from fragprune_plugins.cli.learning import learning_options
 
 HOST = ("--", "train.py")
 COMMANDS = {"run": HOST, "finetune": ("model.ply", "--data", "scene", "--out", "out.ply")}
@@ -70,3 +74,19 @@ def test_a_bound_of_loss_needs_photographs():
     result = run("finetune", "model.ply", "--self", "--out", "out.ply", "--max-drop", 0.1)
     assert result.exit_code == 2
     assert "--self with --max-drop" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "iterations", "warmup"),
+    [((), 5000, 3000), (("--views", 4), 1250, 750), (("--views", 4, "--iters", 900), 900, 400)],
+)
+def test_more_views_a_step_see_as_many_views_in_fewer_steps(options, iterations, warmup):
+    @click.command()
+    @click.option("--views", "views_per_step", default=1)
+    @learning_options
+    def show(settings, **_):
+        click.echo(f"{settings.iterations} {settings.warmup} {settings.views_per_step}")
+
+    views = options[1] if options else 1
+    said = CliRunner().invoke(show, list(map(str, options))).stdout.split()
+    assert said == [str(iterations), str(warmup), str(views)]
