@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Compensation = Literal["none", "antialiasing", "mip"]
 """What keeps a dilated Gaussian's weight, by name; ``RasterInputs`` has the formulas."""
 
-Plane = Literal["invdepth", "alpha"]
+Plane = Literal["invdepth", "alpha", "surface"]
 """What is drawn beside the image, by its name in ``RasterOutputs``."""
 
 
@@ -328,7 +328,7 @@ class Splats:
     Attributes:
         means: (N, 3) world.
         opacities: (N,) in (0, 1).
-        scales: (N, 3) standard deviations, world units.
+        scales: (N, 3) standard deviations, world units; (N, 2) of surfels, see ``flat``.
         rotations: (N, 4) quaternions w, x, y, z; used as given, the host normalises.
         cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz; scale_modifier does not apply.
         sh: (N, K, 3), K = (degree + 1)^2 or more.
@@ -353,7 +353,7 @@ class Splats:
         _require("Splats.means", self.means, None, 3)
         n = len(self.means)
         _require("Splats.opacities", self.opacities, n)
-        _check("Splats.scales", self.scales, n, 3)
+        _check("Splats.scales", self.scales, n, 2 if self.flat else 3)
         _check("Splats.rotations", self.rotations, n, 4)
         _check("Splats.cov3d", self.cov3d, n, 6)
         _check("Splats.sh", self.sh, n, None, 3)
@@ -379,6 +379,15 @@ class Splats:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    @property
+    def flat(self) -> bool:
+        """Whether they are surfels: two scales each, drawn by the rules of 2D Gaussian Splatting.
+
+        A pixel's ray meets a surfel in the plane of the first two axes of its rotation. A threshold
+        acts on the falloff there.
+        """
+        return getattr(self.scales, "ndim", 0) == 2 and self.scales.shape[1] == 2  # type: ignore[union-attr]
 
     @property
     def device(self) -> torch.device:
@@ -574,7 +583,8 @@ class RasterInputs:
     """The inputs of one rasterization, for any dialect that the engines support.
 
     With ``Footprints``, only the size and background of the view are used; scale_modifier,
-    dilation, compensation and near are ignored.
+    dilation, compensation and near are ignored. Surfels (``Splats.flat``) ignore dilation, and take
+    no features, compensation, sample_offsets or absolute_gradient.
 
     Attributes:
         view: the camera.
@@ -595,8 +605,8 @@ class RasterInputs:
         scores: also give each Gaussian's weights and wins, and the pixels' winners.
         alpha_max: alpha is capped here; 1/255 to 1.
         cap_gradient: the gradient passes through the cap; else it is 0 where alpha was capped.
-        planes: those of inverse depth and alpha that somebody will look at; () for the image alone.
-            An engine may spare itself the others, or draw them all the same.
+        planes: those beside the image that somebody will look at, by their names in
+            ``RasterOutputs``. An engine may spare itself the others, or draw them all the same.
     """
 
     view: View
@@ -634,6 +644,7 @@ class RasterInputs:
                     str(expected),
                     "Check the call's arguments.",
                 )
+        self._check_surfels()
         hook = self.means2d_hook
         if self.absolute_gradient and hook is not None and hook.shape[1] < 3:
             raise InputError(
@@ -641,6 +652,25 @@ class RasterInputs:
                 f"{hook.shape[1]} columns",
                 "3 or more with absolute_gradient",
                 "Pass a wider hook.",
+            )
+
+    def _check_surfels(self) -> None:
+        """Raise InputError if surfels come with what their rasterizer does not know."""
+        splats = self.splats
+        if not (isinstance(splats, Splats) and splats.flat):
+            return
+        given = {
+            "features": splats.features is not None,
+            "compensation": self.compensation != "none",
+            "sample_offsets": self.sample_offsets is not None,
+            "absolute_gradient": self.absolute_gradient,
+        }
+        if any(given.values()):
+            raise InputError(
+                "RasterInputs",
+                f"surfels (2 scales each) with {', '.join(k for k, v in given.items() if v)}",
+                "surfels without them",
+                "Leave them out.",
             )
 
     def check_thresholds(self, thresholds: Tensor | None) -> None:
@@ -665,7 +695,7 @@ class RasterOutputs:
         radii: (N,) int32, the HOST's rule: ceil(3 sigma), 0 when culled by the host, thresholds
             never change it; 0 for ``Footprints``.
         invdepth: (1, H, W) sum of alpha T / z, no background term; or (0, H, W) where ``planes``
-            did not ask for it.
+            did not ask for it. z is that of the mean, also of a surfel.
         alpha: (1, H, W) 1 - final transmittance; likewise.
         fragments_per_pixel: scalar, drawn fragments over pixels; differentiable in the thresholds
             through the rim surrogate, so ``loss + pressure * fragments_per_pixel`` is the fragment
@@ -684,6 +714,9 @@ class RasterOutputs:
         entries_per_pixel: (Gaussian, tile) pairs in the engine's lists, per pixel. The cpu engine
             counts those that it blends, which leaves out what lies behind a tile that is opaque.
             NaN from engines that do not count.
+        surface: (6, H, W) of surfels: sum of alpha T depth, of alpha T normal (3, view space), the
+            median depth and the depth distortion of 2D Gaussian Splatting. None of other
+            Gaussians, and where ``planes`` did not ask for it.
     """
 
     image: Tensor
@@ -700,5 +733,6 @@ class RasterOutputs:
     wins_per_gaussian: Tensor | None = None
     winners: Tensor | None = None
     entries_per_pixel: float = math.nan
+    surface: Tensor | None = None
 
     __repr__ = one_line

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from reference_renderer.project import Footprints
 from reference_renderer.scene import FALLOFF_MIN, RIM_REACH, RIM_WIDTH, Options
+from reference_renderer.surfel import meet
 
 
 @dataclass(frozen=True)
@@ -22,11 +23,13 @@ class Fragments:
         alpha: (K, P) capped alpha times the gate; 0 where not drawn.
         gate: (K, P) 1 where drawn, else 0 (soft: between), with the thresholds' gradient.
         drawn: (K, P) bool, without regard to a pixel's stop.
+        depth: (K, P) view depth of surfels' fragments, 1 where not drawn; None of others.
     """
 
     alpha: Tensor
     gate: Tensor
     drawn: Tensor
+    depth: Tensor | None = None
 
 
 class Spread(torch.autograd.Function):
@@ -130,10 +133,14 @@ def fragments(
         thresholds: (K,) or None.
         options: the cuts.
     """
-    q = squared_distances(footprints, pixels)
+    q, depth = squared_distances(footprints, pixels), None
+    if footprints.plane is not None:
+        q, depth = meet(footprints.plane, pixels, q, options.near)
     # Rounding can make q negative; such a fragment is skipped, and must not overflow here first.
     falloff = (-0.5 * q.clamp(min=0)).exp()
     visible = visible_cutoffs(footprints.opacity, options.alpha_min)
     gate = gates(q.detach(), falloff, visible, thresholds, options)
     alpha = cap(footprints.opacity[:, None] * falloff, options.alpha_max, options.cap_gradient)
-    return Fragments(alpha=alpha * gate, gate=gate, drawn=gate.detach() > 0)
+    drawn = gate.detach() > 0
+    depth = None if depth is None else torch.where(drawn, depth, 1)
+    return Fragments(alpha=alpha * gate, gate=gate, drawn=drawn, depth=depth)

@@ -34,6 +34,8 @@ class Footprints:
         radius: (K,) pixels, ceil(3 sigma) of the longer axis; 0 when degenerate.
         features: (K, F) more channels, or None.
         felt: (K, 2) zeros that receive the sum of absolute values of the means' gradient; or None.
+        plane: (K, 3, 3) of surfels, from ``surfel.planes``; None of others.
+        normal: (K, 3) of surfels, view space, toward the camera; None of others.
     """
 
     mean2d: Tensor
@@ -44,6 +46,8 @@ class Footprints:
     radius: Tensor
     features: Tensor | None = None
     felt: Tensor | None = None
+    plane: Tensor | None = None
+    normal: Tensor | None = None
 
     def take(self, rows: Tensor) -> Footprints:
         """The footprints of these rows (M,), in their order."""
@@ -56,6 +60,8 @@ class Footprints:
             radius=self.radius[rows],
             features=None if self.features is None else self.features[rows],
             felt=None if self.felt is None else self.felt[rows],
+            plane=None if self.plane is None else self.plane[rows],
+            normal=None if self.normal is None else self.normal[rows],
         )
 
 
@@ -78,9 +84,16 @@ def project_means(camera: Camera, means: Tensor) -> Tensor:
 
 
 def hooked(camera: Camera, footprints: Footprints, hook: Tensor, options: Options) -> Footprints:
-    """The same footprints, with a hook (K, >= 2) that receives their means' gradient in NDC."""
+    """The same footprints, with a hook (K, >= 2) that receives their means' gradient in NDC.
+
+    Of surfels it receives what moves the plane alone, times the centre's depth, as in the host.
+    """
     half = 0.5 * hook.new_tensor([camera.width, camera.height])
     zero = hook - hook.detach()
+    if footprints.plane is not None:
+        moved = footprints.depth.detach()[:, None] * half * zero[:, :2]
+        moved = torch.nn.functional.pad(moved[:, :, None], (2, 0, 0, 1))
+        return replace(footprints, plane=footprints.plane + moved)
     return replace(
         footprints,
         mean2d=footprints.mean2d + half * zero[:, :2],

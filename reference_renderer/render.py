@@ -21,6 +21,7 @@ from reference_renderer.project import (
     tile_rects,
 )
 from reference_renderer.scene import Camera, Gaussians, Options, Rendering
+from reference_renderer.surfel import project_surfels, surface_of
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class Drawing:
         gate: scalar, sum of the gates of fragments before their pixel's stop.
         weights: (K,) sum of alpha T of each of the block's footprints.
         winners: (h, w) which of all footprints has the largest alpha T; -1 for none.
+        surface: (6, h, w) of surfels; else None.
     """
 
     layers: Tensor
@@ -57,6 +59,7 @@ class Drawing:
     gate: Tensor
     weights: Tensor
     winners: Tensor
+    surface: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,7 @@ def render(
     """
     options = options or Options()
     front = rows_in_front(camera, gaussians.means, options.near)
-    footprints = project(camera, gaussians.take(front), options)
+    footprints = footprints_of(camera, gaussians.take(front), options)
     if means2d_hook is not None:
         footprints = hooked(camera, footprints, means2d_hook[front], options)
     tau = None if thresholds is None else thresholds[front]
@@ -141,7 +144,7 @@ def blended(
     """
     options = options or Options()
     front = rows_in_front(camera, gaussians.means, options.near)
-    footprints = project(camera, gaussians.take(front), options)
+    footprints = footprints_of(camera, gaussians.take(front), options)
     tau = None if thresholds is None else thresholds[front]
     for block in cut_world(camera, footprints, options, every)[1]:
         here = footprints.take(block.rows)
@@ -151,6 +154,11 @@ def blended(
         yield Blended(
             front[block.rows], found.alpha * live, found.drawn & live, here.opacity, here.color
         )
+
+
+def footprints_of(camera: Camera, gaussians: Gaussians, options: Options) -> Footprints:
+    """Footprints of Gaussians that are all in front of the camera."""
+    return (project_surfels if gaussians.flat else project)(camera, gaussians, options)
 
 
 def render_footprints(
@@ -206,6 +214,7 @@ def collect(
     winners = assemble(blocks, [drawing.winners for drawing in drawings])
     won = winners >= 0
     winners[won] = front[winners[won]]
+    surfaces = [drawing.surface for drawing in drawings if drawing.surface is not None]
     return Rendering(
         image=layers[:3] + layers[-1:] * camera.background[:, None, None],
         radii=radii,
@@ -220,6 +229,7 @@ def collect(
         weights_per_gaussian=weights,
         winners=winners.to(torch.int32),
         wins_per_gaussian=winners[won].bincount(minlength=len(radii)).to(torch.int32),
+        surface=assemble(blocks, surfaces) if surfaces else None,
     )
 
 
@@ -291,6 +301,11 @@ def draw(
     counted = (found.drawn & live).to(torch.int32)
     weights = weights_of(alpha.detach())
     shape = (len(block.y), len(block.x))
+    surface = None
+    if found.depth is not None and here.normal is not None:
+        light = weights_of(alpha)
+        surface = surface_of(light, found.drawn & live, found.depth, here.normal, options.near)
+        surface = surface.reshape(-1, *shape)
     return Drawing(
         layers=torch.cat([sums, left[None]]).reshape(-1, *shape),
         fragments=counted.sum(dim=0, dtype=torch.int32).reshape(shape),
@@ -298,6 +313,7 @@ def draw(
         gate=(found.gate * live).sum(),
         weights=weights.sum(dim=1),
         winners=winners_of(weights, block.rows).reshape(shape),
+        surface=surface,
     )
 
 

@@ -49,7 +49,7 @@ class Gaussians:
     Attributes:
         means: (N, 3) world.
         opacities: (N,) in (0, 1).
-        scales: (N, 3) standard deviations, world units.
+        scales: (N, 3) standard deviations, world units; (N, 2) of surfels, along the first two axes.
         rotations: (N, 4) quaternions w, x, y, z, used as given.
         cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
         sh: (N, K, 3) with K = (sh_degree + 1)^2 or more.
@@ -67,6 +67,11 @@ class Gaussians:
     colors: Tensor | None = None
     sh_degree: int = 0
     features: Tensor | None = None
+
+    @property
+    def flat(self) -> bool:
+        """Whether they are surfels."""
+        return self.scales is not None and self.scales.shape[1] == 2
 
     def take(self, rows: Tensor) -> Gaussians:
         """The Gaussians of these rows (K,), in their order; all others get zero gradient."""
@@ -86,6 +91,8 @@ class Gaussians:
 @dataclass(frozen=True)
 class Options:
     """The numbers of a dialect. With the three cuts at 0 the renderer is differentiable everywhere.
+
+    Surfels take no dilation, compensation, sample_offsets or absolute_gradient.
 
     Attributes:
         scale_modifier: factor on the scales; cov3d is used as given.
@@ -125,7 +132,7 @@ class Rendering:
     Attributes:
         image: (3, H, W) RGB with background, not clamped.
         radii: (N,) int32 pixels, ceil(3 sigma); 0 when culled. Thresholds never change it.
-        invdepth: (1, H, W) sum of alpha T / z, without background.
+        invdepth: (1, H, W) sum of alpha T / z, without background; of surfels, z of the mean.
         alpha: (1, H, W) 1 - final transmittance.
         fragments_per_pixel: scalar, drawn fragments over pixels; its gradient in the thresholds is
             the surrogate's.
@@ -138,6 +145,7 @@ class Rendering:
         winners: (H, W) int32 row of the Gaussian of largest alpha T, the first in depth order of
             equal ones, -1 where nothing is drawn.
         wins_per_gaussian: (N,) int32 pixels that each wins.
+        surface: (6, H, W) of surfels, see ``surfel.surface_of``; None of others.
     """
 
     image: Tensor
@@ -153,3 +161,4 @@ class Rendering:
     weights_per_gaussian: Tensor
     winners: Tensor
     wins_per_gaussian: Tensor
+    surface: Tensor | None = None

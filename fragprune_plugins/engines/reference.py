@@ -62,6 +62,7 @@ class ReferenceEngine:
             weights_per_gaussian=drawn.weights_per_gaussian.float() if inputs.scores else None,
             wins_per_gaussian=drawn.wins_per_gaussian if inputs.scores else None,
             winners=drawn.winners if inputs.scores else None,
+            surface=drawn.surface,
         )
 
     def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:

@@ -31,6 +31,7 @@ def random_scene(
     sh_degree: int = 1,
     colors: bool = False,
     cov3d: bool = False,
+    flat: bool = False,
     features: int = 0,
     offsets: bool = False,
     compensation: Compensation = "none",
@@ -52,6 +53,7 @@ def random_scene(
         sh_degree: 0 to 3; ``sh`` always has all 16 coefficients.
         colors: give RGB colours instead of ``sh``.
         cov3d: give 3D covariances instead of scales and rotations.
+        flat: give two scales each: surfels.
         features: channels to blend beside colour; 0 for none.
         offsets: give sample offsets of up to half a pixel.
         compensation: as in ``RasterInputs``.
@@ -77,6 +79,8 @@ def random_scene(
         splats = replace(splats, sh=None, colors=_uniform(generator, 0.0, 1.2, n, 3), sh_degree=0)
     if cov3d:
         splats = with_cov3d(splats)
+    if flat:
+        splats = flattened(splats)
     if features:
         splats = replace(splats, features=_uniform(generator, -1.0, 2.0, n, features))
     inputs = RasterInputs(
@@ -87,6 +91,12 @@ def random_scene(
         sample_offsets=_uniform(generator, -0.5, 0.5, height, width, 2) if offsets else None,
     )
     return cast(inputs, dtype, device)
+
+
+def flattened(splats: Splats) -> Splats:
+    """The same Gaussians as surfels: without their third scale."""
+    assert splats.scales is not None
+    return replace(splats, scales=splats.scales[:, :2].clone())
 
 
 def random_thresholds(
