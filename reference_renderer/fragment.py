@@ -23,7 +23,7 @@ class Fragments:
         alpha: (K, P) capped alpha times the gate; 0 where not drawn.
         gate: (K, P) 1 where drawn, else 0 (soft: between), with the thresholds' gradient.
         drawn: (K, P) bool, without regard to a pixel's stop.
-        depth: (K, P) view depth of surfels' fragments, 1 where not drawn; None of others.
+        depth: (K, P) view depth of surfels' fragments, 1 where none is met; None of others.
     """
 
     alpha: Tensor
@@ -141,6 +141,4 @@ def fragments(
     visible = visible_cutoffs(footprints.opacity, options.alpha_min)
     gate = gates(q.detach(), falloff, visible, thresholds, options)
     alpha = cap(footprints.opacity[:, None] * falloff, options.alpha_max, options.cap_gradient)
-    drawn = gate.detach() > 0
-    depth = None if depth is None else torch.where(drawn, depth, 1)
-    return Fragments(alpha=alpha * gate, gate=gate, drawn=drawn, depth=depth)
+    return Fragments(alpha=alpha * gate, gate=gate, drawn=gate.detach() > 0, depth=depth)

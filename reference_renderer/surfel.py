@@ -124,7 +124,9 @@ def meet(plane: Tensor, pixels: Tensor, filtered: Tensor, near: float) -> tuple[
     return torch.where(met, q, -1), torch.where(met, depth, 1)
 
 
-def surface_of(weights: Tensor, drawn: Tensor, depth: Tensor, normal: Tensor, near: float) -> Tensor:
+def surface_of(
+    weights: Tensor, drawn: Tensor, depth: Tensor, normal: Tensor, near: float
+) -> Tensor:
     """(6, P): sum of w depth, of w normal (3), the median depth, the distortion.
 
     The median depth is that of the last drawn fragment before which more than half of the light is

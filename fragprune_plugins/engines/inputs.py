@@ -73,6 +73,7 @@ def native_inputs(
         sh_coefficients=_second_length(arrays.get("sh")),
         feature_count=_second_length(arrays.get("features")),
         widen=widen,
+        flat=isinstance(splats, Splats) and splats.flat,
         count=len(splats),
         lengths=native_lengths(arrays),
         workspace=workspace,

@@ -307,6 +307,8 @@ class HostAdapter(ABC):
         inherited: param groups that children copy from their parents bit for bit; this is checked.
         gradients_read: param groups whose gradient the host reads in every iteration. While frozen,
             they get zeros.
+        on_gpu: our cuda engine can draw its Gaussians. If not, ``fragprune run`` refuses a GPU for
+            what draws with thresholds.
     """
 
     name: str
@@ -318,6 +320,7 @@ class HostAdapter(ABC):
     appearance: frozenset[str] = frozenset({"f_dc", "f_rest"})
     inherited: tuple[str, ...] = ()
     gradients_read: frozenset[str] = frozenset()
+    on_gpu: bool = True
 
     # -- the source ------------------------------------------------------------------------------
 

@@ -170,6 +170,13 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     device = process.host_device(options.device, options.engine)
     if options.engine != "auto":
         engine_for(options.engine, device, plugins)  # refuse before stage 1
+    elif device != "cpu" and options.stage != "off" and not adapter.on_gpu:
+        raise UsageError(
+            f"--device {device}",
+            f"{adapter.info.title}, whose Gaussians our cuda engine cannot draw",
+            "--device cpu, or --engine reference, which is slow",
+            "Train with --stage off on the GPU; then learn with --stage finetune --device cpu.",
+        )
     started = time.perf_counter()
     trains = script in (repo.root / name for name in host.line.scripts)
     if trains and options.stage != "off":

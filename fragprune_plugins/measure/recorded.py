@@ -21,7 +21,7 @@ class Recorded:
     Attributes:
         photographs: the scene.
         models: the model before and the model after; joint learning leaves the latter alone.
-        filtered: whether the models have Mip-Splatting's 3D filter.
+        filtered: whether the models may be such as only their host's rules draw; see ``read_ply``.
         drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
     """
 

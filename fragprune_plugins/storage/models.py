@@ -36,8 +36,7 @@ def load(
     Args:
         path: of the model, in any format of ``storage/formats``. Only a PLY has a sidecar.
         truncation: False ignores thresholds.
-        filtered: accept a Mip-Splatting model that has its 3D filter; the caller draws it by
-            Mip-Splatting's rules.
+        filtered: accept a model that the caller draws by its host's rules; see ``read_ply``.
         device: the device of the result.
 
     Raises:

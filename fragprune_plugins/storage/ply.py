@@ -5,7 +5,7 @@ f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then 
 (logit), scale_0..2 (log), rot_0..3 (w x y z, any length). ``fragprune export`` adds one column,
 ``trunc_threshold``: the threshold itself, in falloff, in (0, 1). Unknown columns are ignored,
 except Mip-Splatting's ``filter_3D``: such a model is refused unless the caller draws by the rules
-of Mip-Splatting.
+of Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaussians are flat.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class SplatFile:
         f_dc: (N, 1, 3) first SH coefficient.
         f_rest: (N, K - 1, 3) the other coefficients, K = (degree + 1)^2.
         opacity: (N, 1) logits.
-        scaling: (N, 3) logarithms of standard deviations.
+        scaling: (N, 3) logarithms of standard deviations; (N, 2) of surfels (2D Gaussian Splatting).
         rotation: (N, 4) quaternions w, x, y, z of any length.
         thresholds: (N,) truncation thresholds in (0, 1); None if the file has none.
         filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units. It widens
@@ -89,7 +89,7 @@ class SplatFile:
             "f_dc": (n, 1, 3),
             "f_rest": (n, self.f_rest.shape[1] if self.f_rest.ndim == 3 else 0, 3),
             "opacity": (n, 1),
-            "scaling": (n, 3),
+            "scaling": (n, 2 if tuple(self.scaling.shape[1:]) == (2,) else 3),
             "rotation": (n, 4),
             "thresholds": (n,),
             "filter_3d": (n, 1),
@@ -146,7 +146,8 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
 
     Args:
         path: the file.
-        filtered: accept a model with a 3D filter, which the caller draws by Mip-Splatting's rules.
+        filtered: accept a model that the caller draws by its host's rules: one with a 3D filter
+            (Mip-Splatting), or of surfels, which have two scales (2D Gaussian Splatting).
 
     Raises:
         ModelFileError: missing, truncated, not a PLY, not a Gaussian splat, empty or not finite.
@@ -172,7 +173,8 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
 def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
     """The splat of a file's columns; raises ModelFileError."""
     names, count = columns.keys(), len(next(iter(columns.values())))
-    missing = [name for name in (*_XYZ, *_DC, "opacity", *_SCALES, *_ROTATION) if name not in names]
+    scales = _SCALES if _SCALES[2] in names else _SCALES[:2]
+    missing = [name for name in (*_XYZ, *_DC, "opacity", *scales, *_ROTATION) if name not in names]
     if missing == list(_DC):
         raise ModelFileError(
             str(path),
@@ -186,6 +188,13 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
             f"a PLY without {', '.join(missing)}",
             "the columns of a Gaussian splat",
             "A point cloud or mesh is not a trained splat. " + _REMEDY,
+        )
+    if scales != _SCALES and not filtered:
+        raise ModelFileError(
+            str(path),
+            "flat Gaussians with two scales, as 2D Gaussian Splatting saves, which are no 3D Gaussians",
+            "a splat of 3D Gaussians",
+            "Fine-tune and draw it through its host's own scripts, with fragprune run.",
         )
     if _FILTER in names and not filtered:
         raise ModelFileError(
@@ -223,7 +232,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
             else torch.zeros(count, 0, 3)
         ),
         opacity=column("opacity"),
-        scaling=column(*_SCALES),
+        scaling=column(*scales),
         rotation=column(*_ROTATION),
         thresholds=(
             _checked_thresholds(path, column(THRESHOLD_COLUMN)[:, 0])
@@ -260,7 +269,7 @@ def write_ply(
         (_DC, model.f_dc[:, 0]),
         (tuple(f"f_rest_{i}" for i in range(rest.shape[1])), rest),
         (("opacity",), model.opacity),
-        (_SCALES, model.scaling),
+        (_SCALES[: model.scaling.shape[1]], model.scaling),
         (_ROTATION, model.rotation),
     ]
     if model.filter_3d is not None:

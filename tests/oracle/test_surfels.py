@@ -162,7 +162,11 @@ def test_every_output_is_that_of_rays_and_planes(kind, truncated):
     assert np.array_equal(drawn.fragments.numpy(), counts)
     assert counts.max() > 3
     # The rim's box is found to 1e-7 of its size; depths go to 13.
-    for found, expected in ((drawn.image, image), (drawn.alpha[0], alpha), (drawn.surface, surface)):
+    for found, expected in (
+        (drawn.image, image),
+        (drawn.alpha[0], alpha),
+        (drawn.surface, surface),
+    ):
         assert found.numpy() == pytest.approx(expected, abs=3e-6)
     touching = {row: radius for row, radius in radii.items() if drawn.radii[row] > 0}
     assert {row: int(drawn.radii[row]) for row in touching} == touching
@@ -218,7 +222,9 @@ def smooth(**kind):
         made.splats,
         means=scenes.unproject(view, at, depths),
         opacities=torch.tensor([0.5, 0.8, 0.3], dtype=F64),
-        scales=torch.tensor([[1.6, 1.2], [1.2, 1.8], [1.5, 1.5]], dtype=F64) * per_pixel[:, None],
+        scales=torch.tensor([[1.6, 1.2], [1.2, 1.8], [1.5, 1.5]], dtype=F64)
+        * per_pixel[:, None]
+        / made.scale_modifier,
         rotations=torch.nn.functional.normalize(turns),
     )
     if splats.sh is not None:
@@ -232,7 +238,9 @@ def uncut(inputs):
 
 
 @pytest.mark.parametrize("truncated", [True, False], ids=["thresholds", "none"])
-@pytest.mark.parametrize("kind", [{"colors": True}, {"sh_degree": 2, "scale_modifier": 1.3}], ids=str)
+@pytest.mark.parametrize(
+    "kind", [{"colors": True}, {"sh_degree": 2, "scale_modifier": 1.3}], ids=str
+)
 def test_every_input_has_the_derivative_of_finite_differences(kind, truncated):
     scene, leaves = scenes.leaves(smooth(**kind))
     options = uncut(scene)

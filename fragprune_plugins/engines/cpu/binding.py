@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from fragprune_plugins import native
 
-API_VERSION: Final = 6
+API_VERSION: Final = 7
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -95,6 +95,7 @@ class Inputs(_Sized):
         ("sh_coefficients", ctypes.c_int32),
         ("feature_count", ctypes.c_int32),
         ("widen", ctypes.c_int32),
+        ("flat", ctypes.c_int32),
         ("count", ctypes.c_int64),
         ("lengths", Lengths),
         *_pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
@@ -109,7 +110,7 @@ class Outputs(_Sized):
     _fields_ = (
         ("size", ctypes.c_uint32),
         *_pointers("image invdepth alpha radii features fragments fragments_per_gaussian"),
-        *_pointers("weights_per_gaussian wins_per_gaussian winners"),
+        *_pointers("weights_per_gaussian wins_per_gaussian winners surface"),
         ("drawn", ctypes.c_int64),
         ("evaluated", ctypes.c_int64),
         ("entries", ctypes.c_int64),
@@ -125,7 +126,7 @@ class OutputGrads(_Sized):
     _fields_ = (
         ("size", ctypes.c_uint32),
         ("fragments_per_pixel", ctypes.c_float),
-        *_pointers("image invdepth alpha features"),
+        *_pointers("image invdepth alpha features surface"),
     )
 
 

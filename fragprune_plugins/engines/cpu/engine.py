@@ -16,7 +16,7 @@ from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs, native_threads
 from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.types import RasterOutputs
+from fragprune_plugins.types import RasterOutputs, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -94,13 +94,15 @@ class _Drawing:
     found: dict[str, Tensor] = field(default_factory=dict)
 
     def draw(self, wants: dict[str, bool]) -> tuple[Tensor, ...]:
-        """Run the forward pass: image, invdepth, alpha, features, radii, fragments per pixel."""
+        """Run the forward pass; returns the autograd function's outputs, in their order."""
         view, n = self.inputs.view, len(self.inputs.splats)
         size = (view.height, view.width)
         empty = partial(_empty, self.workspace)
         image, planes = empty(3, *size), self.inputs.planes
         invdepth, alpha = (empty(int(name in planes), *size) for name in ("invdepth", "alpha"))
         features = empty(_channels(self.inputs.splats.features), *size)
+        flat = isinstance(self.inputs.splats, Splats) and self.inputs.splats.flat
+        surface = empty(6 * (flat and "surface" in planes), *size)
         radii, whole = empty(n, dtype=torch.int32), torch.int32
         if self.inputs.counts:
             self.found["fragments"] = empty(*size, dtype=whole)
@@ -115,6 +117,7 @@ class _Drawing:
             alpha=address(alpha),
             radii=address(radii),
             features=address(features),
+            surface=address(surface),
             **{name: address(tensor) for name, tensor in self.found.items()},
         )
         given = native_inputs(
@@ -143,19 +146,20 @@ class _Drawing:
         self.evaluated, self.entries = outputs.evaluated, outputs.entries
         self.stages = {name: getattr(outputs, f"{name}_ms") for name in _STAGES}
         drawn = torch.tensor(outputs.drawn / (view.width * view.height), dtype=torch.float32)
-        return image, invdepth, alpha, features, radii, drawn
+        return image, invdepth, alpha, features, surface, radii, drawn
 
     def undraw(self, upstream: tuple[Tensor | None, ...], wants: dict[str, bool]) -> dict[str, Any]:
         """Run the backward pass; returns gradients by name, float32 on the CPU."""
         assert self.state is not None
         by = [None if g is None else plain(g) for g in upstream]
-        image, invdepth, alpha, features, per_pixel = by
+        image, invdepth, alpha, features, surface, per_pixel = by
         output_grads = binding.OutputGrads(
             fragments_per_pixel=0.0 if per_pixel is None else per_pixel.item(),
             image=address(image),
             invdepth=address(invdepth),
             alpha=address(alpha),
             features=address(features),
+            surface=address(surface),
         )
         n = len(self.inputs.splats)
         shapes = {name: array.shape for name, array in self.arrays.items()}
@@ -181,7 +185,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, drawing: _Drawing, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         wants = dict(zip(_NAMES, ctx.needs_input_grad[1:], strict=True))
         outputs = drawing.draw(wants)
-        ctx.mark_non_differentiable(outputs[4])
+        ctx.mark_non_differentiable(outputs[5])
         ctx.set_materialize_grads(False)
         ctx.drawing, ctx.wants = drawing, wants
         # Saved for the sake of autograd's check against changes in place: the state reads these.
@@ -192,8 +196,8 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         tensors = ctx.saved_tensors
-        image, invdepth, alpha, features, _, per_pixel = upstream
-        grads = ctx.drawing.undraw((image, invdepth, alpha, features, per_pixel), ctx.wants)
+        *pictures, _, per_pixel = upstream
+        grads = ctx.drawing.undraw((*pictures, per_pixel), ctx.wants)
         given: list[Tensor | None] = [None]
         for name, tensor in zip(_NAMES, tensors, strict=True):
             if name not in grads:
@@ -260,7 +264,7 @@ class CpuEngine:
         outputs = _Rasterize.apply(  # type: ignore[no-untyped-call]
             drawing, *(tensors[name] for name in _NAMES)
         )
-        image, invdepth, alpha, features, radii, per_pixel = outputs
+        image, invdepth, alpha, features, surface, radii, per_pixel = outputs
         device, pixels = splats.device, view.width * view.height
         return RasterOutputs(
             image=image.to(device),
@@ -272,6 +276,7 @@ class CpuEngine:
             entries_per_pixel=drawing.entries / pixels,
             features=None if splats.features is None else features.to(device),
             stages=drawing.stages,
+            surface=surface.to(device) if len(surface) else None,
             **{name: tensor.to(device) for name, tensor in drawing.found.items()},
         )
 

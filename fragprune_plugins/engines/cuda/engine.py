@@ -107,8 +107,16 @@ class CudaEngine:
 
         Raises:
             InputError: the Gaussians are not on a GPU, or there is not one threshold for each.
+            EngineError: they are surfels, for which there are no kernels.
         """
         inputs.check_thresholds(thresholds)
+        if isinstance(inputs.splats, Splats) and inputs.splats.flat:
+            raise EngineError(
+                "engine 'cuda'",
+                "surfels (2 scales each)",
+                "3D Gaussians: there are no kernels for surfels",
+                "Run on the CPU (--device cpu), or draw small pictures with --engine reference.",
+            )
         self._on_device(inputs.splats)
         drawing = Drawing(self._device, inputs, thresholds)
         tensors = {

@@ -13,6 +13,7 @@
 #include "binning.h"
 #include "blend.h"
 #include "slice.h"
+#include "surfel.h"
 
 namespace fp {
 
@@ -38,6 +39,7 @@ struct fragprune_state {
   std::vector<fp::KeptCell> cells;
   size_t slots;
   fp::Buffer<fp::TilePixels> pixels;  // per tile
+  std::unique_ptr<fp::SurfelScene> surfels;  // of surfels this alone, and `in`
 };
 
 namespace fp {
@@ -290,6 +292,13 @@ class Clock {
 FP_STAGE void forward(const fragprune_inputs& in, float spread, fragprune_outputs& out,
              const Memory& memory, fragprune_state* keep) {
   Clock clock;
+  if (in.flat) {
+    std::unique_ptr<SurfelScene> surfels = draw_surfels(in, out, memory);
+    out.projection_ms = out.binning_ms = 0;
+    out.blend_ms = clock.lap();
+    if (keep) keep->in = in, keep->surfels = std::move(surfels);
+    return;
+  }
   Team team(in.threads);
   const Camera<float> camera = unpack_camera(in, spread);
   // A state holds on to its memory until the backward pass is done, which then wants more: what the
@@ -678,7 +687,7 @@ int check_lengths(const fragprune_inputs& in, fragprune_error* error) {
   const int64_t n = in.count, pixels = int64_t{in.width} * in.height;
   return check_lengths(
       {FP_HELD(viewmatrix, 16), FP_HELD(projmatrix, 16), FP_HELD(campos, 3), FP_HELD(background, 3),
-       FP_HELD(means, 3 * n), FP_HELD(opacities, n), FP_HELD(scales, 3 * n),
+       FP_HELD(means, 3 * n), FP_HELD(opacities, n), FP_HELD(scales, (in.flat ? 2 : 3) * n),
        FP_HELD(rotations, 4 * n), FP_HELD(cov3d, 6 * n), FP_HELD(sh, 3 * n * in.sh_coefficients),
        FP_HELD(colors, 3 * n), FP_HELD(features, n * in.feature_count), FP_HELD(thresholds, n),
        FP_HELD(sample_offsets, 2 * pixels), FP_HELD(means2d, 2 * n), FP_HELD(conics, 3 * n),
@@ -723,6 +732,15 @@ const char* splats_fault_of(const fragprune_inputs* in) {
   return nullptr;
 }
 
+const char* surfels_fault_of(const fragprune_inputs* in) {
+  if (in->count && !in->scales) return "flat Gaussians need scales and rotations";
+  if (in->means2d || in->cov3d || in->features || in->sample_offsets || in->absolute_gradient ||
+      in->compensation != FRAGPRUNE_NO_COMPENSATION)
+    return "flat Gaussians take no means2d, cov3d, features, sample_offsets, absolute_gradient or "
+           "compensation";
+  return splats_fault_of(in);
+}
+
 const char* fault_of(const fragprune_inputs* in, const fragprune_outputs* out) {
   if (!in || in->size != sizeof *in || !out || out->size != sizeof *out)
     return kOtherVersion;
@@ -741,6 +759,8 @@ const char* fault_of(const fragprune_inputs* in, const fragprune_outputs* out) {
   if (in->feature_count < 0 || in->feature_count > FRAGPRUNE_FEATURES_MAX)
     return "feature_count must be 0 to 8";
   if (out->features && !in->feature_count) return "features are wanted, but feature_count is 0";
+  if (out->surface && !in->flat) return "a surface is wanted, but flat is 0";
+  if (in->flat) return surfels_fault_of(in);
   return in->means2d ? footprints_fault_of(in) : splats_fault_of(in);
 }
 
@@ -859,7 +879,12 @@ int fragprune_backward(const fragprune_state* state, const fragprune_output_grad
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kBadThreads);
   if (fp::wants_absent(state->in, *input_grads))
     return fp::fail(error, FRAGPRUNE_BAD_INPUT, fp::kNotGiven);
-  return fp::guarded(error, [&] { fp::backward(*state, *output_grads, *input_grads, threads); });
+  return fp::guarded(error, [&] {
+    if (state->surfels)
+      fp::undraw_surfels(*state->surfels, *output_grads, *input_grads, threads);
+    else
+      fp::backward(*state, *output_grads, *input_grads, threads);
+  });
 }
 
 void fragprune_free(fragprune_state* state) { delete state; }

@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 6
+#define FRAGPRUNE_API_VERSION 7
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
@@ -95,7 +95,11 @@ typedef struct fragprune_lengths {
 /* N Gaussians are given in the world (means, scales and rotations or cov3d, sh or colors) or, when
  * means2d is not NULL, on the image (means2d, conics, depths, tiles, colors): then neither the camera
  * nor what belongs to projection is read, and one draws nothing that has no tiles, a depth that is not
- * positive or a conic that is not positive definite. */
+ * positive or a conic that is not positive definite.
+ *
+ * With `flat` they are surfels, flat Gaussians in the plane of their first two axes, drawn by the rules
+ * of 2D Gaussian Splatting: given in the world by scales and rotations, without dilation, compensation,
+ * features, sample_offsets and absolute_gradient. */
 typedef struct fragprune_inputs {
   uint32_t size;           /* sizeof(fragprune_inputs) */
   int32_t threads;         /* 1 to 1024; results do not depend on it */
@@ -114,6 +118,7 @@ typedef struct fragprune_inputs {
   int32_t sh_coefficients; /* K, the second dimension of sh; 0 to 1024 */
   int32_t feature_count;   /* F, 0 to 8 */
   int32_t widen;           /* keep rim fragments: thresholds will want a gradient */
+  int32_t flat;            /* surfels: scales are (N, 2), see below; the cpu engine's alone */
   int64_t count;           /* N */
   fragprune_lengths lengths;
   const float *viewmatrix; /* (4, 4) */
@@ -122,7 +127,7 @@ typedef struct fragprune_inputs {
   const float *background; /* (3) */
   const float *means;      /* (N, 3) */
   const float *opacities;  /* (N) */
-  const float *scales;     /* (N, 3), with rotations; or NULL */
+  const float *scales;     /* (N, 3), or (N, 2) of surfels, with rotations; or NULL */
   const float *rotations;  /* (N, 4) w x y z, used as given; or NULL */
   const float *cov3d;      /* (N, 6) xx xy xz yy yz zz; or NULL */
   const float *sh;         /* (N, K, 3); or NULL */
@@ -150,6 +155,8 @@ typedef struct fragprune_outputs {
   float *weights_per_gaussian;     /* (N) sum of alpha T over drawn fragments */
   int32_t *wins_per_gaussian;      /* (N) pixels where its alpha T is the largest */
   int32_t *winners;                /* (H, W) row of the largest, the first of equals; -1 for none */
+  float *surface;                  /* (6, H, W) of surfels: sum of alpha T depth, of alpha T normal (3,
+                                      view space), the median depth, the distortion */
   int64_t drawn;                   /* filled in: fragments drawn */
   int64_t evaluated;               /* filled in: lanes spent on (Gaussian, pixel) pairs */
   int64_t entries;                 /* filled in: (Gaussian, tile) pairs that were blended */
@@ -166,6 +173,7 @@ typedef struct fragprune_output_grads {
   const float *invdepth;     /* (H, W) */
   const float *alpha;        /* (H, W) */
   const float *features;     /* (F, H, W) */
+  const float *surface;      /* (6, H, W) */
 } fragprune_output_grads;
 
 /* Where to put gradients; NULL: not wanted, and not computed. Every element is written. */
@@ -173,9 +181,10 @@ typedef struct fragprune_input_grads {
   uint32_t size;
   float *means;      /* (N, 3) */
   float *hook;       /* (N, 3) gx, gy of the mean on the image, times (W/2, H/2), then 0 or, with
-                        absolute_gradient, the sum of |gx| + |gy| of single pixels */
+                        absolute_gradient, the sum of |gx| + |gy| of single pixels; of surfels, of
+                        what moves the plane, as their rasterizer has it */
   float *opacities;  /* (N) */
-  float *scales;     /* (N, 3) */
+  float *scales;     /* (N, 3), or (N, 2) of surfels */
   float *rotations;  /* (N, 4) */
   float *cov3d;      /* (N, 6) */
   float *sh;         /* (N, K, 3) */

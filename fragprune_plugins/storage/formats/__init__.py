@@ -131,7 +131,7 @@ def read(path: Path, *, filtered: bool = False) -> SplatFile:
 
     Args:
         path: the file.
-        filtered: accept a Mip-Splatting PLY that has its 3D filter, as ``read_ply`` does.
+        filtered: accept a PLY that the caller draws by its host's rules, as ``read_ply`` does.
 
     Raises:
         ModelFileError: missing, truncated, of another kind, empty or not finite.

@@ -1,0 +1,103 @@
+"""hbb1/2d-gaussian-splatting: flat Gaussians (surfels) that lie on the surface.
+
+A pixel's ray meets a surfel in the surfel's plane, and the falloff is that of the point there. A
+threshold acts on this falloff. The rasterizer also draws depths, normals and a distortion, from
+which the host regularises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fragprune_plugins.adapting import (
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    InputError,
+    RasterInputs,
+    RasterizerCall,
+    RasterOutputs,
+    hookimpl,
+    revised,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.adapting import SplatFile
+
+PACKAGE = "diff_surfel_rasterization"
+
+
+@dataclass(frozen=True)
+class SurfelDialect(GraphdecoDialect):
+    """Vanilla's call of 2023 with two scales; a stack of seven maps comes third."""
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Translate the call.
+
+        Raises:
+            InputError: the host passed matrices instead of scales and rotations.
+        """
+        if call.get("cov3D_precomp") is not None:
+            raise InputError(
+                "diff_surfel_rasterization",
+                "cov3D_precomp, the surfels' matrices, of which the host draws no normals",
+                "scales and rotations",
+                "Leave out --compute_cov3D_python.",
+            )
+        return replace(super().unpack(call), planes=("alpha", "surface"))
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
+        """(colour (3, H, W), radii (P,) int32, maps (7, H, W)).
+
+        The maps: depth, alpha, normal (3), median depth, distortion.
+        """
+        import torch
+
+        surface = outputs.surface
+        assert surface is not None  # unpack asked for it
+        maps = torch.cat([surface[:1], outputs.alpha, surface[1:]])
+        return outputs.image, outputs.radii, maps
+
+
+class SurfelSplatting(GraphdecoAdapter):
+    """The adapter of 2D Gaussian Splatting."""
+
+    name = "2dgs"
+    descends_from = ("vanilla-3dgs",)
+    info = HostInfo(
+        "2D Gaussian Splatting",
+        repo="hbb1/2d-gaussian-splatting",
+        states="July 2025",
+        limits=(
+            "A GPU cannot draw with thresholds: stage 2 needs --device cpu.",
+            "fragprune finetune, render, export and view have no surfels: they refuse its PLY.",
+            "--portable and --compute_cov3D_python are refused.",
+        ),
+    )
+    package = PACKAGE
+    on_gpu = False
+    calls = (RasterizerCall(outputs=3),)
+    own_names = ("utils.point_utils:depth_to_normal", "gaussian_renderer:allmap")
+    dialect_type = SurfelDialect
+    seams = revised(
+        GraphdecoAdapter.seams, {"GaussianRasterizer.forward": {"module": PACKAGE}}
+    )
+
+    def read_model(self, ply: Path) -> SplatFile:
+        """The host's own PLY, with two scales."""
+        from fragprune_plugins.adapting import read_ply
+
+        return read_ply(ply, filtered=True)
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Register the adapter of 2D Gaussian Splatting."""
+    register(SurfelSplatting())

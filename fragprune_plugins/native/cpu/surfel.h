@@ -1,0 +1,742 @@
+// Surfels: flat Gaussians, which a pixel's ray meets in their own plane (2D Gaussian Splatting,
+// Huang et al. 2024). reference_renderer/surfel.py says what is drawn; this draws it tile by tile.
+//
+// A plane's point (u, v) is seen at the pixel (x, y) with x w = across . (u, v, 1), y w = down .
+// (u, v, 1), w = depth . (u, v, 1). The point that a pixel sees is p.xy / p.z, where
+//     p = (x depth - across) x (y depth - down)
+//       = across x down + x (down x depth) + y (depth x across)
+// is linear in x and y. Pixels are counted from one near the surfel's mean: far from it the terms
+// would cancel.
+#pragma once
+
+#include <atomic>
+#include <cmath>
+#include <memory>
+#include <numeric>
+#include <vector>
+
+#include "gaussian.h"
+#include "threads.h"
+#include "workspace.h"
+
+namespace fp {
+
+constexpr float kSurfelFilter = 2.f;  // inverse variance, pixels^-2, of the round Gaussian
+constexpr double kSurfelReach = 3.0;  // standard deviations that give centre, radius and tiles
+constexpr float kSurfelFar = 100.f;   // the distortion's far plane
+constexpr int kSurface = 6;           // depth, normal (3), median depth, distortion
+constexpr int kSide = FRAGPRUNE_TILE, kArea = kSide * kSide;
+constexpr int32_t kNever = INT32_MAX;
+
+typedef Vec<double> Wide3;
+inline Wide3 wide3(const float* p) { return {p[0], p[1], p[2]}; }
+inline double dot3(const Wide3& a, const Wide3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline Wide3 scaled3(double s, const Wide3& a) { return {s * a.x, s * a.y, s * a.z}; }
+inline void add3(Wide3& a, double s, const Wide3& b) { a.x += s * b.x, a.y += s * b.y, a.z += s * b.z; }
+inline Wide3 cross3(const Wide3& a, const Wide3& b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+inline Vec3 narrow3(const Wide3& a) {
+  return {static_cast<float>(a.x), static_cast<float>(a.y), static_cast<float>(a.z)};
+}
+
+// One surfel in one view, in double: once for the picture, and again for its derivatives.
+struct SurfelView {
+  double shift_x, shift_y;      // the pixel that the rows count from
+  Wide3 across, down, depth;    // rows of the map from (u, v, 1)
+  Wide3 to_across, to_down, to_depth;  // world to these rows, of a vector
+  double add_across, add_down, add_depth;  // of a point
+  Wide3 axis[3];                // columns of the rotation: u, v, normal
+  double facing;                // 1 or -1: turns the normal toward the camera
+  double view_z;
+  double centre_x, centre_y, half_x, half_y;  // of the box at kSurfelReach
+  bool boxed;
+};
+
+// A box on the image of the plane out to `reach2`, squared standard deviations; false: none.
+// Numbers that are no box where that part of the plane reaches behind the camera.
+inline bool surfel_box(const SurfelView& s, double reach2, double* centre, double* half) {
+  const Wide3 t = {reach2, reach2, -1};
+  const Wide3& w = s.depth;
+  const double d = t.x * w.x * w.x + t.y * w.y * w.y + t.z * w.z * w.z;
+  if (d == 0) return false;
+  const Wide3* rows[2] = {&s.across, &s.down};
+  for (int k = 0; k < 2; k++) {
+    const Wide3& r = *rows[k];
+    centre[k] = (t.x * r.x * w.x + t.y * r.y * w.y + t.z * r.z * w.z) / d;
+    const double square =
+        centre[k] * centre[k] - (t.x * r.x * r.x + t.y * r.y * r.y + t.z * r.z * r.z) / d;
+    half[k] = std::sqrt(std::max(square, 1e-4));
+  }
+  return true;
+}
+
+// False: the host culls it.
+inline bool view_surfel(const fragprune_inputs& in, size_t i, SurfelView& s) {
+  const float *v = in.viewmatrix, *p = in.projmatrix, *q = in.rotations + 4 * i;
+  const Wide3 mean = wide3(in.means + 3 * i);
+  s.view_z = mean.x * v[2] + mean.y * v[6] + mean.z * v[10] + v[14];
+  if (!(static_cast<float>(s.view_z) > in.near)) return false;
+  const double w = q[0], x = q[1], y = q[2], z = q[3];
+  s.axis[0] = {1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)};
+  s.axis[1] = {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)};
+  s.axis[2] = {2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)};
+  const Wide3 view = {mean.x * v[0] + mean.y * v[4] + mean.z * v[8] + v[12],
+                      mean.x * v[1] + mean.y * v[5] + mean.z * v[9] + v[13], s.view_z};
+  const Wide3 &n = s.axis[2];
+  const Wide3 normal = {n.x * v[0] + n.y * v[4] + n.z * v[8], n.x * v[1] + n.y * v[5] + n.z * v[9],
+                        n.x * v[2] + n.y * v[6] + n.z * v[10]};
+  const double facing = -dot3(view, normal);
+  if (!(facing != 0)) return false;
+  s.facing = facing > 0 ? 1 : -1;
+
+  const Wide3 clip_x = {p[0], p[4], p[8]}, clip_y = {p[1], p[5], p[9]};
+  s.to_depth = {p[3], p[7], p[11]}, s.add_depth = p[15];
+  const double mean_w = dot3(mean, s.to_depth) + s.add_depth;
+  const auto row = [&](const Wide3& clip, double add, int size, Wide3& to, double& more) {
+    // pixel times w: clip * size / 2 + w * (size - 1) / 2
+    to = scaled3(0.5 * size, clip), more = 0.5 * size * add;
+    add3(to, 0.5 * (size - 1), s.to_depth), more += 0.5 * (size - 1) * s.add_depth;
+    const double at = (dot3(mean, to) + more) / mean_w;
+    const double shift = std::isfinite(at) ? std::nearbyint(std::clamp(at, -1e6, 1e6)) : 0;
+    add3(to, -shift, s.to_depth), more -= shift * s.add_depth;
+    return shift;
+  };
+  s.shift_x = row(clip_x, p[12], in.width, s.to_across, s.add_across);
+  s.shift_y = row(clip_y, p[13], in.height, s.to_down, s.add_down);
+  const double long_side = double{in.scale_modifier} * in.scales[2 * i];
+  const double wide_side = double{in.scale_modifier} * in.scales[2 * i + 1];
+  const auto map = [&](const Wide3& to, double add) {
+    return Wide3{long_side * dot3(s.axis[0], to), wide_side * dot3(s.axis[1], to),
+                 dot3(mean, to) + add};
+  };
+  s.across = map(s.to_across, s.add_across);
+  s.down = map(s.to_down, s.add_down);
+  s.depth = map(s.to_depth, s.add_depth);
+  double centre[2], half[2];
+  if (!surfel_box(s, kSurfelReach * kSurfelReach, centre, half)) return false;
+  s.centre_x = centre[0], s.centre_y = centre[1], s.half_x = half[0], s.half_y = half[1];
+  return true;
+}
+
+// What blending reads of one surfel.
+struct Surfel {
+  Vec3 origin, by_x, by_y;  // p at its pixel, and its steps
+  Vec3 depth;
+  float shift_x, shift_y;   // its pixel
+  float centre_x, centre_y; // of the round Gaussian, from its pixel
+  Vec3 normal, colour;
+  float inv_z, opacity, threshold;
+  float cut, list_cut;      // drawn iff q is at most this; reached, for the rim's gradient
+  float order;              // depth
+  int32_t x0, y0, x1, y1;   // pixels that it may draw, half open
+  uint32_t id;
+  uint32_t slot;            // of its first tile
+  int tiles_across() const { return (x1 - 1) / kSide - x0 / kSide + 1; }
+  int tiles() const { return tiles_across() * ((y1 - 1) / kSide - y0 / kSide + 1); }
+  uint32_t slot_of(int tile_x, int tile_y) const {
+    return slot + static_cast<uint32_t>((tile_y - y0 / kSide) * tiles_across() + tile_x - x0 / kSide);
+  }
+};
+
+// The colour, and for its derivative the direction; given or by spherical harmonics.
+inline Vec3 surfel_colour(const fragprune_inputs& in, size_t i, Harmonics<float>& h, int& terms,
+                          Vec3& direction, float& inv_length, bool with_slope) {
+  if (in.colors) return read3(in.colors + 3 * i);
+  direction = direction_to(read3(in.campos), read3(in.means + 3 * i), inv_length);
+  terms = harmonics(in.sh_degree, direction, h, with_slope);
+  const float* sh = in.sh + i * 3 * static_cast<size_t>(in.sh_coefficients);
+  return raw_colour(h, terms, [&](int k) { return read3(sh + 3 * k); });
+}
+
+// False: nothing of it is drawn. The radius is the host's, whatever the thresholds.
+inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius, Surfel& to) {
+  radius = 0;
+  SurfelView s;
+  if (!view_surfel(in, i, s)) return false;
+  const double round = kSurfelReach / std::sqrt(double{kSurfelFilter});
+  const double reach = std::ceil(std::max({s.half_x, s.half_y, round}));
+  const double at_x = s.shift_x + s.centre_x, at_y = s.shift_y + s.centre_y;
+  if (!(reach < 1e9 && std::abs(at_x) < 1e9 && std::abs(at_y) < 1e9)) return false;
+  const int tiles_x = (in.width + kSide - 1) / kSide, tiles_y = (in.height + kSide - 1) / kSide;
+  const auto tile = [](double pixel, int most) {  // towards 0, as a cast does
+    return static_cast<int>(std::clamp(pixel / kSide, 0.0, static_cast<double>(most)));
+  };
+  const int first_x = tile(at_x - reach, tiles_x), last_x = tile(at_x + reach + kSide - 1, tiles_x);
+  const int first_y = tile(at_y - reach, tiles_y), last_y = tile(at_y + reach + kSide - 1, tiles_y);
+  if (first_x >= last_x || first_y >= last_y) return false;
+  radius = static_cast<int32_t>(reach);
+
+  const float opacity = in.opacities[i], tau = in.thresholds ? in.thresholds[i] : 0.f;
+  if (!(opacity > 0 && opacity < 1e30f && tau >= 0)) return false;
+  const float visible = 2 * std::log(opacity * 255.f);
+  const auto farthest = [&](float falloff) {
+    return falloff > 0 ? std::min(-2 * std::log(falloff), visible) : visible;
+  };
+  to.cut = farthest(tau);
+  to.list_cut = in.widen ? farthest(rim_reach(tau)) : to.cut;
+  if (!(to.list_cut >= 0)) return false;
+
+  // The pixels within the cut: those of the plane's ellipse and of the round Gaussian's disc.
+  double centre[2], half[2];
+  const double w_edge = to.list_cut * (s.depth.x * s.depth.x + s.depth.y * s.depth.y) -
+                        s.depth.z * s.depth.z;
+  to.x0 = first_x * kSide, to.y0 = first_y * kSide;
+  to.x1 = std::min(last_x * kSide, in.width), to.y1 = std::min(last_y * kSide, in.height);
+  if (w_edge < 0 && surfel_box(s, to.list_cut, centre, half)) {
+    const double disc = std::sqrt(to.list_cut / kSurfelFilter);
+    const double means[2] = {s.centre_x, s.centre_y}, shift[2] = {s.shift_x, s.shift_y};
+    int32_t* low[2] = {&to.x0, &to.y0};
+    int32_t* high[2] = {&to.x1, &to.y1};
+    for (int k = 0; k < 2; k++) {
+      const double spare = 0.01 + 1e-4 * half[k];
+      const double from = std::min(centre[k] - half[k] - spare, means[k] - disc - spare);
+      const double end = std::max(centre[k] + half[k] + spare, means[k] + disc + spare);
+      *low[k] = std::max(*low[k], static_cast<int32_t>(std::ceil(std::max(from + shift[k], -1.))));
+      *high[k] =
+          std::min(*high[k], static_cast<int32_t>(std::floor(std::min(end + shift[k], 1e6))) + 1);
+    }
+  }
+  if (to.x0 >= to.x1 || to.y0 >= to.y1) return false;
+
+  Harmonics<float> h;
+  int terms;
+  Vec3 direction;
+  float inv_length;
+  Vec3 c = surfel_colour(in, i, h, terms, direction, inv_length, false);
+  if (!(std::abs(c.x) + std::abs(c.y) + std::abs(c.z) < 1e30f)) return false;
+  if (!in.colors) c = {max(c.x, 0.f), max(c.y, 0.f), max(c.z, 0.f)};
+  to.colour = c;
+  const Wide3 origin = cross3(s.across, s.down);
+  const double size = std::abs(origin.x) + std::abs(origin.y) + std::abs(origin.z);
+  if (!std::isfinite(size)) return false;
+  to.origin = narrow3(origin);
+  to.by_x = narrow3(cross3(s.down, s.depth));
+  to.by_y = narrow3(cross3(s.depth, s.across));
+  to.depth = narrow3(s.depth);
+  to.shift_x = static_cast<float>(s.shift_x), to.shift_y = static_cast<float>(s.shift_y);
+  to.centre_x = static_cast<float>(s.centre_x), to.centre_y = static_cast<float>(s.centre_y);
+  const float* v = in.viewmatrix;
+  const Wide3& n = s.axis[2];
+  to.normal = narrow3(scaled3(s.facing, {n.x * v[0] + n.y * v[4] + n.z * v[8],
+                                         n.x * v[1] + n.y * v[5] + n.z * v[9],
+                                         n.x * v[2] + n.y * v[6] + n.z * v[10]}));
+  to.order = static_cast<float>(s.view_z);
+  to.inv_z = 1 / to.order;
+  to.opacity = opacity, to.threshold = tau;
+  to.id = static_cast<uint32_t>(i);
+  return true;
+}
+
+// ---- one fragment ----------------------------------------------------------------------------
+
+// A surfel met by kLanes pixels of a row.
+struct SurfelMeeting {
+  Lanes u, v, inv;   // the point on the plane, and 1 / p.z
+  Lanes dx, dy;      // from the pixels to the round Gaussian's centre
+  Lanes q, depth;
+  Mask on_plane;     // else the round Gaussian is nearer
+  Mask met;          // in front of the near plane, and within the list's cut
+};
+
+inline SurfelMeeting meet_surfel(const Surfel& s, Lanes px, Lanes py, float near) {
+  const auto all = [](float x) { return broadcast<Lanes>(x); };
+  const Lanes x = px - all(s.shift_x), y = py - all(s.shift_y);
+  const auto point = [&](float at, float by_x, float by_y) {
+    return fma(x, all(by_x), fma(y, all(by_y), all(at)));
+  };
+  const Lanes pz = point(s.origin.z, s.by_x.z, s.by_y.z);
+  SurfelMeeting m;
+  m.inv = all(1.f) / pz;
+  m.u = point(s.origin.x, s.by_x.x, s.by_y.x) * m.inv;
+  m.v = point(s.origin.y, s.by_x.y, s.by_y.y) * m.inv;
+  m.dx = all(s.centre_x) - x, m.dy = all(s.centre_y) - y;
+  const Lanes on_plane = fma(m.u, m.u, m.v * m.v);
+  const Lanes filtered = all(kSurfelFilter) * fma(m.dx, m.dx, m.dy * m.dy);
+  m.on_plane = ge(filtered, on_plane);
+  m.q = select(m.on_plane, on_plane, filtered);
+  m.depth = fma(m.u, all(s.depth.x), fma(m.v, all(s.depth.y), all(s.depth.z)));
+  m.met = both(both(ge(m.depth, all(near)), gt(abs(pz), all(0.f))), ge(all(s.list_cut), m.q));
+  return m;
+}
+
+inline Lanes surfel_falloff(Lanes q) { return exp2(q * broadcast<Lanes>(-0.5f * kLog2E)); }
+
+// The distortion's depth: 0 at the near plane, 1 at kSurfelFar.
+inline Lanes surfel_m(Lanes depth, float near) {
+  const Lanes one = broadcast<Lanes>(1.f);
+  return broadcast<Lanes>(kSurfelFar / (kSurfelFar - near)) * (one - broadcast<Lanes>(near) / depth);
+}
+
+// Calls work(place, px, py) for each kLanes pixels of a tile that a surfel may draw.
+template <class Work>
+inline void each_lanes(const Surfel& s, int tile_x, int tile_y, Work work) {
+  float steps[kLanes];
+  for (int i = 0; i < kLanes; i++) steps[i] = static_cast<float>(i);
+  const int left = std::max(s.x0 - tile_x, 0) / kLanes * kLanes, right = std::min(s.x1 - tile_x, kSide);
+  const int top = std::max(s.y0 - tile_y, 0), bottom = std::min(s.y1 - tile_y, kSide);
+  for (int y = top; y < bottom; y++)
+    for (int x = left; x < right; x += kLanes)
+      work(y * kSide + x, load(steps) + broadcast<Lanes>(static_cast<float>(tile_x + x)),
+           broadcast<Lanes>(static_cast<float>(tile_y + y)));
+}
+
+// ---- forward ---------------------------------------------------------------------------------
+
+// What the forward pass leaves of a tile, row by row.
+struct SurfelPixels {
+  float light[kArea];        // final transmittance
+  float first[kArea], second[kArea];  // sums of w m, w m^2
+  int32_t stop[kArea];       // fragments at this place of the list or later are not alive
+  int32_t median[kArea];     // place of the median depth's fragment; -1
+};
+
+struct SurfelScene {
+  Memory memory;
+  fragprune_inputs in;
+  std::vector<Surfel> surfels;      // front to back
+  std::vector<uint32_t> first;      // per tile, one more at the end
+  std::vector<uint32_t> list;       // surfels
+  Buffer<SurfelPixels> pixels;      // per tile
+  size_t slots = 0;
+  int tiles_x = 0, tiles_y = 0;
+};
+
+inline void list_surfels(SurfelScene& scene) {
+  const auto tiles_of = [&](const Surfel& s, auto work) {
+    for (int y = s.y0 / kSide; y <= (s.y1 - 1) / kSide; y++)
+      for (int x = s.x0 / kSide; x <= (s.x1 - 1) / kSide; x++)
+        work(static_cast<size_t>(y) * static_cast<size_t>(scene.tiles_x) + static_cast<size_t>(x));
+  };
+  const size_t tiles = static_cast<size_t>(scene.tiles_x) * static_cast<size_t>(scene.tiles_y);
+  std::vector<uint64_t> counts(tiles + 1);
+  for (Surfel& s : scene.surfels) {
+    s.slot = static_cast<uint32_t>(scene.slots);
+    scene.slots += static_cast<size_t>(s.tiles());
+    tiles_of(s, [&](size_t t) { counts[t + 1]++; });
+  }
+  if (scene.slots > UINT32_MAX) throw std::length_error("tile lists");
+  std::partial_sum(counts.begin(), counts.end(), counts.begin());
+  scene.first.assign(counts.begin(), counts.end());
+  scene.list.resize(scene.slots);
+  std::vector<uint32_t> cursor(scene.first.begin(), scene.first.end() - 1);
+  for (size_t j = 0; j < scene.surfels.size(); j++)
+    tiles_of(scene.surfels[j], [&](size_t t) { scene.list[cursor[t]++] = static_cast<uint32_t>(j); });
+}
+
+inline void prepare_surfels(Team& team, const fragprune_inputs& in, int32_t* radii,
+                            SurfelScene& scene) {
+  const size_t n = static_cast<size_t>(in.count);
+  Buffer<Surfel> all(scene.memory, n);
+  std::vector<uint8_t> lives(n);
+  team.each(n, 256, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; i++) lives[i] = prepare_surfel(in, i, radii[i], all[i]);
+  });
+  std::vector<uint32_t> order;
+  for (size_t i = 0; i < n; i++)
+    if (lives[i]) order.push_back(static_cast<uint32_t>(i));
+  std::stable_sort(order.begin(), order.end(),
+                   [&](uint32_t a, uint32_t b) { return all[a].order < all[b].order; });
+  scene.surfels.reserve(order.size());
+  for (uint32_t i : order) scene.surfels.push_back(all[i]);
+  list_surfels(scene);
+}
+
+// Sums of one surfel over one tile, if they are wanted.
+struct SurfelFound {
+  Buffer<int32_t> fragments;
+  Buffer<float> weights;
+};
+
+struct SurfelSpent {
+  int64_t drawn = 0, evaluated = 0, entries = 0;
+};
+
+inline SurfelSpent draw_surfel_tile(SurfelScene& scene, size_t t, const fragprune_outputs& out,
+                                    SurfelFound& found) {
+  const fragprune_inputs& in = scene.in;
+  const int tile_x = static_cast<int>(t) % scene.tiles_x * kSide;
+  const int tile_y = static_cast<int>(t) / scene.tiles_x * kSide;
+  const int wide = std::min(kSide, in.width - tile_x), high = std::min(kSide, in.height - tile_y);
+  SurfelPixels& kept = scene.pixels[t];
+  // red, green, blue, 1/z; depth, normal, median depth, distortion
+  alignas(64) float sums[4 + kSurface][kArea] = {};
+  alignas(64) float most[kArea] = {};
+  alignas(64) int32_t drawn_count[kArea] = {}, winner[kArea];
+  std::fill_n(winner, kArea, -1), std::fill_n(kept.median, kArea, -1);
+  std::fill_n(kept.first, kArea, 0.f), std::fill_n(kept.second, kArea, 0.f);
+  int pixels = 0;
+  for (int i = 0; i < kArea; i++) {
+    const bool inside = i % kSide < wide && i / kSide < high;
+    kept.light[i] = 1.f, kept.stop[i] = inside ? kNever : 0;
+    pixels += inside;
+  }
+  const auto all = [](float x) { return broadcast<Lanes>(x); };
+  const bool surface = out.surface != nullptr, scores = out.winners || out.wins_per_gaussian;
+  SurfelSpent spent;
+  const uint32_t begin = scene.first[t], end = scene.first[t + 1];
+  int stopped = kArea - pixels;
+  for (uint32_t e = begin; e < end && stopped < kArea; e++) {
+    const Surfel& s = scene.surfels[scene.list[e]];
+    const int32_t place = static_cast<int32_t>(e - begin);
+    int32_t fragments = 0;
+    Lanes weights = all(0.f);
+    spent.entries++;
+    each_lanes(s, tile_x, tile_y, [&](int at, Lanes px, Lanes py) {
+      spent.evaluated += kLanes;
+      const IntLanes stop = load(kept.stop + at);
+      Mask alive = gt(stop, broadcast_int(place));
+      if (!bits(alive)) return;
+      const SurfelMeeting m = meet_surfel(s, px, py, in.near);
+      const Mask inside = both(both(m.met, alive), ge(all(s.cut), m.q));
+      if (!bits(inside)) return;
+      const Lanes alpha = where(inside, capped(all(s.opacity) * surfel_falloff(m.q), in.alpha_max));
+      const Lanes light = load(kept.light + at), after = fnma(light, alpha, light);
+      const Mask goes_on = both(alive, ge(after, all(kTransmittanceMin)));
+      const Mask drawn = both(inside, goes_on);
+      const uint32_t ends = bits(alive) & ~bits(goes_on);
+      if (ends) {
+        store(kept.stop + at, select(goes_on, stop, select(alive, broadcast_int(place), stop)));
+        stopped += __builtin_popcount(ends);
+      }
+      const Lanes weight = where(drawn, alpha * light);
+      store(kept.light + at, select(goes_on, after, light));
+      store(drawn_count + at, increment(drawn, load(drawn_count + at)));
+      const auto add = [&](int k, Lanes value) {
+        store(sums[k] + at, fma(weight, value, load(sums[k] + at)));
+      };
+      add(0, all(s.colour.x)), add(1, all(s.colour.y)), add(2, all(s.colour.z));
+      if (out.invdepth) add(3, all(s.inv_z));
+      if (surface) {
+        const Lanes depth = select(drawn, m.depth, all(1.f));
+        const Lanes d = surfel_m(depth, in.near), used = all(1.f) - light;
+        const Lanes first = load(kept.first + at), second = load(kept.second + at);
+        add(4, depth);
+        add(5, all(s.normal.x)), add(6, all(s.normal.y)), add(7, all(s.normal.z));
+        add(9, fma(d, fma(d, used, -2.f * first), second));
+        store(kept.first + at, fma(weight, d, first));
+        store(kept.second + at, fma(weight * d, d, second));
+        const Mask half = both(drawn, gt(light, all(0.5f)));
+        store(sums[8] + at, select(half, depth, load(sums[8] + at)));
+        store(kept.median + at, select(half, broadcast_int(place), load(kept.median + at)));
+      }
+      fragments += __builtin_popcount(bits(drawn));
+      weights = weights + weight;
+      if (scores) {
+        const Lanes before = load(most + at);
+        const auto id = broadcast_int(static_cast<int32_t>(s.id));
+        store(winner + at, select(gt(weight, before), id, load(winner + at)));
+        store(most + at, max(weight, before));
+      }
+    });
+    spent.drawn += fragments;
+    const uint32_t slot = s.slot_of(tile_x / kSide, tile_y / kSide);
+    if (found.fragments.size()) found.fragments[slot] = fragments;
+    if (found.weights.size()) found.weights[slot] = sum(weights);
+  }
+  const size_t plane = static_cast<size_t>(in.width) * static_cast<size_t>(in.height);
+  for (int y = 0; y < high; y++)
+    for (int x = 0; x < wide; x++) {
+      const int i = y * kSide + x;
+      const size_t at = static_cast<size_t>(tile_y + y) * static_cast<size_t>(in.width) +
+                        static_cast<size_t>(tile_x + x);
+      for (int k = 0; k < 3; k++)
+        out.image[k * plane + at] = sums[k][i] + kept.light[i] * in.background[k];
+      if (out.invdepth) out.invdepth[at] = sums[3][i];
+      if (out.alpha) out.alpha[at] = 1.f - kept.light[i];
+      for (int k = 0; surface && k < kSurface; k++) out.surface[k * plane + at] = sums[4 + k][i];
+      if (out.fragments) out.fragments[at] = drawn_count[i];
+      if (out.winners) out.winners[at] = winner[i];
+      if (out.wins_per_gaussian && winner[i] >= 0)
+        __atomic_fetch_add(out.wins_per_gaussian + winner[i], 1, __ATOMIC_RELAXED);
+    }
+  return spent;
+}
+
+// Draws; returns what the way back needs.
+FP_STAGE inline std::unique_ptr<SurfelScene> draw_surfels(const fragprune_inputs& in,
+                                                          fragprune_outputs& out,
+                                                          const Memory& memory) {
+  Team team(in.threads);
+  auto scene = std::make_unique<SurfelScene>();
+  scene->memory = memory, scene->in = in;
+  scene->tiles_x = (in.width + kSide - 1) / kSide, scene->tiles_y = (in.height + kSide - 1) / kSide;
+  prepare_surfels(team, in, out.radii, *scene);
+  const size_t n = static_cast<size_t>(in.count), tiles = scene->first.size() - 1;
+  scene->pixels = Buffer<SurfelPixels>(memory, tiles);
+  SurfelFound found;
+  if (out.fragments_per_gaussian) {
+    found.fragments = Buffer<int32_t>(memory, scene->slots);
+    std::fill_n(found.fragments.data(), scene->slots, 0);
+    std::fill_n(out.fragments_per_gaussian, n, 0);
+  }
+  if (out.weights_per_gaussian) {
+    found.weights = Buffer<float>(memory, scene->slots);
+    std::fill_n(found.weights.data(), scene->slots, 0.f);
+    std::fill_n(out.weights_per_gaussian, n, 0.f);
+  }
+  if (out.wins_per_gaussian) std::fill_n(out.wins_per_gaussian, n, 0);
+  std::atomic<int64_t> drawn{0}, evaluated{0}, entries{0};
+  team.each(tiles, 1, [&](size_t t, size_t) {
+    const SurfelSpent spent = draw_surfel_tile(*scene, t, out, found);
+    drawn += spent.drawn, evaluated += spent.evaluated, entries += spent.entries;
+  });
+  for (const Surfel& s : scene->surfels)
+    for (uint32_t slot = s.slot; slot < s.slot + static_cast<uint32_t>(s.tiles()); slot++) {
+      if (out.fragments_per_gaussian) out.fragments_per_gaussian[s.id] += found.fragments[slot];
+      if (out.weights_per_gaussian) out.weights_per_gaussian[s.id] += found.weights[slot];
+    }
+  out.drawn = drawn, out.evaluated = evaluated, out.entries = entries;
+  return scene;
+}
+
+// ---- backward --------------------------------------------------------------------------------
+
+// Sums over the fragments of one surfel in one tile: dL/d of each.
+enum SurfelSum {
+  kByOrigin = 0,      // 3: p at its pixel
+  kByX = 3, kByY = 6, // 3 each: its steps
+  kByDepth = 9,       // 3: the depth's row, as it acts beside p
+  kByCentre = 12,     // 2: the round Gaussian's
+  kByNormal = 14,     // 3
+  kByColour = 17,     // 3
+  kByInvZ = 20,
+  kByOpacity = 21,    // times the opacity
+  kByThreshold = 22,
+  kSurfelSums = 24
+};
+
+inline void undraw_surfel_tile(const SurfelScene& scene, size_t t, const fragprune_output_grads& by,
+                               bool rim, float* slots, double* by_background) {
+  const fragprune_inputs& in = scene.in;
+  const int tile_x = static_cast<int>(t) % scene.tiles_x * kSide;
+  const int tile_y = static_cast<int>(t) / scene.tiles_x * kSide;
+  const int wide = std::min(kSide, in.width - tile_x), high = std::min(kSide, in.height - tile_y);
+  const size_t plane = static_cast<size_t>(in.width) * static_cast<size_t>(in.height);
+  const SurfelPixels& kept = scene.pixels[t];
+  alignas(64) float g[4 + kSurface][kArea] = {};  // as in draw_surfel_tile
+  alignas(64) float light[kArea], behind[kArea];
+  for (int k = 0; k < 3; k++) by_background[k] = 0;
+  int32_t last = 0;
+  for (int i = 0; i < kArea; i++) {
+    light[i] = kept.light[i], behind[i] = 0;
+    const int x = i % kSide, y = i / kSide;
+    if (x >= wide || y >= high) continue;
+    const size_t at = static_cast<size_t>(tile_y + y) * static_cast<size_t>(in.width) +
+                      static_cast<size_t>(tile_x + x);
+    float seen = by.alpha ? -by.alpha[at] : 0.f;
+    for (int k = 0; k < 3; k++) {
+      g[k][i] = by.image ? by.image[k * plane + at] : 0.f;
+      seen += g[k][i] * in.background[k];
+      by_background[k] += light[i] * g[k][i];
+    }
+    g[3][i] = by.invdepth ? by.invdepth[at] : 0.f;
+    for (int k = 0; by.surface && k < kSurface; k++) g[4 + k][i] = by.surface[k * plane + at];
+    behind[i] = light[i] * seen;
+    last = std::max(last, kept.stop[i]);
+  }
+  const auto all = [](float x) { return broadcast<Lanes>(x); };
+  const float per_fragment = by.fragments_per_pixel / static_cast<float>(plane);
+  const float slope = kSurfelFar * in.near / (kSurfelFar - in.near);  // of m, times depth^2
+  const int32_t length = static_cast<int32_t>(scene.first[t + 1] - scene.first[t]);
+  for (int32_t place = std::min(last, length) - 1; place >= 0; place--) {
+    const Surfel& s = scene.surfels[scene.list[scene.first[t] + static_cast<uint32_t>(place)]];
+    Lanes sums[kSurfelSums];
+    for (Lanes& v : sums) v = all(0.f);
+    each_lanes(s, tile_x, tile_y, [&](int at, Lanes px, Lanes py) {
+      const Mask alive = gt(load(kept.stop + at), broadcast_int(place));
+      if (!bits(alive)) return;
+      const SurfelMeeting m = meet_surfel(s, px, py, in.near);
+      const Mask reached = both(m.met, alive);
+      if (!bits(reached)) return;
+      const Mask drawn = both(reached, ge(all(s.cut), m.q));
+      const Lanes one = all(1.f);
+      const Lanes falloff = surfel_falloff(select(reached, m.q, all(0.f)));
+      const Lanes uncapped = all(s.opacity) * falloff, full = capped(uncapped, in.alpha_max);
+      const Lanes alpha = where(drawn, full), inv = one / (one - alpha);
+      const Lanes before = load(light + at) * inv, later = load(behind + at);
+      const auto loss = [&](int k) { return load(g[k] + at); };
+      const Lanes depth = select(reached, m.depth, one);
+      Lanes shade = loss(0) * all(s.colour.x) + loss(1) * all(s.colour.y) +
+                    loss(2) * all(s.colour.z) + loss(3) * all(s.inv_z);
+      Lanes by_depth = all(0.f);
+      const Lanes weight = alpha * before;
+      if (by.surface) {
+        const Lanes d = surfel_m(depth, in.near), used = one - load(kept.light + at);
+        const Lanes first = load(kept.first + at), distortion = loss(9);
+        shade = shade + loss(4) * depth + loss(5) * all(s.normal.x) + loss(6) * all(s.normal.y) +
+                loss(7) * all(s.normal.z) +
+                distortion * fma(d, fma(d, used, -2.f * first), load(kept.second + at));
+        by_depth = weight * (loss(4) + 2.f * distortion * fma(d, used, -first) * all(slope) /
+                                           (depth * depth));
+        const IntLanes median = load(kept.median + at);
+        const Mask other = gt(median, broadcast_int(place));  // behind
+        const Mask here = both(gt(median, broadcast_int(place - 1)), drawn);
+        by_depth = by_depth + select(other, all(0.f), where(here, loss(8)));
+        for (int k = 0; k < 3; k++)
+          sums[kByNormal + k] = fma(weight, loss(5 + k), sums[kByNormal + k]);
+      }
+      const Lanes by_alpha = fnma(later, inv, before * shade);
+      store(light + at, select(drawn, before, load(light + at)));
+      store(behind + at, fma(weight, shade, later));
+      for (int k = 0; k < 3; k++)
+        sums[kByColour + k] = fma(weight, loss(k), sums[kByColour + k]);
+      sums[kByInvZ] = fma(weight, loss(3), sums[kByInvZ]);
+      Lanes w = where(drawn, uncapped * by_alpha);  // straight through the cap
+      if (!in.cap_gradient) w = where(ge(all(in.alpha_max), uncapped), w);
+      sums[kByOpacity] = sums[kByOpacity] + w;
+      if (rim) {
+        const Lanes away = abs(falloff - all(s.threshold));
+        const Mask near = both(reached, ge(all(kRimHorizon), away));
+        const Lanes gain = fma(full, by_alpha, all(per_fragment));
+        sums[kByThreshold] = sums[kByThreshold] - where(near, gain * rim_density(away));
+      }
+      // q = u^2 + v^2 or 2 |centre - pixel|^2, and dL/dq = -w / 2
+      const Mask plane_drawn = both(drawn, m.on_plane);
+      const Lanes round = select(m.on_plane, all(0.f), w * all(-kSurfelFilter));
+      sums[kByCentre] = sums[kByCentre] + where(drawn, round * m.dx);
+      sums[kByCentre + 1] = sums[kByCentre + 1] + where(drawn, round * m.dy);
+      const Lanes u = where(drawn, m.u), v = where(drawn, m.v);
+      const Lanes by_u = where(plane_drawn, (by_depth * all(s.depth.x) - w * u) * m.inv);
+      const Lanes by_v = where(plane_drawn, (by_depth * all(s.depth.y) - w * v) * m.inv);
+      const Lanes by_point[3] = {by_u, by_v, -(by_u * u + by_v * v)};
+      const Lanes x = px - all(s.shift_x), y = py - all(s.shift_y);
+      const Lanes by_row[3] = {by_depth * u, by_depth * v, by_depth};
+      for (int k = 0; k < 3; k++) {
+        sums[kByOrigin + k] = sums[kByOrigin + k] + by_point[k];
+        sums[kByX + k] = fma(x, by_point[k], sums[kByX + k]);
+        sums[kByY + k] = fma(y, by_point[k], sums[kByY + k]);
+        sums[kByDepth + k] = sums[kByDepth + k] + where(drawn, by_row[k]);
+      }
+    });
+    sum_each<kSurfelSums>(sums, slots + size_t{kSurfelSums} *
+                                            s.slot_of(tile_x / kSide, tile_y / kSide));
+  }
+}
+
+// From a surfel's sums over all its tiles to its inputs.
+inline void unproject_surfel(const fragprune_inputs& in, const Surfel& surfel, const double* sums,
+                             const fragprune_input_grads& to) {
+  const size_t i = surfel.id;
+  const auto three = [&](int k) { return Wide3{sums[k], sums[k + 1], sums[k + 2]}; };
+  if (to.opacities) to.opacities[i] = static_cast<float>(sums[kByOpacity] / surfel.opacity);
+  if (to.thresholds) to.thresholds[i] = static_cast<float>(sums[kByThreshold]);
+  const auto write = [&](float* rows, const Wide3& v) {
+    if (!rows) return;
+    const Vec3 n = narrow3(v);
+    rows[3 * i] = n.x, rows[3 * i + 1] = n.y, rows[3 * i + 2] = n.z;
+  };
+  write(to.colors, three(kByColour));
+  Wide3 by_mean = {0, 0, 0};
+  if (in.sh && (to.sh || to.means)) {
+    Harmonics<float> h;
+    int terms;
+    Vec3 direction;
+    float inv_length;
+    const bool slope = to.means && in.sh_degree > 0;
+    const Vec3 raw = surfel_colour(in, i, h, terms, direction, inv_length, slope);
+    const Vec3 by = through_clamp(raw, narrow3(three(kByColour)));
+    const size_t width = 3 * static_cast<size_t>(in.sh_coefficients);
+    for (int k = 0; to.sh && k < terms; k++)
+      for (int c = 0; c < 3; c++)
+        to.sh[i * width + static_cast<size_t>(3 * k + c)] = h.value[k] * (&by.x)[c];
+    const float* sh = in.sh + i * width;
+    if (slope) {
+      const Vec3 d = direction_gradient(h, terms, direction, inv_length, by,
+                                        [&](int k) { return read3(sh + 3 * k); });
+      by_mean = {d.x, d.y, d.z};
+    }
+  }
+  if (!(to.means || to.hook || to.scales || to.rotations)) return;
+  SurfelView s;
+  if (!view_surfel(in, i, s)) return;
+  // p = origin + x by_x + y by_y, each a cross product of two rows
+  Wide3 across = {0, 0, 0}, down = {0, 0, 0}, depth = three(kByDepth);
+  const auto through = [](const Wide3& a, const Wide3& b, const Wide3& by, Wide3& by_a, Wide3& by_b) {
+    add3(by_a, 1, cross3(b, by)), add3(by_b, 1, cross3(by, a));
+  };
+  through(s.across, s.down, three(kByOrigin), across, down);
+  through(s.down, s.depth, three(kByX), down, depth);
+  through(s.depth, s.across, three(kByY), depth, across);
+  if (to.hook) {  // of the plane alone, as the host has it
+    to.hook[3 * i] = static_cast<float>(across.z * s.view_z * 0.5 * in.width);
+    to.hook[3 * i + 1] = static_cast<float>(down.z * s.view_z * 0.5 * in.height);
+    to.hook[3 * i + 2] = 0.f;
+  }
+  // centre = sum_k t_k row_k depth_k / d, d = sum_k t_k depth_k^2
+  const double t[3] = {kSurfelReach * kSurfelReach, kSurfelReach * kSurfelReach, -1};
+  double *rows[2] = {&across.x, &down.x}, *by_depth = &depth.x;
+  const double *given[2] = {&s.across.x, &s.down.x}, *w = &s.depth.x;
+  const double d = t[0] * w[0] * w[0] + t[1] * w[1] * w[1] + t[2] * w[2] * w[2];
+  const double centre[2] = {s.centre_x, s.centre_y};
+  for (int axis = 0; axis < 2; axis++)
+    for (int k = 0; k < 3; k++) {
+      const double by = sums[kByCentre + axis] * t[k] / d;
+      rows[axis][k] += by * w[k];
+      by_depth[k] += by * (given[axis][k] - 2 * centre[axis] * w[k]);
+    }
+  // rows = (side u, side v, mean) in the world times to_*
+  const auto back = [&](double a, double b, double c) {
+    Wide3 v = scaled3(a, s.to_across);
+    add3(v, b, s.to_down), add3(v, c, s.to_depth);
+    return v;
+  };
+  const Wide3 by_u = back(across.x, down.x, depth.x), by_v = back(across.y, down.y, depth.y);
+  add3(by_mean, 1, back(across.z, down.z, depth.z));
+  const float* view = in.viewmatrix;
+  add3(by_mean, -sums[kByInvZ] / (s.view_z * s.view_z), {view[2], view[6], view[10]});
+  write(to.means, by_mean);
+  const double modifier = in.scale_modifier;
+  if (to.scales) {
+    to.scales[2 * i] = static_cast<float>(modifier * dot3(by_u, s.axis[0]));
+    to.scales[2 * i + 1] = static_cast<float>(modifier * dot3(by_v, s.axis[1]));
+  }
+  if (to.rotations) {
+    const Wide3 n = scaled3(s.facing, three(kByNormal));
+    const Wide3 by_n = {n.x * view[0] + n.y * view[1] + n.z * view[2],
+                        n.x * view[4] + n.y * view[5] + n.z * view[6],
+                        n.x * view[8] + n.y * view[9] + n.z * view[10]};
+    const Vec3 a = narrow3(scaled3(modifier * in.scales[2 * i], by_u));
+    const Vec3 b = narrow3(scaled3(modifier * in.scales[2 * i + 1], by_v)), c = narrow3(by_n);
+    const Mat3<float> m = {{{a.x, b.x, c.x}, {a.y, b.y, c.y}, {a.z, b.z, c.z}}};
+    rotation_gradient(in.rotations + 4 * i, m, to.rotations + 4 * i);
+  }
+}
+
+FP_STAGE inline void undraw_surfels(const SurfelScene& scene, const fragprune_output_grads& by,
+                                    const fragprune_input_grads& to, int threads) {
+  Team team(threads);
+  const fragprune_inputs& in = scene.in;
+  const size_t n = static_cast<size_t>(in.count), tiles = scene.first.size() - 1;
+  const std::pair<float*, size_t> arrays[] = {
+      {to.means, 3},     {to.hook, 3}, {to.opacities, 1}, {to.scales, 2},
+      {to.rotations, 4}, {to.sh, 3 * static_cast<size_t>(in.sh_coefficients)},
+      {to.colors, 3},    {to.thresholds, 1}};
+  for (const auto& [data, width] : arrays)
+    if (data) std::fill_n(data, n * width, 0.f);
+  Buffer<float> slots(scene.memory, scene.slots * kSurfelSums);
+  team.each(slots.size(), 1u << 18,
+            [&](size_t begin, size_t end) { std::fill(&slots[begin], slots.data() + end, 0.f); });
+  std::vector<double> by_background(3 * tiles);
+  team.each(tiles, 1, [&](size_t t, size_t) {
+    undraw_surfel_tile(scene, t, by, to.thresholds != nullptr, slots.data(), &by_background[3 * t]);
+  });
+  if (to.background)
+    for (size_t k = 0; k < 3; k++) {
+      double total = 0;
+      for (size_t t = 0; t < tiles; t++) total += by_background[3 * t + k];
+      to.background[k] = static_cast<float>(total);
+    }
+  team.each(scene.surfels.size(), 256, [&](size_t begin, size_t end) {
+    for (size_t j = begin; j < end; j++) {
+      const Surfel& s = scene.surfels[j];
+      double sums[kSurfelSums] = {};
+      for (int k = 0; k < s.tiles(); k++)
+        for (int m = 0; m < kSurfelSums; m++)
+          sums[m] += slots[(s.slot + static_cast<size_t>(k)) * kSurfelSums + static_cast<size_t>(m)];
+      unproject_surfel(in, s, sums, to);
+    }
+  });
+}
+
+}  // namespace fp
