@@ -303,8 +303,7 @@ def draw(
     shape = (len(block.y), len(block.x))
     surface = None
     if found.depth is not None and here.normal is not None:
-        light = weights_of(alpha)
-        surface = surface_of(light, found.drawn & live, found.depth, here.normal, options.near)
+        surface = surface_of(alpha, found.drawn & live, found.depth, here.normal, options.near)
         surface = surface.reshape(-1, *shape)
     return Drawing(
         layers=torch.cat([sums, left[None]]).reshape(-1, *shape),

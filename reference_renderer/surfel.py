@@ -13,6 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from reference_renderer.composite import transmittances
 from reference_renderer.covariance import rotation_matrices
 from reference_renderer.project import Footprints, colors_of, transform
 from reference_renderer.scene import Camera, Gaussians, Options
@@ -124,9 +125,7 @@ def meet(plane: Tensor, pixels: Tensor, filtered: Tensor, near: float) -> tuple[
     return torch.where(met, q, -1), torch.where(met, depth, 1)
 
 
-def surface_of(
-    weights: Tensor, drawn: Tensor, depth: Tensor, normal: Tensor, near: float
-) -> Tensor:
+def surface_of(alpha: Tensor, drawn: Tensor, depth: Tensor, normal: Tensor, near: float) -> Tensor:
     """(6, P): sum of w depth, of w normal (3), the median depth, the distortion.
 
     The median depth is that of the last drawn fragment before which more than half of the light is
@@ -134,15 +133,16 @@ def surface_of(
     w_i w_j (m_i - m_j)^2, where m maps depths near to 0 and ``FAR`` to 1, evenly in 1 / depth.
 
     Args:
-        weights: (K, P) w = alpha T, front to back.
+        alpha: (K, P) front to back, 0 where not drawn or stopped; w is alpha T.
         drawn: (K, P) bool.
         depth: (K, P) of the fragments.
         normal: (K, 3) view space.
         near: view depth.
     """
-    used = weights.cumsum(dim=0) - weights
+    light = transmittances(alpha)[:-1]
+    weights, used = alpha * light, 1 - light
     last = torch.arange(1, len(weights) + 1, device=depth.device)[:, None]
-    last = (last * (drawn & (used.detach() < 0.5))).max(dim=0).values if len(weights) else None
+    last = (last * (drawn & (light.detach() > 0.5))).max(dim=0).values if len(weights) else None
     median = weights.new_zeros(weights.shape[1])
     if last is not None:
         found = depth.gather(0, (last - 1).clamp(min=0)[None])[0]

@@ -56,14 +56,16 @@ class SurfelDialect(GraphdecoDialect):
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
         """(colour (3, H, W), radii (P,) int32, maps (7, H, W)).
 
-        The maps: depth, alpha, normal (3), median depth, distortion.
+        The maps: depth, alpha, normal (3), median depth, distortion. The host divides the first by
+        the second, so its gradient is NaN where nothing is drawn. No fragment of its own rasterizer
+        reads it there, but fragments just beyond a threshold would.
         """
         import torch
 
         surface = outputs.surface
         assert surface is not None  # unpack asked for it
         maps = torch.cat([surface[:1], outputs.alpha, surface[1:]])
-        return outputs.image, outputs.radii, maps
+        return outputs.image, outputs.radii, torch.where(outputs.alpha > 0, maps, 0.0)
 
 
 class SurfelSplatting(GraphdecoAdapter):
@@ -86,9 +88,7 @@ class SurfelSplatting(GraphdecoAdapter):
     calls = (RasterizerCall(outputs=3),)
     own_names = ("utils.point_utils:depth_to_normal", "gaussian_renderer:allmap")
     dialect_type = SurfelDialect
-    seams = revised(
-        GraphdecoAdapter.seams, {"GaussianRasterizer.forward": {"module": PACKAGE}}
-    )
+    seams = revised(GraphdecoAdapter.seams, {"GaussianRasterizer.forward": {"module": PACKAGE}})
 
     def read_model(self, ply: Path) -> SplatFile:
         """The host's own PLY, with two scales."""

@@ -76,6 +76,20 @@ def test_ascii_doubles_and_unknown_columns(tmp_path):
     assert same(model, read_ply(tmp_path / "foreign.ply"))
 
 
+def test_a_model_of_surfels_is_read_only_by_who_asks_for_it_and_written_as_it_was(tmp_path):
+    round_ones = tiny.random_model(4, degree=1)
+    model = replace(round_ones, scaling=round_ones.scaling[:, :2])
+    write_ply(tmp_path / "m.ply", model)
+    names = [p.name for p in PlyData.read(tmp_path / "m.ply")["vertex"].properties]
+    assert [name for name in names if name.startswith("scale")] == ["scale_0", "scale_1"]
+    with pytest.raises(ModelFileError, match=r"two scales.*2D Gaussian Splatting"):
+        read_ply(tmp_path / "m.ply")
+    read = read_ply(tmp_path / "m.ply", filtered=True)
+    assert same(model, read)
+    assert read.splats().flat
+    assert not round_ones.splats().flat
+
+
 def test_a_filtered_model_is_read_only_by_who_asks_for_it_and_written_as_it_was(tmp_path):
     model = tiny.random_model(4, degree=1)
     model = replace(model, filter_3d=torch.rand(4, 1))

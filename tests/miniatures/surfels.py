@@ -52,7 +52,10 @@ def depth_to_normal(view, depth):
 
 CHANGES = {
     "arguments/__init__.py": [
-        ("        self.debug = False\n", "        self.debug = False\n        self.depth_ratio = 0.0\n"),
+        (
+            "        self.debug = False\n",
+            "        self.debug = False\n        self.depth_ratio = 0.0\n",
+        ),
         (
             "        self.lambda_dssim = 0.2\n",
             "        self.lambda_dssim = 0.2\n"

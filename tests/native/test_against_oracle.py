@@ -33,6 +33,9 @@ KINDS = {
     "cov3d, antialiasing": {"cov3d": True, "compensation": "antialiasing", "sh_degree": 0},
     "colours, modifier": {"colors": True, "scale_modifier": 0.7},
     "odd size, sh 2": {"width": 33, "height": 17, "sh_degree": 2},
+    "surfels": {"flat": True},
+    "surfels, sh 3, modifier": {"flat": True, "sh_degree": 3, "scale_modifier": 0.7, "width": 33},
+    "surfels, colours": {"flat": True, "colors": True},
 }
 
 
@@ -54,7 +57,7 @@ def check_images(
     tolerance: float = IMAGE_TOLERANCE,
 ) -> None:
     assert (~same).sum() <= 1 + same.numel() // 500
-    for name in ("image", "invdepth", "alpha", "features"):
+    for name in ("image", "invdepth", "alpha", "features", "surface"):
         expected = getattr(truth, name)
         if expected is None:
             assert getattr(ours, name) is None
@@ -93,7 +96,7 @@ def gradients(
     out = engine.rasterize(made, thresholds)
     generator = torch.Generator().manual_seed(7)
     loss = out.image.new_zeros(())
-    for tensor in (out.image, out.invdepth, out.alpha, out.features):
+    for tensor in (out.image, out.invdepth, out.alpha, out.features, out.surface):
         if tensor is None:
             continue
         weight = torch.randn(tensor.shape, generator=generator) * same

@@ -1,0 +1,203 @@
+"""2D Gaussian Splatting: surfels and their maps, on a miniature of the host."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from cli.commands import run as command_line
+from cli.commands import run_json
+from miniatures.runs import OPTIONS, command, edit, frozen_differences, written
+from miniatures.surfels import SurfelHost
+from miniatures.vanilla_3dgs import joint
+from PIL import Image
+
+from fragprune_2dgs import SurfelSplatting
+from fragprune_plugins import rasterize
+from fragprune_plugins.cli.run import _measure, _photographs
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.errors import InputError, ModelFileError, UsageError
+from fragprune_plugins.finetuning import load_dataset
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import process
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.measure import Candidate
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.storage import records, sidecar
+from fragprune_plugins.storage.ply import read_ply
+
+COUNT = 16
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    return written(SurfelHost, tmp_path_factory.mktemp("surfels"))
+
+
+def of(mini, **options):
+    return {"path": mini, "adapter": SurfelSplatting(), "driver": SurfelHost()} | options
+
+
+# -- the call ------------------------------------------------------------------------------------
+
+
+def test_a_host_that_draws_no_maps_is_refused(mini, tmp_path):
+    written(SurfelHost, tmp_path)
+    renderer = tmp_path / "gaussian_renderer" / "__init__.py"
+    edit(renderer, "image, radii, allmap = Gauss", "image, radii = Gauss")
+    errors = [f.found for f in SurfelSplatting().match(HostRepo(tmp_path)).findings]
+    assert any("2 values back" in error for error in errors)
+
+
+class Notes:
+    """Remembers what was rasterized."""
+
+    @hookimpl(tryfirst=True)
+    def fragprune_truncate(self, inputs, store):
+        self.inputs = inputs
+
+
+def test_the_hosts_maps_are_those_of_the_oracle_in_its_order(mini):
+    notes = Notes()
+    with joint(**of(mini, plugins=[notes])) as host:
+        model, camera = host.model(COUNT), host.camera(20, 14)
+        host.step(model, camera, 1)
+        host.store(model).open(host.adapter.opacities(model))
+        drawn = host.render(camera, model)
+        truth = ReferenceEngine().rasterize(notes.inputs, host.store(model).values)
+    assert notes.inputs.splats.scales.shape == (COUNT, 2)
+    turn = camera.world_view_transform[:3, :3].T
+    depth = (truth.surface[:1] / truth.alpha).nan_to_num(0, 0)
+    expected = {
+        "render": truth.image,
+        "rend_alpha": truth.alpha,
+        "rend_normal": (truth.surface[1:4].permute(1, 2, 0) @ turn).permute(2, 0, 1),
+        "surf_depth": 0.6 * depth + 0.4 * truth.surface[4:5],
+        "rend_dist": truth.surface[5:],
+    }
+    for name, tensor in expected.items():
+        torch.testing.assert_close(drawn[name], tensor, rtol=1e-4, atol=1e-5)
+    assert (drawn["rend_normal"].norm(dim=0) > 0.1).any()
+    assert drawn["rend_dist"].max() > 0
+
+
+def test_matrices_in_place_of_scales_are_refused(mini):
+    with joint(**of(mini)) as host:
+        model, camera = host.model(COUNT), host.camera()
+        pipe = host.driver.pipe()
+        pipe.compute_cov3D_python = True
+        model.get_covariance = lambda modifier: torch.zeros(COUNT, 9)
+        host.driver.pipe = lambda: pipe
+        with pytest.raises(InputError, match="cov3D_precomp"):
+            host.render(camera, model)
+
+
+# -- a GPU ---------------------------------------------------------------------------------------
+
+
+def test_a_gpu_is_refused_before_the_training(mini, photographs, tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "host_device", lambda wanted, engine: "cuda")
+    words = command(mini / "train.py", photographs, tmp_path / "out", 20)
+    with pytest.raises(UsageError, match="2D Gaussian Splatting.*cuda engine.*--device cpu"):
+        run(words, RunOptions(device="cuda"))
+    assert not (tmp_path / "out").exists()
+
+
+# -- whole runs ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trained(mini, photographs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("trained")
+    words = command(mini / "train.py", photographs, out, 20)
+    return run(words, OPTIONS), words, out
+
+
+def read(path):
+    return SurfelSplatting().read_model(path)
+
+
+def test_stage_two_moves_opacities_and_thresholds_alone(trained):
+    summary, _, _ = trained
+    assert (summary.adapter, summary.iterations) == ("2dgs", 8)
+    assert summary.gaussians != 150  # it densified
+    assert frozen_differences(summary.model_before, summary.model_after, read) == []
+    before, after = read(summary.model_before), read(summary.model_after)
+    assert before.scaling.shape == (summary.gaussians, 2)
+    assert not torch.equal(before.opacity, after.opacity)
+    store, info = sidecar.load(summary.model_after)
+    assert len(store) == info.rows == summary.gaussians
+    assert summary.fragments_after < summary.fragments_before
+
+
+def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained, photographs):
+    summary, _, out = trained
+    run([str(mini / "render.py"), "-m", str(out), "--skip_train"], OPTIONS)
+    (theirs,) = (out / "test" / "ours_29" / "renders").glob("*.png")
+    values = sidecar.load(summary.model_after)[0].values.detach()
+    candidate = Candidate(read(summary.model_after), values, summary.drawing)
+    (shot,) = load_dataset(photographs).test
+    with torch.no_grad():
+        image = rasterize(candidate.inputs(shot.view, candidate.model.splats()), values).image
+    pixels = (image.clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
+    away = np.abs(pixels.astype(int) - np.asarray(Image.open(theirs)))
+    assert away.max() <= 1  # a camera's float32, rounded
+    before, after = _measure(_photographs(summary))
+    assert after["fragments_per_pixel"] < before["fragments_per_pixel"]
+
+
+def test_compare_draws_its_models_by_their_record(trained):
+    summary, _, _ = trained
+    records.leave(summary.model_after, "run", {"photographs": _photographs(summary)})
+    found = run_json("compare", summary.model_before, summary.model_after)
+    assert found["b"]["fragments_per_pixel"] < found["a"]["fragments_per_pixel"]
+
+
+def test_a_point_cloud_alone_is_resumed(mini, photographs, trained, tmp_path):
+    summary, _, _ = trained
+    words = command(
+        mini / "train.py", photographs, tmp_path, 28, "--start_checkpoint", summary.model_after
+    )
+    again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
+    assert sidecar.load(again.model_after)[0].steps == 16
+    assert read(again.model_after).scaling.shape[1] == 2
+
+
+def test_portable_is_refused(mini, photographs, trained, tmp_path):
+    _, words, _ = trained
+    options = RunOptions(
+        device="cpu",
+        stage="finetune",
+        settings=Settings(iterations=8, portable=True),
+        again=True,
+    )
+    with pytest.raises(InputError, match="surfels"):
+        run(words, options)
+
+
+# -- its PLY elsewhere ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("finetune", "MODEL", "--self", "--out", "new.ply"),
+        ("render", "MODEL", "--orbit", "--out", "film.mp4"),
+        ("export", "MODEL", "--out", "new.spz"),
+        ("audit", "MODEL", "--out", "audit"),
+        ("view", "MODEL", "--out", "page"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_commands_for_3d_gaussians_refuse_its_models(trained, tmp_path, words):
+    model = str(trained[0].model_before)
+    words = [str(tmp_path / w) if "." in w else w.replace("MODEL", model) for w in words]
+    result = command_line(*words)
+    assert result.exit_code == 1
+    assert "flat Gaussians with two scales" in result.stderr
+
+
+def test_reading_its_model_as_3d_gaussians_says_what_it_is(trained):
+    with pytest.raises(ModelFileError, match="2D Gaussian Splatting.*fragprune run"):
+        read_ply(trained[0].model_before)

@@ -1,0 +1,109 @@
+"""Surfels on the cpu engine; what all Gaussians have in common is in test_against_oracle.py."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from native.test_against_oracle import check_gradients, check_images, draw_pair
+from native.test_dialects import check_scores
+from native.test_inputs import draw
+
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.inputs import native_arrays, native_inputs
+from fragprune_plugins.testing import scenes
+
+DIALECTS = {
+    "near": {"near": 2.5},
+    "scores": {"scores": True},
+    "low cap": {"alpha_max": 0.5},
+    "capped gradient": {"alpha_max": 0.6, "cap_gradient": False},
+}
+
+
+@pytest.mark.parametrize("kind", DIALECTS)
+def test_dialects_equal_the_oracle(engine: CpuEngine, kind: str) -> None:
+    scene = replace(scenes.random_scene(5, 60, 41, 29, flat=True), **DIALECTS[kind])
+    thresholds = scenes.random_thresholds(5, 60)
+    truth, ours, same = draw_pair(engine, scene, thresholds)
+    check_images(truth, ours, same)
+    check_gradients(engine, scene, thresholds, same)
+    if scene.scores:
+        check_scores(truth, ours, same)
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**20),
+    n=st.sampled_from([0, 1, 9, 40]),
+    size=st.sampled_from([(1, 1), (7, 33), (17, 15), (35, 21)]),
+    truncated=st.booleans(),
+)
+def test_pictures_of_any_size_equal_the_oracle(
+    engine: CpuEngine, seed: int, n: int, size: tuple[int, int], truncated: bool
+) -> None:
+    scene = scenes.random_scene(seed, n, *size, flat=True)
+    truth, ours, same = draw_pair(
+        engine, scene, scenes.random_thresholds(seed, n) if truncated else None
+    )
+    if not torch.equal(truth.radii, ours.radii):
+        assert (truth.radii - ours.radii).abs().max() <= 1
+        return  # within rounding of an integer: a whole tile more or less, rightly
+    same &= (truth.surface[4] - ours.surface[4]).abs() < 1e-3  # half of the light, to rounding
+    # Depths of surfels that are seen from the side: a division by what is left of cancelling terms.
+    check_images(truth, ours, same, 1e-3)
+
+
+def test_thresholds_spare_what_they_cut_off(engine: CpuEngine) -> None:
+    scene = scenes.random_scene(5, 300, 160, 120, flat=True)
+    whole = engine.rasterize(scene, None)
+    cut = engine.rasterize(scene, torch.full((300,), 0.5))
+    assert cut.fragments_per_pixel < 0.7 * whole.fragments_per_pixel
+    assert cut.evaluated_per_pixel < 0.7 * whole.evaluated_per_pixel
+    assert cut.entries_per_pixel < 0.8 * whole.entries_per_pixel
+
+
+def test_any_number_of_threads_draws_and_learns_the_same(engine: CpuEngine) -> None:
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            made, leaves = scenes.leaves(scenes.random_scene(6, 200, 70, 50, flat=True))
+            made = replace(made, scores=True, counts=True)
+            thresholds = scenes.random_thresholds(6, 200).requires_grad_()
+            out = engine.rasterize(made, thresholds)
+            (out.image.square().sum() + out.surface.sum() + out.fragments_per_pixel).backward()
+            grads = [leaf.grad for leaf in (*leaves.values(), thresholds)]
+            results.append([out.image, out.surface, out.weights_per_gaussian, out.winners, *grads])
+    finally:
+        torch.set_num_threads(before)
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_surface_is_drawn_where_it_is_asked_for(engine: CpuEngine) -> None:
+    scene = scenes.random_scene(6, 20, flat=True)
+    assert engine.rasterize(replace(scene, planes=("alpha",)), None).surface is None
+    assert engine.rasterize(replace(scene, planes=("surface",)), None).surface.shape == (6, 28, 40)
+    round_ones = scenes.random_scene(6, 20)
+    assert engine.rasterize(round_ones, None).surface is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"features": 2}, {"offsets": True}, {"compensation": "mip"}, {"cov3d": True}],
+    ids=lambda change: next(iter(change)),
+)
+def test_what_surfels_do_not_have_is_refused_by_compiled_code(change: dict) -> None:
+    scene = scenes.random_scene(6, 40, **change)
+    arrays = native_arrays(scene, None)
+    struct = native_inputs(scene, arrays, widen=False)
+    struct.flat = 1
+    status, message = draw(binding.library(), struct)
+    assert status != binding.OK
+    assert "flat Gaussians" in message
