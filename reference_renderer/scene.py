@@ -49,7 +49,7 @@ class Gaussians:
     Attributes:
         means: (N, 3) world.
         opacities: (N,) in (0, 1).
-        scales: (N, 3) standard deviations, world units; (N, 2) of surfels, along the first two axes.
+        scales: (N, 3) standard deviations, world units; (N, 2) of surfels, see ``flat``.
         rotations: (N, 4) quaternions w, x, y, z, used as given.
         cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
         sh: (N, K, 3) with K = (sh_degree + 1)^2 or more.
@@ -70,7 +70,7 @@ class Gaussians:
 
     @property
     def flat(self) -> bool:
-        """Whether they are surfels."""
+        """Whether they are surfels, which lie in the plane of their first two axes."""
         return self.scales is not None and self.scales.shape[1] == 2
 
     def take(self, rows: Tensor) -> Gaussians:

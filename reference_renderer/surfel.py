@@ -141,12 +141,10 @@ def surface_of(alpha: Tensor, drawn: Tensor, depth: Tensor, normal: Tensor, near
     """
     light = transmittances(alpha)[:-1]
     weights, used = alpha * light, 1 - light
-    last = torch.arange(1, len(weights) + 1, device=depth.device)[:, None]
-    last = (last * (drawn & (light.detach() > 0.5))).max(dim=0).values if len(weights) else None
-    median = weights.new_zeros(weights.shape[1])
-    if last is not None:
-        found = depth.gather(0, (last - 1).clamp(min=0)[None])[0]
-        median = torch.where(last > 0, found, 0)
+    none = depth.new_zeros(1, depth.shape[1])
+    place = torch.arange(1, len(depth) + 1, device=depth.device)[:, None]
+    last = torch.cat([none.long(), place * (drawn & (light.detach() > 0.5))]).amax(dim=0)
+    median = torch.cat([none, depth]).gather(0, last[None])[0]
     m = FAR / (FAR - near) * (1 - near / depth)
     first, second = m * weights, m * m * weights
     before = [each.cumsum(dim=0) - each for each in (first, second)]

@@ -64,7 +64,7 @@ class SplatFile:
         f_dc: (N, 1, 3) first SH coefficient.
         f_rest: (N, K - 1, 3) the other coefficients, K = (degree + 1)^2.
         opacity: (N, 1) logits.
-        scaling: (N, 3) logarithms of standard deviations; (N, 2) of surfels (2D Gaussian Splatting).
+        scaling: (N, 3) logarithms of standard deviations; (N, 2) of surfels.
         rotation: (N, 4) quaternions w, x, y, z of any length.
         thresholds: (N,) truncation thresholds in (0, 1); None if the file has none.
         filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units. It widens
@@ -192,7 +192,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
     if scales != _SCALES and not filtered:
         raise ModelFileError(
             str(path),
-            "flat Gaussians with two scales, as 2D Gaussian Splatting saves, which are no 3D Gaussians",
+            "flat Gaussians with two scales, as 2D Gaussian Splatting saves, and no 3D Gaussians",
             "a splat of 3D Gaussians",
             "Fine-tune and draw it through its host's own scripts, with fragprune run.",
         )

@@ -99,7 +99,7 @@ def test_matrices_in_place_of_scales_are_refused(mini):
 def test_a_gpu_is_refused_before_the_training(mini, photographs, tmp_path, monkeypatch):
     monkeypatch.setattr(process, "host_device", lambda wanted, engine: "cuda")
     words = command(mini / "train.py", photographs, tmp_path / "out", 20)
-    with pytest.raises(UsageError, match="2D Gaussian Splatting.*cuda engine.*--device cpu"):
+    with pytest.raises(UsageError, match=r"2D Gaussian Splatting.*cuda engine.*--device cpu"):
         run(words, RunOptions(device="cuda"))
     assert not (tmp_path / "out").exists()
 
@@ -199,5 +199,5 @@ def test_commands_for_3d_gaussians_refuse_its_models(trained, tmp_path, words):
 
 
 def test_reading_its_model_as_3d_gaussians_says_what_it_is(trained):
-    with pytest.raises(ModelFileError, match="2D Gaussian Splatting.*fragprune run"):
+    with pytest.raises(ModelFileError, match=r"2D Gaussian Splatting.*fragprune run"):
         read_ply(trained[0].model_before)

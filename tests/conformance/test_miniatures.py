@@ -14,12 +14,13 @@ from miniatures.mip_splatting import MipHost
 from miniatures.rain_gs import RainHost
 from miniatures.rt_4dgs import RT4DGSHost
 from miniatures.speedy_splat import SpeedyHost
+from miniatures.surfels import SurfelHost
 
 from fragprune_plugins.testing import Host
 
 HOSTS = (
     *(Host, MCMCHost, LightGaussianHost, MiniSplattingHost, MipHost, RainHost, RT4DGSHost),
-    *(SpeedyHost, LPHost),
+    *(SpeedyHost, LPHost, SurfelHost),
 )
 OURS = {path.stem for path in Path(__file__).parents[1].iterdir()}
 

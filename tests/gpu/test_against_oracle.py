@@ -62,6 +62,11 @@ def test_footprints_equal_the_oracle(engine: CudaEngine, kind: str) -> None:
     check_gradients(engine, inputs, thresholds, same)
 
 
+def test_surfels_are_refused(engine: CudaEngine) -> None:
+    with pytest.raises(EngineError, match=r"surfels.*--device cpu"):
+        engine.rasterize(scenes.random_scene(5, 20, flat=True), None)
+
+
 def test_tiles_of_footprints_may_be_any_integers(engine: CudaEngine) -> None:
     inputs = flat(dialect(5))
     wide = replace(inputs, splats=replace(inputs.splats, tiles=inputs.splats.tiles.long()))

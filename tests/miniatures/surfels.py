@@ -32,13 +32,15 @@ def surface(viewpoint_camera, allmap, pipe):
 
 POINTS = '''"""Normals of a depth map."""
 
+import math
+
 import torch
 
 
 def depth_to_normal(view, depth):
     """(H, W, 3) world normals of depths (1, H, W), zeros at the border."""
     _, height, width = depth.shape
-    tan_x, tan_y = 1 / view.full_proj_transform[0, 0].abs(), 1 / view.full_proj_transform[1, 1].abs()
+    tan_x, tan_y = math.tan(view.FoVx / 2), math.tan(view.FoVy / 2)
     x = torch.arange(width, device="cuda") / width * 2 - 1
     y = torch.arange(height, device="cuda") / height * 2 - 1
     rows, columns = torch.meshgrid(y * tan_y, x * tan_x, indexing="ij")

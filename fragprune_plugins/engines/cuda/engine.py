@@ -18,7 +18,7 @@ from fragprune_plugins.engines.cuda.frame import (
 )
 from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.types import RasterOutputs
+from fragprune_plugins.types import RasterOutputs, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         RasterInputs,
         Sliced,
         SpacetimeSplats,
-        Splats,
     )
 
 _FIRST_CAPACITY = 1 << 20
