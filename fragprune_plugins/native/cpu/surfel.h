@@ -189,6 +189,7 @@ inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius
     int32_t* low[2] = {&to.x0, &to.y0};
     int32_t* high[2] = {&to.x1, &to.y1};
     for (int k = 0; k < 2; k++) {
+      if (!std::isfinite(centre[k] + half[k])) continue;
       const double spare = 0.01 + 1e-4 * half[k];
       const double from = std::min(centre[k] - half[k] - spare, means[k] - disc - spare);
       const double end = std::max(centre[k] + half[k] + spare, means[k] + disc + spare);
@@ -207,10 +208,7 @@ inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius
   if (!(std::abs(c.x) + std::abs(c.y) + std::abs(c.z) < 1e30f)) return false;
   if (!in.colors) c = {max(c.x, 0.f), max(c.y, 0.f), max(c.z, 0.f)};
   to.colour = c;
-  const Wide3 origin = cross3(s.across, s.down);
-  const double size = std::abs(origin.x) + std::abs(origin.y) + std::abs(origin.z);
-  if (!std::isfinite(size)) return false;
-  to.origin = narrow3(origin);
+  to.origin = narrow3(cross3(s.across, s.down));
   to.by_x = narrow3(cross3(s.down, s.depth));
   to.by_y = narrow3(cross3(s.depth, s.across));
   to.depth = narrow3(s.depth);
@@ -221,7 +219,10 @@ inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius
   to.normal = narrow3(scaled3(s.facing, {n.x * v[0] + n.y * v[4] + n.z * v[8],
                                          n.x * v[1] + n.y * v[5] + n.z * v[9],
                                          n.x * v[2] + n.y * v[6] + n.z * v[10]}));
+  for (const Vec3& each : {to.origin, to.by_x, to.by_y, to.depth, to.normal})
+    if (!(std::abs(each.x) + std::abs(each.y) + std::abs(each.z) < 1e30f)) return false;
   to.order = static_cast<float>(s.view_z);
+  if (!(to.order < 1e30f)) return false;
   to.inv_z = 1 / to.order;
   to.opacity = opacity, to.threshold = tau;
   to.id = static_cast<uint32_t>(i);

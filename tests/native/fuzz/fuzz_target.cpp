@@ -73,7 +73,8 @@ calls::Scene scene_of(calls::Source& from) {
     if (options >> 9 & 1) {
       take(s.cov3d, 6 * n, from, raw);
     } else {
-      take(s.scales, 3 * n, from, raw);
+      in.flat = options >> 22 & 1;
+      take(s.scales, (in.flat ? 2 : 3) * n, from, raw);
       take(s.rotations, 4 * n, from, raw);
     }
     if (options >> 10 & 1)
@@ -82,8 +83,9 @@ calls::Scene scene_of(calls::Source& from) {
       take(s.sh, 3 * n * in.sh_coefficients, from, raw);
   }
   if (options >> 11 & 1) take(s.thresholds, n, from, raw);
+  if (in.flat) in.feature_count = in.compensation = in.absolute_gradient = 0;
   if (in.feature_count) take(s.features, n * in.feature_count, from, raw);
-  if (options >> 21 & 1) {
+  if (options >> 21 & 1 && !in.flat) {
     take(s.offsets, 2 * s.pixels(), from, raw);
     for (size_t i = 0; i < s.offsets.size(); i++)
       if (!(std::fabs(s.offsets[i]) <= 1e6f)) s.offsets[i] = 0;  // the contract's

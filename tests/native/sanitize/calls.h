@@ -264,14 +264,16 @@ inline void make_gaussians(Scene& s, Source& from) {
   make_camera(s, from, turn, shift);
   s.means.make(3 * n);
   const bool by_covariance = from.one_in(3);
+  in.flat = !by_covariance && from.one_in(3);
+  const size_t scales = in.flat ? 2 : 3;
   if (by_covariance) s.cov3d.make(6 * n);
-  if (!by_covariance) s.scales.make(3 * n), s.rotations.make(4 * n);
+  if (!by_covariance) s.scales.make(scales * n), s.rotations.make(4 * n);
   for (size_t i = 0; i < n; i++) {
     float sizes[3], q[4], axes[3][3];
     place(s, from, i, turn, shift, sizes);
     unit_quaternion(from, q);
     if (!by_covariance) {
-      std::memcpy(&s.scales[3 * i], sizes, sizeof sizes);
+      std::memcpy(&s.scales[scales * i], sizes, scales * sizeof *sizes);
       std::memcpy(&s.rotations[4 * i], q, sizeof q);
       continue;
     }
@@ -338,9 +340,10 @@ inline Scene make_scene(Source& from, Limits limits) {
     make_footprints(s, from);
   else
     make_gaussians(s, from);
-  in.feature_count = from.one_in(2) ? 0 : 1 + from.below(FRAGPRUNE_FEATURES_MAX);
+  in.feature_count = from.one_in(2) || in.flat ? 0 : 1 + from.below(FRAGPRUNE_FEATURES_MAX);
   if (in.feature_count) fill(s.features, n * in.feature_count, from, -1, 2);
-  if (from.one_in(3)) fill(s.offsets, 2 * s.pixels(), from, -0.5f, 0.5f);
+  if (from.one_in(3) && !in.flat) fill(s.offsets, 2 * s.pixels(), from, -0.5f, 0.5f);
+  if (in.flat) in.compensation = FRAGPRUNE_NO_COMPENSATION, in.absolute_gradient = 0;
   if (!from.one_in(3)) {
     s.thresholds.make(n);
     for (size_t i = 0; i < n; i++) s.thresholds[i] = threshold(from);
@@ -367,12 +370,12 @@ inline void poison(Scene& s, Source& from) {
 
 struct Picture {
   fragprune_outputs out{};
-  Floats image, invdepth, alpha, features, weights;
+  Floats image, invdepth, alpha, features, weights, surface;
   Integers radii, fragments, per_gaussian, wins, winners;
 };
 
 // Of kinds that Picture may lack, in bits.
-constexpr int kOptional = 1 << 8;
+constexpr int kOptional = 1 << 9;
 
 // Outputs that are optional are there or not by the bits of `absent`.
 inline Picture make_picture(const Scene& s, int absent) {
@@ -387,6 +390,8 @@ inline Picture make_picture(const Scene& s, int absent) {
   if (!(absent & 32)) p.weights.make(s.count());
   if (!(absent & 64)) p.wins.make(s.count());
   if (!(absent & 128)) p.winners.make(s.pixels());
+  if (!(absent & 256) && s.in.flat) p.surface.make(6 * s.pixels());
+  p.out.surface = p.surface.get();
   p.out.features = p.features.get(), p.out.weights_per_gaussian = p.weights.get();
   p.out.wins_per_gaussian = p.wins.get(), p.out.winners = p.winners.get();
   p.out.image = p.image.get(), p.out.radii = p.radii.get();
@@ -398,7 +403,7 @@ inline Picture make_picture(const Scene& s, int absent) {
 inline void check(const Scene& s, const Picture& p) {
   CALLS_CHECK(p.image.written() && p.invdepth.written() && p.alpha.written());
   CALLS_CHECK(p.radii.written() && p.fragments.written() && p.per_gaussian.written());
-  CALLS_CHECK(p.features.written() && p.weights.written());
+  CALLS_CHECK(p.features.written() && p.weights.written() && p.surface.written());
   CALLS_CHECK(p.wins.written() && p.winners.written());
   CALLS_CHECK(p.out.drawn >= 0 && p.out.evaluated >= p.out.drawn);
   for (const Integers* counts : {&p.fragments, &p.per_gaussian})
@@ -425,7 +430,7 @@ inline void check(const Scene& s, const Picture& p) {
 
 struct Loss {
   fragprune_output_grads grads{};
-  Floats image, invdepth, alpha, features;
+  Floats image, invdepth, alpha, features, surface;
 };
 
 inline Loss make_loss(const Scene& s, Source& from, int absent) {
@@ -436,6 +441,8 @@ inline Loss make_loss(const Scene& s, Source& from, int absent) {
   if (!(absent & 2)) fill(loss.invdepth, s.pixels(), from, -1, 1);
   if (!(absent & 4)) fill(loss.alpha, s.pixels(), from, -1, 1);
   if (!(absent & 8)) fill(loss.features, s.pixels() * s.in.feature_count, from, -1, 1);
+  if (!(absent & 16) && s.in.flat) fill(loss.surface, 6 * s.pixels(), from, -1, 1);
+  loss.grads.surface = loss.surface.get();
   loss.grads.features = loss.features.get();
   loss.grads.image = loss.image.get();
   loss.grads.invdepth = loss.invdepth.get();
@@ -466,7 +473,7 @@ inline Gradients make_gradients(const Scene& s, int absent) {
   g.to.means = want(0, s.means.get(), g.means, 3 * n);
   g.to.hook = want(1, true, g.hook, 3 * n);
   g.to.opacities = want(2, true, g.opacities, n);
-  g.to.scales = want(3, s.scales.get(), g.scales, 3 * n);
+  g.to.scales = want(3, s.scales.get(), g.scales, (s.in.flat ? 2 : 3) * n);
   g.to.rotations = want(4, s.rotations.get(), g.rotations, 4 * n);
   g.to.cov3d = want(5, s.cov3d.get(), g.cov3d, 6 * n);
   g.to.sh = want(6, s.sh.get(), g.sh, 3 * n * s.in.sh_coefficients);
@@ -658,13 +665,14 @@ inline void run(Scene s, Source& from, Tally& tally) {
     if (again.weights.get() && p.weights.get()) CALLS_CHECK(again.weights.same_bits(p.weights));
     if (again.winners.get() && p.winners.get()) CALLS_CHECK(again.winners.same_bits(p.winners));
     if (again.features.get() && p.features.get()) CALLS_CHECK(again.features.same_bits(p.features));
+    if (again.surface.get() && p.surface.get()) CALLS_CHECK(again.surface.same_bits(p.surface));
   }
   s.in.workspace = nullptr;
   own.reset();
   if (!keep) return;
   const std::unique_ptr<fragprune_state, void (*)(fragprune_state*)> owner(state, fragprune_free);
   if (from.one_in(8) && s.count()) try_illegal_backward(s, state, tally);
-  const Loss loss = make_loss(s, from, from.below(16));
+  const Loss loss = make_loss(s, from, from.below(32));
   const int absent = from.one_in(2) ? 0 : from.below(1 << kGradients);
   const Gradients g = differentiate(s, state, loss, absent, 1 + from.below(4));
   if (s.tame)
