@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from miniatures.skeletons import STATES
 
+from fragprune_2dgs import SurfelSplatting
 from fragprune_mcmc import MCMC
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins.hosts.source import HostRepo
@@ -45,7 +46,8 @@ every_vanilla = each_of(Vanilla3DGS())
 every_mcmc = each_of(MCMC())
 every_mip = each_of(MipSplatting())
 every_rain = each_of(RainGS())
-every_host = each_of(Vanilla3DGS(), MCMC(), MipSplatting(), RainGS())
+every_surfel = each_of(SurfelSplatting())
+every_host = each_of(Vanilla3DGS(), MCMC(), MipSplatting(), RainGS(), SurfelSplatting())
 every_renderer = each_of(Vanilla3DGS(), MCMC(), MipSplatting())  # RAIN-GS's fails by itself
 
 
@@ -95,6 +97,16 @@ def test_rain_gss_dialect_is_read_and_vanillas_adapter_keeps_out(host):
     dialect = adapter.dialect(repo)
     assert (len(dialect.settings), dialect.outputs, dialect.sparse_adam) == (13, 3, False)
     assert dialect.settings[-1] == "low_pass"
+    assert not Vanilla3DGS().match(repo).fits
+
+
+@every_surfel
+def test_the_dialect_of_surfels_is_read_and_vanillas_adapter_keeps_out(host):
+    adapter, repo = SurfelSplatting(), HostRepo(host)
+    dialect = adapter.dialect(repo)
+    assert (dialect.package, dialect.outputs) == ("diff_surfel_rasterization", 3)
+    assert len(dialect.settings) == 12
+    assert adapter.densified(repo, repo.root / "train.py", []) == 15_000
     assert not Vanilla3DGS().match(repo).fits
 
 

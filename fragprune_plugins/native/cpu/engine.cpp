@@ -13,7 +13,7 @@
 #include "binning.h"
 #include "blend.h"
 #include "slice.h"
-#include "surfel.h"
+#include "surfels.h"
 
 namespace fp {
 

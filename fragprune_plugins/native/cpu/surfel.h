@@ -1,5 +1,6 @@
 // Surfels: flat Gaussians, which a pixel's ray meets in their own plane (2D Gaussian Splatting,
-// Huang et al. 2024). reference_renderer/surfel.py says what is drawn; this draws it tile by tile.
+// Huang et al. 2024). reference_renderer/surfel.py says what is drawn. This is the mathematics of one
+// surfel in one view; surfels.h draws them.
 //
 // A plane's point (u, v) is seen at the pixel (x, y) with x w = across . (u, v, 1), y w = down .
 // (u, v, 1), w = depth . (u, v, 1). The point that a pixel sees is p.xy / p.z, where
@@ -9,30 +10,25 @@
 // would cancel.
 #pragma once
 
-#include <atomic>
+#include <algorithm>
 #include <cmath>
-#include <memory>
-#include <numeric>
-#include <vector>
 
 #include "gaussian.h"
-#include "threads.h"
-#include "workspace.h"
 
 namespace fp {
 
 constexpr float kSurfelFilter = 2.f;  // inverse variance, pixels^-2, of the round Gaussian
 constexpr double kSurfelReach = 3.0;  // standard deviations that give centre, radius and tiles
 constexpr float kSurfelFar = 100.f;   // the distortion's far plane
-constexpr int kSurface = 6;           // depth, normal (3), median depth, distortion
 constexpr int kSide = FRAGPRUNE_TILE, kArea = kSide * kSide;
-constexpr int32_t kNever = INT32_MAX;
 
 typedef Vec<double> Wide3;
 inline Wide3 wide3(const float* p) { return {p[0], p[1], p[2]}; }
 inline double dot3(const Wide3& a, const Wide3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 inline Wide3 scaled3(double s, const Wide3& a) { return {s * a.x, s * a.y, s * a.z}; }
-inline void add3(Wide3& a, double s, const Wide3& b) { a.x += s * b.x, a.y += s * b.y, a.z += s * b.z; }
+inline void add3(Wide3& a, double s, const Wide3& b) {
+  a.x += s * b.x, a.y += s * b.y, a.z += s * b.z;
+}
 inline Wide3 cross3(const Wide3& a, const Wide3& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
@@ -50,7 +46,6 @@ struct SurfelView {
   double facing;                // 1 or -1: turns the normal toward the camera
   double view_z;
   double centre_x, centre_y, half_x, half_y;  // of the box at kSurfelReach
-  bool boxed;
 };
 
 // A box on the image of the plane out to `reach2`, squared standard deviations; false: none.
@@ -135,7 +130,8 @@ struct Surfel {
   int tiles_across() const { return (x1 - 1) / kSide - x0 / kSide + 1; }
   int tiles() const { return tiles_across() * ((y1 - 1) / kSide - y0 / kSide + 1); }
   uint32_t slot_of(int tile_x, int tile_y) const {
-    return slot + static_cast<uint32_t>((tile_y - y0 / kSide) * tiles_across() + tile_x - x0 / kSide);
+    const int place = (tile_y - y0 / kSide) * tiles_across() + tile_x - x0 / kSide;
+    return slot + static_cast<uint32_t>(place);
   }
 };
 
@@ -231,7 +227,7 @@ inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius
 
 // ---- one fragment ----------------------------------------------------------------------------
 
-// A surfel met by kLanes pixels of a row.
+// A surfel met by kLanes pixels.
 struct SurfelMeeting {
   Lanes u, v, inv;   // the point on the plane, and 1 / p.z
   Lanes dx, dy;      // from the pixels to the round Gaussian's centre
@@ -266,232 +262,35 @@ inline Lanes surfel_falloff(Lanes q) { return exp2(q * broadcast<Lanes>(-0.5f * 
 // The distortion's depth: 0 at the near plane, 1 at kSurfelFar.
 inline Lanes surfel_m(Lanes depth, float near) {
   const Lanes one = broadcast<Lanes>(1.f);
-  return broadcast<Lanes>(kSurfelFar / (kSurfelFar - near)) * (one - broadcast<Lanes>(near) / depth);
+  const float scale = kSurfelFar / (kSurfelFar - near);
+  return broadcast<Lanes>(scale) * (one - broadcast<Lanes>(near) / depth);
 }
 
-// Calls work(place, px, py) for each kLanes pixels of a tile that a surfel may draw.
+// A tile's pixels lie in blocks of 4 columns by kLanes / 4 rows, one pixel per lane, row by row.
+constexpr int kBlockX = 4, kBlockY = kLanes / kBlockX;
+inline int place_of(int x, int y) {
+  return (y / kBlockY * (kSide / kBlockX) + x / kBlockX) * kLanes + y % kBlockY * kBlockX +
+         x % kBlockX;
+}
+
+// Calls work(place, px, py) for the blocks of a tile that hold pixels which a surfel may draw.
 template <class Work>
-inline void each_lanes(const Surfel& s, int tile_x, int tile_y, Work work) {
-  float steps[kLanes];
-  for (int i = 0; i < kLanes; i++) steps[i] = static_cast<float>(i);
-  const int left = std::max(s.x0 - tile_x, 0) / kLanes * kLanes, right = std::min(s.x1 - tile_x, kSide);
-  const int top = std::max(s.y0 - tile_y, 0), bottom = std::min(s.y1 - tile_y, kSide);
-  for (int y = top; y < bottom; y++)
-    for (int x = left; x < right; x += kLanes)
-      work(y * kSide + x, load(steps) + broadcast<Lanes>(static_cast<float>(tile_x + x)),
-           broadcast<Lanes>(static_cast<float>(tile_y + y)));
+inline void each_block(const Surfel& s, int tile_x, int tile_y, Work work) {
+  float steps_x[kLanes], steps_y[kLanes];
+  for (int i = 0; i < kLanes; i++) {
+    steps_x[i] = static_cast<float>(i % kBlockX);
+    steps_y[i] = static_cast<float>(i / kBlockX);
+  }
+  const int left = std::max(s.x0 - tile_x, 0) / kBlockX * kBlockX;
+  const int top = std::max(s.y0 - tile_y, 0) / kBlockY * kBlockY;
+  const int right = std::min(s.x1 - tile_x, kSide), bottom = std::min(s.y1 - tile_y, kSide);
+  for (int y = top; y < bottom; y += kBlockY)
+    for (int x = left; x < right; x += kBlockX)
+      work(place_of(x, y), load(steps_x) + broadcast<Lanes>(static_cast<float>(tile_x + x)),
+           load(steps_y) + broadcast<Lanes>(static_cast<float>(tile_y + y)));
 }
 
-// ---- forward ---------------------------------------------------------------------------------
-
-// What the forward pass leaves of a tile, row by row.
-struct SurfelPixels {
-  float light[kArea];        // final transmittance
-  float first[kArea], second[kArea];  // sums of w m, w m^2
-  int32_t stop[kArea];       // fragments at this place of the list or later are not alive
-  int32_t median[kArea];     // place of the median depth's fragment; -1
-};
-
-struct SurfelScene {
-  Memory memory;
-  fragprune_inputs in;
-  std::vector<Surfel> surfels;      // front to back
-  std::vector<uint32_t> first;      // per tile, one more at the end
-  std::vector<uint32_t> list;       // surfels
-  Buffer<SurfelPixels> pixels;      // per tile
-  size_t slots = 0;
-  int tiles_x = 0, tiles_y = 0;
-};
-
-inline void list_surfels(SurfelScene& scene) {
-  const auto tiles_of = [&](const Surfel& s, auto work) {
-    for (int y = s.y0 / kSide; y <= (s.y1 - 1) / kSide; y++)
-      for (int x = s.x0 / kSide; x <= (s.x1 - 1) / kSide; x++)
-        work(static_cast<size_t>(y) * static_cast<size_t>(scene.tiles_x) + static_cast<size_t>(x));
-  };
-  const size_t tiles = static_cast<size_t>(scene.tiles_x) * static_cast<size_t>(scene.tiles_y);
-  std::vector<uint64_t> counts(tiles + 1);
-  for (Surfel& s : scene.surfels) {
-    s.slot = static_cast<uint32_t>(scene.slots);
-    scene.slots += static_cast<size_t>(s.tiles());
-    tiles_of(s, [&](size_t t) { counts[t + 1]++; });
-  }
-  if (scene.slots > UINT32_MAX) throw std::length_error("tile lists");
-  std::partial_sum(counts.begin(), counts.end(), counts.begin());
-  scene.first.assign(counts.begin(), counts.end());
-  scene.list.resize(scene.slots);
-  std::vector<uint32_t> cursor(scene.first.begin(), scene.first.end() - 1);
-  for (size_t j = 0; j < scene.surfels.size(); j++)
-    tiles_of(scene.surfels[j], [&](size_t t) { scene.list[cursor[t]++] = static_cast<uint32_t>(j); });
-}
-
-inline void prepare_surfels(Team& team, const fragprune_inputs& in, int32_t* radii,
-                            SurfelScene& scene) {
-  const size_t n = static_cast<size_t>(in.count);
-  Buffer<Surfel> all(scene.memory, n);
-  std::vector<uint8_t> lives(n);
-  team.each(n, 256, [&](size_t begin, size_t end) {
-    for (size_t i = begin; i < end; i++) lives[i] = prepare_surfel(in, i, radii[i], all[i]);
-  });
-  std::vector<uint32_t> order;
-  for (size_t i = 0; i < n; i++)
-    if (lives[i]) order.push_back(static_cast<uint32_t>(i));
-  std::stable_sort(order.begin(), order.end(),
-                   [&](uint32_t a, uint32_t b) { return all[a].order < all[b].order; });
-  scene.surfels.reserve(order.size());
-  for (uint32_t i : order) scene.surfels.push_back(all[i]);
-  list_surfels(scene);
-}
-
-// Sums of one surfel over one tile, if they are wanted.
-struct SurfelFound {
-  Buffer<int32_t> fragments;
-  Buffer<float> weights;
-};
-
-struct SurfelSpent {
-  int64_t drawn = 0, evaluated = 0, entries = 0;
-};
-
-inline SurfelSpent draw_surfel_tile(SurfelScene& scene, size_t t, const fragprune_outputs& out,
-                                    SurfelFound& found) {
-  const fragprune_inputs& in = scene.in;
-  const int tile_x = static_cast<int>(t) % scene.tiles_x * kSide;
-  const int tile_y = static_cast<int>(t) / scene.tiles_x * kSide;
-  const int wide = std::min(kSide, in.width - tile_x), high = std::min(kSide, in.height - tile_y);
-  SurfelPixels& kept = scene.pixels[t];
-  // red, green, blue, 1/z; depth, normal, median depth, distortion
-  alignas(64) float sums[4 + kSurface][kArea] = {};
-  alignas(64) float most[kArea] = {};
-  alignas(64) int32_t drawn_count[kArea] = {}, winner[kArea];
-  std::fill_n(winner, kArea, -1), std::fill_n(kept.median, kArea, -1);
-  std::fill_n(kept.first, kArea, 0.f), std::fill_n(kept.second, kArea, 0.f);
-  int pixels = 0;
-  for (int i = 0; i < kArea; i++) {
-    const bool inside = i % kSide < wide && i / kSide < high;
-    kept.light[i] = 1.f, kept.stop[i] = inside ? kNever : 0;
-    pixels += inside;
-  }
-  const auto all = [](float x) { return broadcast<Lanes>(x); };
-  const bool surface = out.surface != nullptr, scores = out.winners || out.wins_per_gaussian;
-  SurfelSpent spent;
-  const uint32_t begin = scene.first[t], end = scene.first[t + 1];
-  int stopped = kArea - pixels;
-  for (uint32_t e = begin; e < end && stopped < kArea; e++) {
-    const Surfel& s = scene.surfels[scene.list[e]];
-    const int32_t place = static_cast<int32_t>(e - begin);
-    int32_t fragments = 0;
-    Lanes weights = all(0.f);
-    spent.entries++;
-    each_lanes(s, tile_x, tile_y, [&](int at, Lanes px, Lanes py) {
-      spent.evaluated += kLanes;
-      const IntLanes stop = load(kept.stop + at);
-      Mask alive = gt(stop, broadcast_int(place));
-      if (!bits(alive)) return;
-      const SurfelMeeting m = meet_surfel(s, px, py, in.near);
-      const Mask inside = both(both(m.met, alive), ge(all(s.cut), m.q));
-      if (!bits(inside)) return;
-      const Lanes alpha = where(inside, capped(all(s.opacity) * surfel_falloff(m.q), in.alpha_max));
-      const Lanes light = load(kept.light + at), after = fnma(light, alpha, light);
-      const Mask goes_on = both(alive, ge(after, all(kTransmittanceMin)));
-      const Mask drawn = both(inside, goes_on);
-      const uint32_t ends = bits(alive) & ~bits(goes_on);
-      if (ends) {
-        store(kept.stop + at, select(goes_on, stop, select(alive, broadcast_int(place), stop)));
-        stopped += __builtin_popcount(ends);
-      }
-      const Lanes weight = where(drawn, alpha * light);
-      store(kept.light + at, select(goes_on, after, light));
-      store(drawn_count + at, increment(drawn, load(drawn_count + at)));
-      const auto add = [&](int k, Lanes value) {
-        store(sums[k] + at, fma(weight, value, load(sums[k] + at)));
-      };
-      add(0, all(s.colour.x)), add(1, all(s.colour.y)), add(2, all(s.colour.z));
-      if (out.invdepth) add(3, all(s.inv_z));
-      if (surface) {
-        const Lanes depth = select(drawn, m.depth, all(1.f));
-        const Lanes d = surfel_m(depth, in.near), used = all(1.f) - light;
-        const Lanes first = load(kept.first + at), second = load(kept.second + at);
-        add(4, depth);
-        add(5, all(s.normal.x)), add(6, all(s.normal.y)), add(7, all(s.normal.z));
-        add(9, fma(d, fma(d, used, -2.f * first), second));
-        store(kept.first + at, fma(weight, d, first));
-        store(kept.second + at, fma(weight * d, d, second));
-        const Mask half = both(drawn, gt(light, all(0.5f)));
-        store(sums[8] + at, select(half, depth, load(sums[8] + at)));
-        store(kept.median + at, select(half, broadcast_int(place), load(kept.median + at)));
-      }
-      fragments += __builtin_popcount(bits(drawn));
-      weights = weights + weight;
-      if (scores) {
-        const Lanes before = load(most + at);
-        const auto id = broadcast_int(static_cast<int32_t>(s.id));
-        store(winner + at, select(gt(weight, before), id, load(winner + at)));
-        store(most + at, max(weight, before));
-      }
-    });
-    spent.drawn += fragments;
-    const uint32_t slot = s.slot_of(tile_x / kSide, tile_y / kSide);
-    if (found.fragments.size()) found.fragments[slot] = fragments;
-    if (found.weights.size()) found.weights[slot] = sum(weights);
-  }
-  const size_t plane = static_cast<size_t>(in.width) * static_cast<size_t>(in.height);
-  for (int y = 0; y < high; y++)
-    for (int x = 0; x < wide; x++) {
-      const int i = y * kSide + x;
-      const size_t at = static_cast<size_t>(tile_y + y) * static_cast<size_t>(in.width) +
-                        static_cast<size_t>(tile_x + x);
-      for (int k = 0; k < 3; k++)
-        out.image[k * plane + at] = sums[k][i] + kept.light[i] * in.background[k];
-      if (out.invdepth) out.invdepth[at] = sums[3][i];
-      if (out.alpha) out.alpha[at] = 1.f - kept.light[i];
-      for (int k = 0; surface && k < kSurface; k++) out.surface[k * plane + at] = sums[4 + k][i];
-      if (out.fragments) out.fragments[at] = drawn_count[i];
-      if (out.winners) out.winners[at] = winner[i];
-      if (out.wins_per_gaussian && winner[i] >= 0)
-        __atomic_fetch_add(out.wins_per_gaussian + winner[i], 1, __ATOMIC_RELAXED);
-    }
-  return spent;
-}
-
-// Draws; returns what the way back needs.
-FP_STAGE inline std::unique_ptr<SurfelScene> draw_surfels(const fragprune_inputs& in,
-                                                          fragprune_outputs& out,
-                                                          const Memory& memory) {
-  Team team(in.threads);
-  auto scene = std::make_unique<SurfelScene>();
-  scene->memory = memory, scene->in = in;
-  scene->tiles_x = (in.width + kSide - 1) / kSide, scene->tiles_y = (in.height + kSide - 1) / kSide;
-  prepare_surfels(team, in, out.radii, *scene);
-  const size_t n = static_cast<size_t>(in.count), tiles = scene->first.size() - 1;
-  scene->pixels = Buffer<SurfelPixels>(memory, tiles);
-  SurfelFound found;
-  if (out.fragments_per_gaussian) {
-    found.fragments = Buffer<int32_t>(memory, scene->slots);
-    std::fill_n(found.fragments.data(), scene->slots, 0);
-    std::fill_n(out.fragments_per_gaussian, n, 0);
-  }
-  if (out.weights_per_gaussian) {
-    found.weights = Buffer<float>(memory, scene->slots);
-    std::fill_n(found.weights.data(), scene->slots, 0.f);
-    std::fill_n(out.weights_per_gaussian, n, 0.f);
-  }
-  if (out.wins_per_gaussian) std::fill_n(out.wins_per_gaussian, n, 0);
-  std::atomic<int64_t> drawn{0}, evaluated{0}, entries{0};
-  team.each(tiles, 1, [&](size_t t, size_t) {
-    const SurfelSpent spent = draw_surfel_tile(*scene, t, out, found);
-    drawn += spent.drawn, evaluated += spent.evaluated, entries += spent.entries;
-  });
-  for (const Surfel& s : scene->surfels)
-    for (uint32_t slot = s.slot; slot < s.slot + static_cast<uint32_t>(s.tiles()); slot++) {
-      if (out.fragments_per_gaussian) out.fragments_per_gaussian[s.id] += found.fragments[slot];
-      if (out.weights_per_gaussian) out.weights_per_gaussian[s.id] += found.weights[slot];
-    }
-  out.drawn = drawn, out.evaluated = evaluated, out.entries = entries;
-  return scene;
-}
-
-// ---- backward --------------------------------------------------------------------------------
+// ---- derivatives -----------------------------------------------------------------------------
 
 // Sums over the fragments of one surfel in one tile: dL/d of each.
 enum SurfelSum {
@@ -506,114 +305,6 @@ enum SurfelSum {
   kByThreshold = 22,
   kSurfelSums = 24
 };
-
-inline void undraw_surfel_tile(const SurfelScene& scene, size_t t, const fragprune_output_grads& by,
-                               bool rim, float* slots, double* by_background) {
-  const fragprune_inputs& in = scene.in;
-  const int tile_x = static_cast<int>(t) % scene.tiles_x * kSide;
-  const int tile_y = static_cast<int>(t) / scene.tiles_x * kSide;
-  const int wide = std::min(kSide, in.width - tile_x), high = std::min(kSide, in.height - tile_y);
-  const size_t plane = static_cast<size_t>(in.width) * static_cast<size_t>(in.height);
-  const SurfelPixels& kept = scene.pixels[t];
-  alignas(64) float g[4 + kSurface][kArea] = {};  // as in draw_surfel_tile
-  alignas(64) float light[kArea], behind[kArea];
-  for (int k = 0; k < 3; k++) by_background[k] = 0;
-  int32_t last = 0;
-  for (int i = 0; i < kArea; i++) {
-    light[i] = kept.light[i], behind[i] = 0;
-    const int x = i % kSide, y = i / kSide;
-    if (x >= wide || y >= high) continue;
-    const size_t at = static_cast<size_t>(tile_y + y) * static_cast<size_t>(in.width) +
-                      static_cast<size_t>(tile_x + x);
-    float seen = by.alpha ? -by.alpha[at] : 0.f;
-    for (int k = 0; k < 3; k++) {
-      g[k][i] = by.image ? by.image[k * plane + at] : 0.f;
-      seen += g[k][i] * in.background[k];
-      by_background[k] += light[i] * g[k][i];
-    }
-    g[3][i] = by.invdepth ? by.invdepth[at] : 0.f;
-    for (int k = 0; by.surface && k < kSurface; k++) g[4 + k][i] = by.surface[k * plane + at];
-    behind[i] = light[i] * seen;
-    last = std::max(last, kept.stop[i]);
-  }
-  const auto all = [](float x) { return broadcast<Lanes>(x); };
-  const float per_fragment = by.fragments_per_pixel / static_cast<float>(plane);
-  const float slope = kSurfelFar * in.near / (kSurfelFar - in.near);  // of m, times depth^2
-  const int32_t length = static_cast<int32_t>(scene.first[t + 1] - scene.first[t]);
-  for (int32_t place = std::min(last, length) - 1; place >= 0; place--) {
-    const Surfel& s = scene.surfels[scene.list[scene.first[t] + static_cast<uint32_t>(place)]];
-    Lanes sums[kSurfelSums];
-    for (Lanes& v : sums) v = all(0.f);
-    each_lanes(s, tile_x, tile_y, [&](int at, Lanes px, Lanes py) {
-      const Mask alive = gt(load(kept.stop + at), broadcast_int(place));
-      if (!bits(alive)) return;
-      const SurfelMeeting m = meet_surfel(s, px, py, in.near);
-      const Mask reached = both(m.met, alive);
-      if (!bits(reached)) return;
-      const Mask drawn = both(reached, ge(all(s.cut), m.q));
-      const Lanes one = all(1.f);
-      const Lanes falloff = surfel_falloff(select(reached, m.q, all(0.f)));
-      const Lanes uncapped = all(s.opacity) * falloff, full = capped(uncapped, in.alpha_max);
-      const Lanes alpha = where(drawn, full), inv = one / (one - alpha);
-      const Lanes before = load(light + at) * inv, later = load(behind + at);
-      const auto loss = [&](int k) { return load(g[k] + at); };
-      const Lanes depth = select(reached, m.depth, one);
-      Lanes shade = loss(0) * all(s.colour.x) + loss(1) * all(s.colour.y) +
-                    loss(2) * all(s.colour.z) + loss(3) * all(s.inv_z);
-      Lanes by_depth = all(0.f);
-      const Lanes weight = alpha * before;
-      if (by.surface) {
-        const Lanes d = surfel_m(depth, in.near), used = one - load(kept.light + at);
-        const Lanes first = load(kept.first + at), distortion = loss(9);
-        shade = shade + loss(4) * depth + loss(5) * all(s.normal.x) + loss(6) * all(s.normal.y) +
-                loss(7) * all(s.normal.z) +
-                distortion * fma(d, fma(d, used, -2.f * first), load(kept.second + at));
-        by_depth = weight * (loss(4) + 2.f * distortion * fma(d, used, -first) * all(slope) /
-                                           (depth * depth));
-        const IntLanes median = load(kept.median + at);
-        const Mask other = gt(median, broadcast_int(place));  // behind
-        const Mask here = both(gt(median, broadcast_int(place - 1)), drawn);
-        by_depth = by_depth + select(other, all(0.f), where(here, loss(8)));
-        for (int k = 0; k < 3; k++)
-          sums[kByNormal + k] = fma(weight, loss(5 + k), sums[kByNormal + k]);
-      }
-      const Lanes by_alpha = fnma(later, inv, before * shade);
-      store(light + at, select(drawn, before, load(light + at)));
-      store(behind + at, fma(weight, shade, later));
-      for (int k = 0; k < 3; k++)
-        sums[kByColour + k] = fma(weight, loss(k), sums[kByColour + k]);
-      sums[kByInvZ] = fma(weight, loss(3), sums[kByInvZ]);
-      Lanes w = where(drawn, uncapped * by_alpha);  // straight through the cap
-      if (!in.cap_gradient) w = where(ge(all(in.alpha_max), uncapped), w);
-      sums[kByOpacity] = sums[kByOpacity] + w;
-      if (rim) {
-        const Lanes away = abs(falloff - all(s.threshold));
-        const Mask near = both(reached, ge(all(kRimHorizon), away));
-        const Lanes gain = fma(full, by_alpha, all(per_fragment));
-        sums[kByThreshold] = sums[kByThreshold] - where(near, gain * rim_density(away));
-      }
-      // q = u^2 + v^2 or 2 |centre - pixel|^2, and dL/dq = -w / 2
-      const Mask plane_drawn = both(drawn, m.on_plane);
-      const Lanes round = select(m.on_plane, all(0.f), w * all(-kSurfelFilter));
-      sums[kByCentre] = sums[kByCentre] + where(drawn, round * m.dx);
-      sums[kByCentre + 1] = sums[kByCentre + 1] + where(drawn, round * m.dy);
-      const Lanes u = where(drawn, m.u), v = where(drawn, m.v);
-      const Lanes by_u = where(plane_drawn, (by_depth * all(s.depth.x) - w * u) * m.inv);
-      const Lanes by_v = where(plane_drawn, (by_depth * all(s.depth.y) - w * v) * m.inv);
-      const Lanes by_point[3] = {by_u, by_v, -(by_u * u + by_v * v)};
-      const Lanes x = px - all(s.shift_x), y = py - all(s.shift_y);
-      const Lanes by_row[3] = {by_depth * u, by_depth * v, by_depth};
-      for (int k = 0; k < 3; k++) {
-        sums[kByOrigin + k] = sums[kByOrigin + k] + by_point[k];
-        sums[kByX + k] = fma(x, by_point[k], sums[kByX + k]);
-        sums[kByY + k] = fma(y, by_point[k], sums[kByY + k]);
-        sums[kByDepth + k] = sums[kByDepth + k] + where(drawn, by_row[k]);
-      }
-    });
-    sum_each<kSurfelSums>(sums, slots + size_t{kSurfelSums} *
-                                            s.slot_of(tile_x / kSide, tile_y / kSide));
-  }
-}
 
 // From a surfel's sums over all its tiles to its inputs.
 inline void unproject_surfel(const fragprune_inputs& in, const Surfel& surfel, const double* sums,
@@ -653,7 +344,8 @@ inline void unproject_surfel(const fragprune_inputs& in, const Surfel& surfel, c
   if (!view_surfel(in, i, s)) return;
   // p = origin + x by_x + y by_y, each a cross product of two rows
   Wide3 across = {0, 0, 0}, down = {0, 0, 0}, depth = three(kByDepth);
-  const auto through = [](const Wide3& a, const Wide3& b, const Wide3& by, Wide3& by_a, Wide3& by_b) {
+  const auto through = [](const Wide3& a, const Wide3& b, const Wide3& by, Wide3& by_a,
+                          Wide3& by_b) {
     add3(by_a, 1, cross3(b, by)), add3(by_b, 1, cross3(by, a));
   };
   through(s.across, s.down, three(kByOrigin), across, down);
@@ -702,42 +394,6 @@ inline void unproject_surfel(const fragprune_inputs& in, const Surfel& surfel, c
     const Mat3<float> m = {{{a.x, b.x, c.x}, {a.y, b.y, c.y}, {a.z, b.z, c.z}}};
     rotation_gradient(in.rotations + 4 * i, m, to.rotations + 4 * i);
   }
-}
-
-FP_STAGE inline void undraw_surfels(const SurfelScene& scene, const fragprune_output_grads& by,
-                                    const fragprune_input_grads& to, int threads) {
-  Team team(threads);
-  const fragprune_inputs& in = scene.in;
-  const size_t n = static_cast<size_t>(in.count), tiles = scene.first.size() - 1;
-  const std::pair<float*, size_t> arrays[] = {
-      {to.means, 3},     {to.hook, 3}, {to.opacities, 1}, {to.scales, 2},
-      {to.rotations, 4}, {to.sh, 3 * static_cast<size_t>(in.sh_coefficients)},
-      {to.colors, 3},    {to.thresholds, 1}};
-  for (const auto& [data, width] : arrays)
-    if (data) std::fill_n(data, n * width, 0.f);
-  Buffer<float> slots(scene.memory, scene.slots * kSurfelSums);
-  team.each(slots.size(), 1u << 18,
-            [&](size_t begin, size_t end) { std::fill(&slots[begin], slots.data() + end, 0.f); });
-  std::vector<double> by_background(3 * tiles);
-  team.each(tiles, 1, [&](size_t t, size_t) {
-    undraw_surfel_tile(scene, t, by, to.thresholds != nullptr, slots.data(), &by_background[3 * t]);
-  });
-  if (to.background)
-    for (size_t k = 0; k < 3; k++) {
-      double total = 0;
-      for (size_t t = 0; t < tiles; t++) total += by_background[3 * t + k];
-      to.background[k] = static_cast<float>(total);
-    }
-  team.each(scene.surfels.size(), 256, [&](size_t begin, size_t end) {
-    for (size_t j = begin; j < end; j++) {
-      const Surfel& s = scene.surfels[j];
-      double sums[kSurfelSums] = {};
-      for (int k = 0; k < s.tiles(); k++)
-        for (int m = 0; m < kSurfelSums; m++)
-          sums[m] += slots[(s.slot + static_cast<size_t>(k)) * kSurfelSums + static_cast<size_t>(m)];
-      unproject_surfel(in, s, sums, to);
-    }
-  });
 }
 
 }  // namespace fp
