@@ -1,6 +1,6 @@
 // Surfels: flat Gaussians, which a pixel's ray meets in their own plane (2D Gaussian Splatting,
-// Huang et al. 2024). reference_renderer/surfel.py says what is drawn. This is the mathematics of one
-// surfel in one view; surfels.h draws them.
+// Huang et al. 2024). reference_renderer/surfel.py says what is drawn. This is the mathematics of
+// one surfel in one view; surfels.h draws them.
 //
 // A plane's point (u, v) is seen at the pixel (x, y) with x w = across . (u, v, 1), y w = down .
 // (u, v, 1), w = depth . (u, v, 1). The point that a pixel sees is p.xy / p.z, where
@@ -13,14 +13,13 @@
 #include <algorithm>
 #include <cmath>
 
-#include "gaussian.h"
+#include "blend.h"
 
 namespace fp {
 
 constexpr float kSurfelFilter = 2.f;  // inverse variance, pixels^-2, of the round Gaussian
 constexpr double kSurfelReach = 3.0;  // standard deviations that give centre, radius and tiles
 constexpr float kSurfelFar = 100.f;   // the distortion's far plane
-constexpr int kSide = FRAGPRUNE_TILE, kArea = kSide * kSide;
 
 typedef Vec<double> Wide3;
 inline Wide3 wide3(const float* p) { return {p[0], p[1], p[2]}; }
@@ -127,10 +126,10 @@ struct Surfel {
   int32_t x0, y0, x1, y1;   // pixels that it may draw, half open
   uint32_t id;
   uint32_t slot;            // of its first tile
-  int tiles_across() const { return (x1 - 1) / kSide - x0 / kSide + 1; }
-  int tiles() const { return tiles_across() * ((y1 - 1) / kSide - y0 / kSide + 1); }
+  int tiles_across() const { return (x1 - 1) / kTile - x0 / kTile + 1; }
+  int tiles() const { return tiles_across() * ((y1 - 1) / kTile - y0 / kTile + 1); }
   uint32_t slot_of(int tile_x, int tile_y) const {
-    const int place = (tile_y - y0 / kSide) * tiles_across() + tile_x - x0 / kSide;
+    const int place = (tile_y - y0 / kTile) * tiles_across() + tile_x - x0 / kTile;
     return slot + static_cast<uint32_t>(place);
   }
 };
@@ -154,12 +153,12 @@ inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius
   const double reach = std::ceil(std::max({s.half_x, s.half_y, round}));
   const double at_x = s.shift_x + s.centre_x, at_y = s.shift_y + s.centre_y;
   if (!(reach < 1e9 && std::abs(at_x) < 1e9 && std::abs(at_y) < 1e9)) return false;
-  const int tiles_x = (in.width + kSide - 1) / kSide, tiles_y = (in.height + kSide - 1) / kSide;
+  const int tiles_x = (in.width + kTile - 1) / kTile, tiles_y = (in.height + kTile - 1) / kTile;
   const auto tile = [](double pixel, int most) {  // towards 0, as a cast does
-    return static_cast<int>(std::clamp(pixel / kSide, 0.0, static_cast<double>(most)));
+    return static_cast<int>(std::clamp(pixel / kTile, 0.0, static_cast<double>(most)));
   };
-  const int first_x = tile(at_x - reach, tiles_x), last_x = tile(at_x + reach + kSide - 1, tiles_x);
-  const int first_y = tile(at_y - reach, tiles_y), last_y = tile(at_y + reach + kSide - 1, tiles_y);
+  const int first_x = tile(at_x - reach, tiles_x), last_x = tile(at_x + reach + kTile - 1, tiles_x);
+  const int first_y = tile(at_y - reach, tiles_y), last_y = tile(at_y + reach + kTile - 1, tiles_y);
   if (first_x >= last_x || first_y >= last_y) return false;
   radius = static_cast<int32_t>(reach);
 
@@ -177,8 +176,8 @@ inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius
   double centre[2], half[2];
   const double w_edge = to.list_cut * (s.depth.x * s.depth.x + s.depth.y * s.depth.y) -
                         s.depth.z * s.depth.z;
-  to.x0 = first_x * kSide, to.y0 = first_y * kSide;
-  to.x1 = std::min(last_x * kSide, in.width), to.y1 = std::min(last_y * kSide, in.height);
+  to.x0 = first_x * kTile, to.y0 = first_y * kTile;
+  to.x1 = std::min(last_x * kTile, in.width), to.y1 = std::min(last_y * kTile, in.height);
   if (w_edge < 0 && surfel_box(s, to.list_cut, centre, half)) {
     const double disc = std::sqrt(to.list_cut / kSurfelFilter);
     const double means[2] = {s.centre_x, s.centre_y}, shift[2] = {s.shift_x, s.shift_y};
@@ -266,28 +265,23 @@ inline Lanes surfel_m(Lanes depth, float near) {
   return broadcast<Lanes>(scale) * (one - broadcast<Lanes>(near) / depth);
 }
 
-// A tile's pixels lie in blocks of 4 columns by kLanes / 4 rows, one pixel per lane, row by row.
-constexpr int kBlockX = 4, kBlockY = kLanes / kBlockX;
+// Where a tile's pixel lies among them all, in block order.
 inline int place_of(int x, int y) {
-  return (y / kBlockY * (kSide / kBlockX) + x / kBlockX) * kLanes + y % kBlockY * kBlockX +
-         x % kBlockX;
+  const int block = y / kBlockHeight * (kTile / kBlockWidth) + x / kBlockWidth;
+  return block * kLanes + y % kBlockHeight * kBlockWidth + x % kBlockWidth;
 }
 
 // Calls work(place, px, py) for the blocks of a tile that hold pixels which a surfel may draw.
 template <class Work>
 inline void each_block(const Surfel& s, int tile_x, int tile_y, Work work) {
-  float steps_x[kLanes], steps_y[kLanes];
-  for (int i = 0; i < kLanes; i++) {
-    steps_x[i] = static_cast<float>(i % kBlockX);
-    steps_y[i] = static_cast<float>(i / kBlockX);
-  }
-  const int left = std::max(s.x0 - tile_x, 0) / kBlockX * kBlockX;
-  const int top = std::max(s.y0 - tile_y, 0) / kBlockY * kBlockY;
-  const int right = std::min(s.x1 - tile_x, kSide), bottom = std::min(s.y1 - tile_y, kSide);
-  for (int y = top; y < bottom; y += kBlockY)
-    for (int x = left; x < right; x += kBlockX)
-      work(place_of(x, y), load(steps_x) + broadcast<Lanes>(static_cast<float>(tile_x + x)),
-           load(steps_y) + broadcast<Lanes>(static_cast<float>(tile_y + y)));
+  const Lanes steps_x = lane_x(), steps_y = lane_y();
+  const int left = std::max(s.x0 - tile_x, 0) / kBlockWidth * kBlockWidth;
+  const int top = std::max(s.y0 - tile_y, 0) / kBlockHeight * kBlockHeight;
+  const int right = std::min(s.x1 - tile_x, kTile), bottom = std::min(s.y1 - tile_y, kTile);
+  for (int y = top; y < bottom; y += kBlockHeight)
+    for (int x = left; x < right; x += kBlockWidth)
+      work(place_of(x, y), steps_x + broadcast<Lanes>(static_cast<float>(tile_x + x)),
+           steps_y + broadcast<Lanes>(static_cast<float>(tile_y + y)));
 }
 
 // ---- derivatives -----------------------------------------------------------------------------

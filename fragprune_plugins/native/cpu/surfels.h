@@ -9,7 +9,6 @@
 
 #include "surfel.h"
 #include "threads.h"
-#include "workspace.h"
 
 namespace fp {
 
@@ -20,10 +19,10 @@ constexpr int32_t kNever = INT32_MAX;
 
 // What the forward pass leaves of a tile, by place.
 struct SurfelPixels {
-  float light[kArea];        // final transmittance
-  float first[kArea], second[kArea];  // sums of w m, w m^2
-  int32_t stop[kArea];       // fragments at this place of the list or later are not alive
-  int32_t median[kArea];     // place of the median depth's fragment; -1
+  float light[kPixels];        // final transmittance
+  float first[kPixels], second[kPixels];  // sums of w m, w m^2
+  int32_t stop[kPixels];       // fragments at this place of the list or later are not alive
+  int32_t median[kPixels];     // place of the median depth's fragment; -1
 };
 
 struct SurfelScene {
@@ -39,8 +38,8 @@ struct SurfelScene {
 
 inline void list_surfels(SurfelScene& scene) {
   const auto tiles_of = [&](const Surfel& s, auto work) {
-    for (int y = s.y0 / kSide; y <= (s.y1 - 1) / kSide; y++)
-      for (int x = s.x0 / kSide; x <= (s.x1 - 1) / kSide; x++)
+    for (int y = s.y0 / kTile; y <= (s.y1 - 1) / kTile; y++)
+      for (int x = s.x0 / kTile; x <= (s.x1 - 1) / kTile; x++)
         work(static_cast<size_t>(y) * static_cast<size_t>(scene.tiles_x) + static_cast<size_t>(x));
   };
   const size_t tiles = static_cast<size_t>(scene.tiles_x) * static_cast<size_t>(scene.tiles_y);
@@ -71,8 +70,9 @@ inline void prepare_surfels(Team& team, const fragprune_inputs& in, int32_t* rad
   std::vector<uint32_t> order;
   for (size_t i = 0; i < n; i++)
     if (lives[i]) order.push_back(static_cast<uint32_t>(i));
-  std::stable_sort(order.begin(), order.end(),
-                   [&](uint32_t a, uint32_t b) { return all[a].order < all[b].order; });
+  std::sort(order.begin(), order.end(), [&](uint32_t a, uint32_t b) {
+    return all[a].order != all[b].order ? all[a].order < all[b].order : a < b;
+  });
   scene.surfels.reserve(order.size());
   for (uint32_t i : order) scene.surfels.push_back(all[i]);
   list_surfels(scene);
@@ -91,25 +91,25 @@ struct SurfelSpent {
 inline SurfelSpent draw_surfel_tile(SurfelScene& scene, size_t t, const fragprune_outputs& out,
                                     SurfelFound& found) {
   const fragprune_inputs& in = scene.in;
-  const int tile_x = static_cast<int>(t) % scene.tiles_x * kSide;
-  const int tile_y = static_cast<int>(t) / scene.tiles_x * kSide;
-  const int wide = std::min(kSide, in.width - tile_x), high = std::min(kSide, in.height - tile_y);
+  const int tile_x = static_cast<int>(t) % scene.tiles_x * kTile;
+  const int tile_y = static_cast<int>(t) / scene.tiles_x * kTile;
+  const int wide = std::min(kTile, in.width - tile_x), high = std::min(kTile, in.height - tile_y);
   SurfelPixels& kept = scene.pixels[t];
   // red, green, blue, 1/z; depth, normal, median depth, distortion
-  alignas(64) float sums[4 + kSurface][kArea] = {};
-  alignas(64) float most[kArea] = {};
-  alignas(64) int32_t drawn_count[kArea] = {}, winner[kArea];
-  std::fill_n(winner, kArea, -1), std::fill_n(kept.median, kArea, -1);
-  std::fill_n(kept.first, kArea, 0.f), std::fill_n(kept.second, kArea, 0.f);
-  std::fill_n(kept.light, kArea, 1.f), std::fill_n(kept.stop, kArea, 0);
+  alignas(64) float sums[4 + kSurface][kPixels] = {};
+  alignas(64) float most[kPixels] = {};
+  alignas(64) int32_t drawn_count[kPixels] = {}, winner[kPixels];
+  std::fill_n(winner, kPixels, -1), std::fill_n(kept.median, kPixels, -1);
+  std::fill_n(kept.first, kPixels, 0.f), std::fill_n(kept.second, kPixels, 0.f);
+  std::fill_n(kept.light, kPixels, 1.f), std::fill_n(kept.stop, kPixels, 0);
   for (int y = 0; y < high; y++)
     for (int x = 0; x < wide; x++) kept.stop[place_of(x, y)] = kNever;
   const auto all = [](float x) { return broadcast<Lanes>(x); };
   const bool surface = out.surface != nullptr, scores = out.winners || out.wins_per_gaussian;
   SurfelSpent spent;
   const uint32_t begin = scene.first[t], end = scene.first[t + 1];
-  int stopped = kArea - wide * high;
-  for (uint32_t e = begin; e < end && stopped < kArea; e++) {
+  int stopped = kPixels - wide * high;
+  for (uint32_t e = begin; e < end && stopped < kPixels; e++) {
     const Surfel& s = scene.surfels[scene.list[e]];
     const int32_t place = static_cast<int32_t>(e - begin);
     int32_t fragments = 0;
@@ -163,7 +163,7 @@ inline SurfelSpent draw_surfel_tile(SurfelScene& scene, size_t t, const fragprun
       }
     });
     spent.drawn += fragments;
-    const uint32_t slot = s.slot_of(tile_x / kSide, tile_y / kSide);
+    const uint32_t slot = s.slot_of(tile_x / kTile, tile_y / kTile);
     if (found.fragments.size()) found.fragments[slot] = fragments;
     if (found.weights.size()) found.weights[slot] = sum(weights);
   }
@@ -193,7 +193,7 @@ FP_STAGE inline std::unique_ptr<SurfelScene> draw_surfels(const fragprune_inputs
   Team team(in.threads);
   auto scene = std::make_unique<SurfelScene>();
   scene->memory = memory, scene->in = in;
-  scene->tiles_x = (in.width + kSide - 1) / kSide, scene->tiles_y = (in.height + kSide - 1) / kSide;
+  scene->tiles_x = (in.width + kTile - 1) / kTile, scene->tiles_y = (in.height + kTile - 1) / kTile;
   prepare_surfels(team, in, out.radii, *scene);
   const size_t n = static_cast<size_t>(in.count), tiles = scene->first.size() - 1;
   scene->pixels = Buffer<SurfelPixels>(memory, tiles);
@@ -228,16 +228,16 @@ FP_STAGE inline std::unique_ptr<SurfelScene> draw_surfels(const fragprune_inputs
 inline void undraw_surfel_tile(const SurfelScene& scene, size_t t, const fragprune_output_grads& by,
                                bool rim, float* slots, double* by_background) {
   const fragprune_inputs& in = scene.in;
-  const int tile_x = static_cast<int>(t) % scene.tiles_x * kSide;
-  const int tile_y = static_cast<int>(t) / scene.tiles_x * kSide;
-  const int wide = std::min(kSide, in.width - tile_x), high = std::min(kSide, in.height - tile_y);
+  const int tile_x = static_cast<int>(t) % scene.tiles_x * kTile;
+  const int tile_y = static_cast<int>(t) / scene.tiles_x * kTile;
+  const int wide = std::min(kTile, in.width - tile_x), high = std::min(kTile, in.height - tile_y);
   const size_t plane = static_cast<size_t>(in.width) * static_cast<size_t>(in.height);
   const SurfelPixels& kept = scene.pixels[t];
-  alignas(64) float g[4 + kSurface][kArea] = {};  // as in draw_surfel_tile
-  alignas(64) float light[kArea], behind[kArea] = {};
+  alignas(64) float g[4 + kSurface][kPixels] = {};  // as in draw_surfel_tile
+  alignas(64) float light[kPixels], behind[kPixels] = {};
   for (int k = 0; k < 3; k++) by_background[k] = 0;
   int32_t last = 0;
-  std::copy_n(kept.light, kArea, light);
+  std::copy_n(kept.light, kPixels, light);
   for (int y = 0; y < high; y++)
     for (int x = 0; x < wide; x++) {
       const int i = place_of(x, y);
@@ -329,7 +329,7 @@ inline void undraw_surfel_tile(const SurfelScene& scene, size_t t, const fragpru
       }
     });
     sum_each<kSurfelSums>(sums, slots + size_t{kSurfelSums} *
-                                            s.slot_of(tile_x / kSide, tile_y / kSide));
+                                            s.slot_of(tile_x / kTile, tile_y / kTile));
   }
 }
 
