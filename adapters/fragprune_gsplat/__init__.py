@@ -22,6 +22,7 @@ from fragprune_plugins.adapting import (
     SeamCall,
     SessionError,
     hookimpl,
+    revised,
 )
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 PACKAGE = "gsplat"
 RENDERING, OPERATIONS = f"{PACKAGE}.rendering", f"{PACKAGE}.strategy.ops"
+EXPORTER = f"{PACKAGE}.exporter"
 DEFAULT, MCMC = f"{PACKAGE}.strategy.default", f"{PACKAGE}.strategy.mcmc"
 ROWS = "fragprune_rows"
 """Key under which row numbers ride along while a strategy changes rows."""
@@ -50,19 +52,21 @@ def optimizers(call: SeamCall) -> list[Any]:
 
 @contextmanager
 def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Store row numbers under one more key; gsplat treats a key without an optimizer as frozen.
+    """Store row numbers under one more key, with an optimizer: 1.4 asks every key for one.
 
     float64 holds every row number exactly.
     """
     import torch
 
-    model, trace = call.model, RowTrace()
+    model, trace, optimizers = call.model, RowTrace(), call.arguments["optimizers"]
     rows = len(model["means"])
     numbers = torch.arange(rows, dtype=torch.float64, device=model["means"].device)
     model[ROWS] = torch.nn.Parameter(numbers, requires_grad=False)
+    optimizers[ROWS] = torch.optim.SGD([model[ROWS]])
     try:
         yield trace
     finally:
+        del optimizers[ROWS]
         origins = model.pop(ROWS).detach().long()
     places = torch.arange(len(origins), device=origins.device)
     fresh = torch.zeros_like(places, dtype=torch.bool)
@@ -87,7 +91,7 @@ class Gsplat(HostAdapter):
     info = HostInfo(
         "gsplat",
         repo="nerfstudio-project/gsplat",
-        states="1.5, 1.6 (pinhole cameras)",
+        states="1.4, 1.5, 1.6 (pinhole cameras)",
         limits=(
             "Refused by name: other cameras, distortion, the unscented transform, distributed, "
             "batches, channels other than three, tiles other than 16 pixels.",
@@ -99,7 +103,12 @@ class Gsplat(HostAdapter):
     steps_by_rendering = True
     appearance = HostAdapter.appearance | {"colors"}
     seams = (
-        Seam(Role.RASTERIZE, RENDERING, "rasterization", ("means", "opacities", "viewmats", "Ks")),
+        Seam(
+            Role.RASTERIZE,
+            RENDERING,
+            "rasterization",
+            ("means", "opacities", "viewmats", "Ks", "covars"),
+        ),
         Seam(Role.VIEW, RENDERING, "rasterization", ("viewmats",)),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(
@@ -119,8 +128,13 @@ class Gsplat(HostAdapter):
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_pre_backward", ("params",)),
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_post_backward", ("params",)),
         Seam(Role.STILL, MCMC, "MCMCStrategy.step_post_backward", ("params",)),
-        Seam(Role.SAVE, f"{PACKAGE}.exporter", "export_splats", ("save_to", "means", "format")),
+        Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format")),
     )
+
+    def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
+        """All; versions before 1.5.1 export nothing."""
+        exports = repo.path(EXPORTER) is not None
+        return self.seams if exports else revised(self.seams, {"export_splats": None})
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check that this is the installed package."""
@@ -138,12 +152,17 @@ class Gsplat(HostAdapter):
         ]
 
     def dialect(self, repo: HostRepo) -> Dialect:
-        """The version's dialect: until 1.5 alpha's cap is 0.999, and antialiasing has no floor."""
+        """The version's dialect, read off its source.
+
+        Until 1.4 the extents are squares of 3 sigma. Until 1.5 alpha's cap is 0.999, and
+        antialiasing has no floor.
+        """
         from fragprune_gsplat.dialect import GsplatDialect
 
-        if "1.6" in repo.commit or repo.path(f"{PACKAGE}.cuda._constants"):
-            return GsplatDialect(alpha_max=0.99, floor=0.005)
-        return GsplatDialect(alpha_max=0.999, floor=0.0)
+        if repo.path(f"{PACKAGE}.cuda._constants"):
+            return GsplatDialect(alpha_max=0.99, floor=0.005, tight=True)
+        projects = repo.parameters(f"{PACKAGE}.cuda._wrapper", "fully_fused_projection") or ()
+        return GsplatDialect(alpha_max=0.999, floor=0.0, tight="opacities" in projects)
 
     def model_of(self, call: SeamCall) -> Any:
         """The dict that a strategy changes, or the means if a call has only them."""

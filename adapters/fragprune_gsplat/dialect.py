@@ -70,11 +70,13 @@ class GsplatDialect(Dialect):
     Attributes:
         alpha_max: the cap on alpha; gradients are zero where it applies.
         floor: least antialiasing factor.
+        tight: radii are per axis and follow opacity; otherwise ``meta`` has one for both axes.
     """
 
     means = "means"
     alpha_max: float
     floor: float
+    tight: bool
 
     def unpack(self, call: HostCall) -> Cameras:
         """Project for every camera; the engine then only blends."""
@@ -88,6 +90,7 @@ class GsplatDialect(Dialect):
             radius_clip=given["radius_clip"],
             antialiased=given["rasterize_mode"] == "antialiased",
             floor=self.floor,
+            tight=self.tight,
         )
         covars = given["covars"]
         covars = covariances(given["quats"], given["scales"]) if covars is None else covars
@@ -216,14 +219,15 @@ class GsplatDialect(Dialect):
         colors = torch.cat(channels, dim=1).permute(0, 2, 3, 1)
         return colors, alphas, self._meta(inputs, call)
 
-    @staticmethod
-    def _meta(inputs: Cameras, call: HostCall) -> dict[str, Any]:
+    def _meta(self, inputs: Cameras, call: HostCall) -> dict[str, Any]:
         """The entries that strategies read, without the intersection lists of gsplat's kernels."""
         given = call.arguments
         stacked = {
             name: torch.stack([getattr(each, name) for each in inputs.projections])
             for name in ("radii", "depths", "conics", "opacities")
         }
+        if not self.tight:
+            stacked["radii"] = stacked["radii"][..., 0]
         ids: tuple[Tensor | None, Tensor | None] = (None, None)
         if given["packed"]:
             visible = torch.stack([each.visible for each in inputs.projections])
@@ -262,8 +266,9 @@ class GsplatDialect(Dialect):
         def relocation(
             opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, n_max: int
         ) -> tuple[Tensor, Tensor]:
+            bound = n_max + 1  # gsplat includes n_max
             opacity, scale = stand_ins.compute_relocation(
-                opacities.reshape(-1), scales, ratios.clamp_max(n_max - 1), binoms, n_max
+                opacities.reshape(-1), scales, ratios, binoms, bound
             )
             return opacity.view_as(opacities), scale.view_as(scales)
 
@@ -280,7 +285,9 @@ class GsplatDialect(Dialect):
             return covariances(quats, scales), None
 
         vars(backend)["_C"] = SimpleNamespace(
-            relocation=relocation, quat_scale_to_covar_preci_fwd=quat_scale_to_covar_preci_fwd
+            relocation=relocation,
+            compute_relocation=relocation,  # its name until 1.4
+            quat_scale_to_covar_preci_fwd=quat_scale_to_covar_preci_fwd,
         )
         return {BACKEND: backend}
 

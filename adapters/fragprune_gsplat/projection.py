@@ -1,7 +1,8 @@
 """gsplat's projection of Gaussians in torch, for one camera.
 
 It differs from vanilla's: the Jacobian is clamped to the image's real bounds with the principal
-point, and extents are per axis and end where alpha falls below 1/255 or at 3.33 sigma.
+point. Since 1.5 extents are per axis and end where alpha falls below 1/255 or at 3.33 sigma;
+before, they were squares as vanilla's.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from torch import Tensor
 from fragprune_plugins.adapting import ALPHA_MIN
 
 TILE = 16
-EXTENT = 3.33
-"""In sigma, the furthest that gsplat looks."""
+EXTENT, SQUARE = 3.33, 3.0
+"""In sigma, the furthest that gsplat looks: since 1.5 per axis, until 1.4 along the longer one."""
 MARGIN = 0.3
 """Of the tangent of the half field of view: how far beyond the image the Jacobian is evaluated."""
 
@@ -31,6 +32,8 @@ class Rules:
         radius_clip: pixels; radii up to it are culled.
         antialiased: opacity is multiplied by sqrt(det before / det after eps2d).
         floor: least value of that factor.
+        tight: extents are per axis and follow opacity; otherwise they are squares, and Gaussians
+            of any opacity count as visible.
     """
 
     eps2d: float
@@ -39,6 +42,7 @@ class Rules:
     radius_clip: float
     antialiased: bool
     floor: float
+    tight: bool
 
 
 @dataclass(frozen=True)
@@ -131,11 +135,16 @@ def project(
         least = max(rules.floor**2, 1e-12)  # a root's slope at 0 is not to be had
         opacities = opacities * (before / det).clamp_min(least).sqrt()
     with torch.no_grad():
-        drawn = inside & (opacities >= ALPHA_MIN)
-        reach = (2 * torch.log(opacities.clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
-        sigma = torch.stack([a, c], dim=-1).clamp_min(0).sqrt()
-        radii = torch.ceil(reach.clamp_max(EXTENT)[:, None] * sigma)
-        drawn &= (radii > rules.radius_clip).any(dim=-1)
+        if rules.tight:
+            inside = inside & (opacities >= ALPHA_MIN)
+            reach = (2 * torch.log(opacities.clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
+            sigma = torch.stack([a, c], dim=-1).clamp_min(0).sqrt()
+            radii = torch.ceil(reach.clamp_max(EXTENT)[:, None] * sigma)
+        else:
+            middle = (a + c) / 2
+            longest = middle + (middle**2 - det).clamp_min(0.01).sqrt()  # eigenvalue
+            radii = torch.ceil(SQUARE * longest.sqrt())[:, None].expand(-1, 2)
+        drawn = inside & (radii > rules.radius_clip).any(dim=-1)
         drawn &= ((means2d + radii > 0) & (means2d - radii < size)).all(dim=-1)
         radii = torch.where(drawn[:, None], radii, 0.0)
         grid = torch.ceil(size / TILE)

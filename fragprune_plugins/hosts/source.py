@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
-from importlib.metadata import packages_distributions, version
+from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
@@ -65,10 +65,15 @@ def _identifiers(tree: ast.Module) -> dict[str, int]:
 
 
 @cache
-def _distributions(package: str) -> str:
-    """The distributions that provide an import name, with versions."""
-    names = packages_distributions().get(package, ())
-    return ", ".join(f"{name} {version(name)}" for name in sorted(set(names)))
+def _distributions(package: str, folder: Path) -> str:
+    """The distributions in a folder that provide an import name, with versions."""
+    found = set()
+    for each in distributions(path=[str(folder)]):
+        declared = (each.read_text("top_level.txt") or "").split()
+        names = declared or {file.parts[0] for file in each.files or ()}
+        if package in names:
+            found.add(f"{each.name} {each.version}")
+    return ", ".join(sorted(found))
 
 
 class HostRepo:
@@ -204,10 +209,10 @@ class HostRepo:
     def commit(self) -> str:
         """The checkout's commit, read from .git without running git; "" when there is none.
 
-        An installed package has its distributions and their versions instead.
+        An installed package has the distributions in its folder and their versions instead.
         """
         if self.package:
-            return _distributions(self.package)
+            return _distributions(self.package, self.root)
         git = self.root / ".git"
         head = self._read(git / "HEAD").strip()
         reference = _REFERENCE.fullmatch(head)

@@ -26,8 +26,8 @@ class AdapterConformance:
     """Inherit from this class and name the adapter and its host: each invariant is then a test.
 
     Each test runs in its own process: on the miniature that ``host`` writes or the installed
-    package that it names, and on every checkout in the folder ``FRAGPRUNE_HOSTS`` that the adapter
-    fits.
+    package that it names, and on every folder in the folder ``FRAGPRUNE_HOSTS`` that holds a
+    checkout that the adapter fits, or another release of the package.
 
     Attributes:
         adapter: the name of an installed adapter, or the adapter itself.
@@ -45,9 +45,8 @@ class AdapterConformance:
         """Parametrise the tests: one set for each host."""
         if "place" in metafunc.fixturenames:
             found = _checkouts(os.environ.get("FRAGPRUNE_HOSTS", ""))
-            fitting = [
-                path for path in found if found_adapter(self.adapter).match(HostRepo(path)).fits
-            ]
+            adapter, package = found_adapter(self.adapter), self.host.package
+            fitting = [path for path in found if adapter.match(HostRepo(path, package)).fits]
             first = INSTALLED if self.host.package else MINIATURE
             names = [first, *(path.name for path in fitting)]
             variant = f" {self.host.variant}" if self.host.variant else ""

@@ -29,12 +29,15 @@ def photographs(tmp_path_factory):
 
 @pytest.fixture
 def session_on():
-    """``session_on(adapter, settings)``: the installed host under a session, its modules fresh."""
+    """``session_on(adapter, settings)``: the installed host under a session, its modules fresh.
+
+    ``path`` is another folder that holds the host's package.
+    """
 
     @contextmanager
-    def begin(adapter, settings=None, **options):
+    def begin(adapter, settings=None, path=None, **options):
         driver = DRIVERS[adapter.name]()
-        path = HostRepo.installed(driver.package).root
+        path = path or HostRepo.installed(driver.package).root
         with running(settings, adapter=adapter, path=path, driver=driver, **options) as host:
             yield host.session
 

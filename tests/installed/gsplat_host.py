@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from importlib import import_module
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,12 +13,23 @@ import numpy as np
 import torch
 
 from fragprune_gsplat import GROUPS
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.session import active_session
 from fragprune_plugins.storage.ply import read_ply
 from fragprune_plugins.testing import Chance, Host
 from fragprune_plugins.testing.host import FAINT, Action
 
 KEYS = tuple(GROUPS)
+
+
+def releases() -> dict[str, Path]:
+    """The folders that hold gsplat: the installed one's, and those in ``FRAGPRUNE_HOSTS``."""
+    installed, others = HostRepo.installed("gsplat"), os.environ.get("FRAGPRUNE_HOSTS")
+    found = {"installed": installed.root} if installed else {}
+    for folder in sorted(Path(others).iterdir()) if others else ():
+        if HostRepo(folder).path("gsplat"):
+            found[folder.name] = folder
+    return found
 
 
 def new_params(
@@ -38,6 +51,12 @@ def new_params(
     }
     params = torch.nn.ParameterDict({k: torch.nn.Parameter(v) for k, v in tensors.items()})
     return params, {k: torch.optim.Adam([p], lr=1e-2) for k, p in params.items()}
+
+
+def axes() -> tuple[int, ...]:
+    """What follows a Gaussian's row in the shape of radii: nothing until 1.4."""
+    version: str = import_module("gsplat").__version__
+    return () if version < "1.5" else (2,)
 
 
 def draw(params: Any, **options: Any) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -173,9 +192,10 @@ def default_strategy(model: Any, arguments: Any, chance: Chance) -> None:
     strategy = import_module("gsplat").DefaultStrategy(grow_scale3d=largest, **options)
     shown = torch.zeros(1, count, 2, requires_grad=True)
     shown.grad = chance.uniform(1, count, 2) / 2
+    radii = torch.ones(1, count, *axes(), dtype=torch.int32)
     info = {
         **{"width": 2, "height": 2, "n_cameras": 1, "gaussian_ids": None},
-        **{"means2d": shown, "radii": torch.ones(1, count, 2, dtype=torch.int32)},
+        **{"means2d": shown, "radii": radii},
     }
     state = strategy.initialize_state()
     strategy.step_pre_backward(model, model.optimizers, state, 1, info)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 from click.testing import CliRunner
+from installed.gsplat_host import axes, new_params, releases
 from installed.gsplat_host import draw as drawn_by_gsplat
-from installed.gsplat_host import new_params
 
 from fragprune_gsplat import Gsplat
+from fragprune_gsplat.projection import covariances
 from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import InputError, SessionError, SidecarError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
@@ -25,6 +28,18 @@ from fragprune_plugins.storage.ply import read_ply
 
 WIDTH, HEIGHT = 48, 32
 LOOP = Path(__file__).parents[2] / "docs" / "how-to" / "gsplat_loop.py"
+RELEASES = releases()
+
+
+@pytest.fixture(params=RELEASES.values(), ids=RELEASES.keys())
+def folder(request):
+    """The folder of each gsplat that is here."""
+    return request.param
+
+
+@pytest.fixture
+def session_on(session_on, folder):
+    return partial(session_on, path=folder)
 
 
 def cameras(count: int = 1):
@@ -50,8 +65,11 @@ def brute(params, K, viewmat, *, antialiased: bool = False):
     from gsplat.cuda import _torch_impl as theirs
 
     with torch.no_grad():
-        covars, _ = theirs._quat_scale_to_covar_preci(params["quats"], params["scales"].exp())
-        _, means2d, depths, conics, factor = theirs._fully_fused_projection(
+        shape = getattr(theirs, "_quat_scale_to_covar_preci", None)
+        if shape is None:  # 1.6
+            from gsplat.cuda._math import _quat_scale_to_covar_preci as shape
+        covars, _ = shape(params["quats"], params["scales"].exp())
+        radii, means2d, depths, conics, factor = theirs._fully_fused_projection(
             params["means"],
             covars,
             viewmat[None],
@@ -65,7 +83,9 @@ def brute(params, K, viewmat, *, antialiased: bool = False):
         directions = torch.nn.functional.normalize(params["means"] - campos, dim=-1)
         colors = (theirs._spherical_harmonics(1, directions, shs) + 0.5).clamp_min(0)
         opacities = params["opacities"].sigmoid() * (factor[0] if antialiased else 1.0)
-        y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+        radii = radii[0].reshape(len(opacities), -1).expand(-1, 2)
+        pixels = torch.arange(HEIGHT), torch.arange(WIDTH)
+        y, x = torch.meshgrid(*(each + 0.5 for each in pixels), indexing="ij")
         light = torch.ones(HEIGHT, WIDTH)
         picture, depth = torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH)
         for i in depths[0].argsort().tolist():
@@ -75,6 +95,13 @@ def brute(params, K, viewmat, *, antialiased: bool = False):
             a, b, c = conics[0, i]
             alpha = opacities[i] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
             alpha = torch.where(alpha < 1 / 255, 0.0, alpha.clamp_max(0.999))
+            for at, axis in ((x, 0), (y, 1)):  # tiles of 16 pixels, whole ones
+                first, last = (
+                    (means2d[0, i, axis] + side * radii[i, axis]) / 16 for side in (-1, 1)
+                )
+                alpha = torch.where(
+                    (at >= first.floor() * 16) & (at < last.ceil() * 16), alpha, 0.0
+                )
             picture += (light * alpha)[..., None] * colors[i]
             depth += light * alpha * depths[0, i]
             light = light * (1 - alpha)
@@ -104,7 +131,25 @@ def test_our_picture_is_the_one_of_gsplats_own_formulas(session_on, packed, mode
                 colors[k, ..., 3].detach()[seen], expected[seen], rtol=1e-3, atol=1e-3
             )
         rows = info["gaussian_ids"] if packed else torch.arange(40).repeat(2)
-        assert info["radii"].reshape(-1, 2).shape[0] == len(rows)
+        assert info["radii"].shape == ((len(rows),) if packed else (2, 40)) + axes()
+
+
+def test_radii_are_those_of_gsplats_own_formulas(session_on):
+    """To the pixel until 1.4. Since 1.5 gsplat's formulas in torch leave opacity out."""
+    with session_on(Gsplat()):
+        from gsplat.cuda import _torch_impl as theirs
+
+        params, _ = new_params(40)
+        params["opacities"].data.fill_(9.0)  # sqrt(2 log 255) is 3.329, gsplat's bound 3.33
+        viewmats, Ks = cameras(2)
+        covars = covariances(params["quats"], params["scales"].exp())
+        expected = theirs._fully_fused_projection(
+            params["means"], covars, viewmats, Ks, WIDTH, HEIGHT
+        )[0]
+        ours = draw(params, 2, packed=False)[2]["radii"]
+        assert ours.shape == expected.shape
+        assert (ours > 0).any()
+        assert set((expected - ours).unique().tolist()) <= ({0, 1} if axes() else {0})
 
 
 @pytest.mark.parametrize(
@@ -154,8 +199,12 @@ def test_strategies_find_the_gradients_on_the_screen_packed_or_not(session_on):
 )
 def test_what_we_do_not_draw_is_refused_by_name(session_on, options):
     with session_on(Gsplat()):
+        from gsplat import rasterization
+
         params, _ = new_params(40)
-        with pytest.raises(InputError, match=next(iter(options))):
+        (name,) = options
+        known = name in inspect.signature(rasterization).parameters
+        with pytest.raises(InputError if known else TypeError, match=name):  # 1.4 knows fewer
             draw(params, **options)
 
 
@@ -166,6 +215,12 @@ def test_a_plain_dict_is_refused_and_there_is_no_command_to_run():
         run(["-m", "gsplat.rendering"], RunOptions(device="cpu"))
     assert Gsplat().match(HostRepo.installed("gsplat")).fits
     assert not Gsplat().match(HostRepo.installed("numpy")).fits
+
+
+def test_the_commit_is_the_version_in_the_folder(folder):
+    name, _, version = HostRepo(folder, "gsplat").commit.partition(" ")
+    metadata = list(folder.glob("gsplat-*.dist-info"))
+    assert (name, version) == (("gsplat", metadata[0].name[7:-10]) if metadata else ("", ""))
 
 
 def test_check_takes_the_name_of_an_installed_host():
