@@ -6,8 +6,11 @@ and draws; strategies change rows through a handful of functions that treat ever
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapting import (
@@ -80,6 +83,36 @@ def tracing(call: SeamCall) -> Iterator[RowTrace]:
     trace.origins, trace.fresh = origins, fresh
 
 
+def answered(name: str) -> Callable[[SeamCall], Any]:
+    """Our answer to a function, imported when it is first called: it loads torch."""
+
+    def how(call: SeamCall) -> Any:
+        return getattr(import_module("fragprune_gsplat.answers"), name)(call)
+
+    return how
+
+
+def splats_in(saved: Any) -> Tensor | None:
+    """(N, 3) the means in what ``torch.save`` and ``torch.load`` are given; None without any.
+
+    They are in a dict of parameters, or under "splats" as gsplat's own trainer has it.
+    """
+    import torch
+
+    found = saved.get("splats", saved) if isinstance(saved, Mapping) else None
+    if not isinstance(found, Mapping) or not {"means", "quats", "opacities"} <= found.keys():
+        return None
+    return found["means"] if isinstance(found["means"], torch.Tensor) else None
+
+
+def read_again(call: SeamCall) -> tuple[Path, Tensor] | None:
+    """The file and its means, if ``torch.load`` read parameters from one."""
+    file, means = call.arguments["f"], splats_in(call.result)
+    if means is None or not isinstance(file, str | os.PathLike):
+        return None
+    return Path(file), means.detach().cpu()
+
+
 def _operation(name: str, *needs: str) -> Seam:
     return Seam(Role.REARRANGE, OPERATIONS, name, ("params", "optimizers", *needs), how=tracing)
 
@@ -128,6 +161,23 @@ class Gsplat(HostAdapter):
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_pre_backward", ("params",)),
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_post_backward", ("params",)),
         Seam(Role.STILL, MCMC, "MCMCStrategy.step_post_backward", ("params",)),
+        Seam(
+            Role.ANSWER,
+            f"{PACKAGE}.relocation",
+            "compute_relocation",
+            ("opacities", "scales", "ratios", "binoms"),
+            how=answered("relocation"),
+        ),
+        Seam(
+            Role.ANSWER,
+            f"{PACKAGE}.cuda._wrapper",
+            "quat_scale_to_covar_preci",
+            ("quats", "scales", "compute_covar", "compute_preci", "triu"),
+            how=answered("covariance"),
+        ),
+        Seam(Role.ANSWER, f"{PACKAGE}.distributed", "cli", ("fn", "args"), how=answered("alone")),
+        Seam(Role.SAVE, "torch", "save", ("f", "obj"), external=True),
+        Seam(Role.UNPACK, "torch", "load", ("f",), external=True, how=read_again),
         Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format")),
     )
 
@@ -168,7 +218,11 @@ class Gsplat(HostAdapter):
         """The dict that a strategy changes, or the means if a call has only them."""
         import torch
 
-        params = call.arguments.get("params", call.arguments.get("means"))
+        given = call.arguments
+        if "obj" in given:  # of torch.save
+            to_file = isinstance(given["f"], str | os.PathLike)
+            return splats_in(given["obj"]) if to_file else None
+        params = given.get("params", given.get("means"))
         if isinstance(params, dict):
             raise SessionError(
                 "params",
@@ -176,7 +230,7 @@ class Gsplat(HostAdapter):
                 "torch.nn.ParameterDict",
                 "Convert it: params = torch.nn.ParameterDict(params).",
             )
-        if call.arguments.get("format", "ply") != "ply":
+        if given.get("format", "ply") != "ply":
             return None  # other formats sort their rows
         return params if isinstance(params, torch.nn.ParameterDict | torch.Tensor) else None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -258,37 +258,9 @@ class GsplatDialect(Dialect):
         return torch.cuda.is_available()
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """Stand-ins for the two kernels that strategies call in addition to ``rasterization``."""
-        from fragprune_plugins.adapting import stand_ins
-
+        """A stand-in that keeps gsplat from compiling its kernels; ``answers`` has what we need."""
         backend = ModuleType(BACKEND, "Stand-in of fragprune for compiled kernels.")
-
-        def relocation(
-            opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, n_max: int
-        ) -> tuple[Tensor, Tensor]:
-            bound = n_max + 1  # gsplat includes n_max
-            opacity, scale = stand_ins.compute_relocation(
-                opacities.reshape(-1), scales, ratios, binoms, bound
-            )
-            return opacity.view_as(opacities), scale.view_as(scales)
-
-        def quat_scale_to_covar_preci_fwd(
-            quats: Tensor, scales: Tensor, covar: bool, preci: bool, triu: bool
-        ) -> tuple[Tensor, None]:
-            if preci or triu or not covar:
-                raise InputError(
-                    "gsplat.quat_scale_to_covar_preci",
-                    "precisions or triangles asked for",
-                    "covariances (N, 3, 3), as MCMCStrategy does",
-                    "Compute these on a machine with a GPU.",
-                )
-            return covariances(quats, scales), None
-
-        vars(backend)["_C"] = SimpleNamespace(
-            relocation=relocation,
-            compute_relocation=relocation,  # its name until 1.4
-            quat_scale_to_covar_preci_fwd=quat_scale_to_covar_preci_fwd,
-        )
+        vars(backend)["_C"] = None
         return {BACKEND: backend}
 
 

@@ -38,6 +38,10 @@ class Role(Enum):
     RASTERIZE = "draw with thresholds"
     LOSS = "note the host's loss when it goes backward"
     METRIC = "evaluate a picture; NaN if the weights cannot be downloaded"
+    ANSWER = (
+        "answer a call that the host's own function cannot answer on this machine",
+        "instead: the result",
+    )
     PARENTS = (
         "find the parents of the rows about to be appended",
         "before: rows (n,) int64 that will be copied, one per row appended, in order",
@@ -74,7 +78,9 @@ class Role(Enum):
         self.does, self.how = does, how
 
 
-NEEDS_HOW = frozenset({Role.ATTACH, Role.PARENTS, Role.REARRANGE, Role.PACK, Role.UNPACK})
+NEEDS_HOW = frozenset(
+    {Role.ATTACH, Role.PARENTS, Role.REARRANGE, Role.PACK, Role.UNPACK, Role.ANSWER}
+)
 """Roles whose seams need a ``how`` from the adapter."""
 
 

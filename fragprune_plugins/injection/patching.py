@@ -29,10 +29,11 @@ class PatchLedger:
 
     Args:
         root: the host's folder, from which its modules must come; None for any folder.
+        packages: import names of the host's packages, if its folder holds other packages too.
     """
 
-    def __init__(self, root: Path | None = None) -> None:
-        self._root = root
+    def __init__(self, root: Path | None = None, packages: tuple[str, ...] = ()) -> None:
+        self._root, self._packages = root, packages
         self._live = True
         self._wrapped: list[tuple[ModuleType, Seam, Any]] = []
         self._waiting: list[list[Callable[[ModuleType], None]]] = []
@@ -106,6 +107,8 @@ class PatchLedger:
         return findings
 
     def _is_hosts(self, module: ModuleType) -> bool:
+        if self._packages and module.__name__.split(".")[0] not in self._packages:
+            return False
         file = getattr(module, "__file__", None)
         return not file or Path(file).resolve().is_relative_to(self._root or "/")
 

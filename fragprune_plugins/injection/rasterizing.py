@@ -203,9 +203,15 @@ def on_metric(session: SessionState, call: SeamCall) -> Any:
     return torch.tensor(math.nan)
 
 
+def on_answer(session: SessionState, call: SeamCall) -> Any:
+    """Let the adapter answer."""
+    return call.how()
+
+
 OF_CALLS: dict[Role, Callable[..., Any]] = {
     Role.VIEW: on_view,
     Role.RASTERIZE: on_rasterize,
     Role.LOSS: on_loss,
     Role.METRIC: on_metric,
+    Role.ANSWER: on_answer,
 }

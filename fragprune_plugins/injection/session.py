@@ -61,7 +61,8 @@ class Session(SessionState):
             raise SessionError("activate()", "a session is active", "none", "Deactivate it first.")
         if self.learn:
             ranks.expect_one()
-        self._ledger = PatchLedger(self.repo.root)
+        packages = self.adapter.installed if self.repo.package else ()
+        self._ledger = PatchLedger(self.repo.root, packages)
         disable: Any = torch.compiler.disable  # a host may compile what calls a seam
         # It imports dynamo, which takes a second, and which an optimizer imports anyway.
         enter = disable(self._enter) if self.learn else self._enter

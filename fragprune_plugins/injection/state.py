@@ -175,7 +175,8 @@ class SessionState:
         found = self.adapter.model_of(call)
         if not isinstance(found, Tensor):
             return found
-        known = ((model, self.adapter.means(model)) for model in self.models)
+        models = {**dict.fromkeys(self.models), **dict.fromkeys(self.optimizers)}
+        known = ((model, self.adapter.means(model)) for model in models)
         return next((m for m, means in known if means.data_ptr() == found.data_ptr()), None)
 
     def standing_still(self, model: Any) -> bool:

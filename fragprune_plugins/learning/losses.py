@@ -27,13 +27,18 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     channel for itself. For a figure to quote use ``measure.metrics.ssim``, which leaves the border
     out.
     """
+    return ssim_map(image, target).mean()
+
+
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """(C, H, W) structural similarity at each pixel; see ``ssim``."""
     maps = torch.stack([image, target, image * image, target * target, image * target])
     mu_x, mu_y, xx, yy, xy = _blur(maps)
     var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
     top = (2 * mu_x * mu_y + _C1) * (2 * cov + _C2)
     bottom = (mu_x * mu_x + mu_y * mu_y + _C1) * (var_x + var_y + _C2)
     similarity: Tensor = top / bottom
-    return similarity.mean()
+    return similarity
 
 
 def photometric_loss(image: Tensor, target: Tensor) -> Tensor:

@@ -152,15 +152,23 @@ class GsplatHost(Host):
             model["opacities"][row] = -30.0
 
     def save(self, model: Any, path: Any) -> None:
+        """As PLY; releases that export none are saved as every loop can."""
+        if not axes():
+            torch.save(model.state_dict(), path)
+            return
         tensors = {name: model[name].detach() for name in KEYS}
         tensors["means"] = model["means"]  # by which the model is known
         import_module("gsplat.exporter").export_splats(**tensors, format="ply", save_to=str(path))
 
     def load(self, model: Any, path: Any) -> None:
         """gsplat reads no files: users do, and take thresholds up through the session."""
-        saved = read_ply(path)
-        for key, name in GROUPS.items():
-            model[key] = torch.nn.Parameter(getattr(saved, name).reshape(-1, *model[key].shape[1:]))
+        if axes():
+            ply = read_ply(path)
+            saved = {key: getattr(ply, name) for key, name in GROUPS.items()}
+        else:
+            saved = torch.load(path)
+        for key in KEYS:
+            model[key] = torch.nn.Parameter(saved[key].reshape(-1, *model[key].shape[1:]))
         active_session().load(model, path)
 
 

@@ -125,7 +125,12 @@ def mean_squared_neighbour_distance(points: Tensor) -> Tensor:
 
 
 def compute_relocation(
-    opacity_old: Tensor, scale_old: Tensor, N: Tensor, binoms: Tensor, n_max: int
+    opacity_old: Tensor,
+    scale_old: Tensor,
+    N: Tensor,
+    binoms: Tensor | None,
+    n_max: int,
+    bounds: tuple[float, float] = (0.0, 1.0),
 ) -> tuple[Tensor, Tensor]:
     """N equal Gaussians in place of one, such that together they look like it (3DGS-MCMC, eq. 9).
 
@@ -139,12 +144,13 @@ def compute_relocation(
         N: (P,) integers in [1, n_max).
         binoms: the caller's table of binomials, unused: in single precision it is too coarse.
         n_max: bound of N.
+        bounds: of the new opacity, before it gives the scales.
 
     Returns:
         The opacity (P,) and the scales, flat (3 P,), of each of the N Gaussians.
     """
     total, old = N.long(), opacity_old.double()
-    opacity = -torch.expm1(torch.log1p(-old) / total)
+    opacity = (-torch.expm1(torch.log1p(-old) / total)).clamp(*bounds)
     j = torch.arange(1, n_max, device=old.device)
     table = torch.tensor(
         [
@@ -157,6 +163,23 @@ def compute_relocation(
     width = (table[total] * opacity[:, None] ** j).sum(dim=1)
     scale = scale_old.double() * (old / width)[:, None]
     return opacity.to(opacity_old), scale.to(scale_old).reshape(-1)
+
+
+def fused_ssim() -> dict[str, ModuleType]:
+    """``fused_ssim.fused_ssim``, which hosts of 2024 and later import for their loss."""
+    from fragprune_plugins.learning.losses import WINDOW, ssim_map
+
+    def similarity(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
+        """Mean SSIM of images (B, C, H, W); "valid" leaves out pixels near the border."""
+        values = torch.stack([ssim_map(*pair) for pair in zip(img1, img2, strict=True)])
+        border = WINDOW // 2
+        return (
+            values[..., border:-border, border:-border] if padding == "valid" else values
+        ).mean()
+
+    module = ModuleType("fused_ssim", "Stand-in of fragprune.")
+    vars(module)["fused_ssim"] = similarity
+    return {"fused_ssim": module}
 
 
 class SparseGaussianAdam(torch.optim.Adam):
