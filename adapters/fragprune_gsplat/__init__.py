@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapting import (
-    Dialect,
     Finding,
     HostAdapter,
     HostInfo,
     HostRepo,
     Role,
     RowTrace,
+    ScriptAdapter,
     Seam,
     SeamCall,
     SessionError,
@@ -30,6 +30,8 @@ from fragprune_plugins.adapting import (
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from fragprune_gsplat.dialect import GsplatDialect
 
 PACKAGE = "gsplat"
 RENDERING, OPERATIONS = f"{PACKAGE}.rendering", f"{PACKAGE}.strategy.ops"
@@ -135,7 +137,7 @@ class Gsplat(HostAdapter):
     installed = (PACKAGE,)
     steps_by_rendering = True
     appearance = HostAdapter.appearance | {"colors"}
-    seams = (
+    seams: tuple[Seam, ...] = (
         Seam(
             Role.RASTERIZE,
             RENDERING,
@@ -201,7 +203,7 @@ class Gsplat(HostAdapter):
             )
         ]
 
-    def dialect(self, repo: HostRepo) -> Dialect:
+    def dialect(self, repo: HostRepo) -> GsplatDialect:
         """The version's dialect, read off its source.
 
         Until 1.4 the extents are squares of 3 sigma. Until 1.5 alpha's cap is 0.999, and
@@ -213,6 +215,12 @@ class Gsplat(HostAdapter):
             return GsplatDialect(alpha_max=0.99, floor=0.005, tight=True)
         projects = repo.parameters(f"{PACKAGE}.cuda._wrapper", "fully_fused_projection") or ()
         return GsplatDialect(alpha_max=0.999, floor=0.0, tight="opacities" in projects)
+
+    def trainer(self, script: Path) -> ScriptAdapter | None:
+        """The adapter of gsplat's own training script, if this is it."""
+        from fragprune_gsplat import trainer
+
+        return trainer.SimpleTrainer(script) if trainer.recognised(script) else None
 
     def model_of(self, call: SeamCall) -> Any:
         """The dict that a strategy changes, or the means if a call has only them."""

@@ -209,6 +209,8 @@ class CommandLine:
         images: flags of the folder with the images; () if there are none.
         white_background: flags for white behind transparent images; () if there are none.
         hold_out: flags that make the host hold views out; () if it always does.
+        one_run: the host cannot resume a training, and ``resume`` names a model to evaluate.
+            Stage 2 follows stage 1 in one run; see ``ScriptAdapter.lengthened``.
     """
 
     scripts: tuple[str, ...]
@@ -227,6 +229,7 @@ class CommandLine:
     images: tuple[str, ...] = ()
     white_background: tuple[str, ...] = ()
     hold_out: tuple[str, ...] = ()
+    one_run: bool = False
 
     def spellings(self, field: str) -> tuple[str, ...]:
         """All spellings of a flag; the last one is the one to use."""
@@ -357,6 +360,14 @@ class HostAdapter(ABC):
         call = f'fragprune_plugins.activate("{self.name}")'
         return f"{call} above the import of {package} in your own script"
 
+    def trainer(self, script: Path) -> ScriptAdapter | None:
+        """The adapter of a script that trains with this library; None if it is not known.
+
+        Args:
+            script: a file outside the library, which imports it.
+        """
+        return None
+
     # -- its models ------------------------------------------------------------------------------
 
     @abstractmethod
@@ -429,6 +440,23 @@ class ScriptAdapter(HostAdapter):
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command that can resume a training script's result; by default the same command."""
         return script, arguments
+
+    def refuse(self, repo: HostRepo, arguments: list[str]) -> None:
+        """Refuse, before stage 1, arguments of a training that stage 2 cannot follow.
+
+        Raises:
+            UsageError: names the argument.
+        """
+
+    def lengthened(self, arguments: list[str], first: int, last: int) -> list[str]:
+        """Arguments of a host that cannot resume (``CommandLine.one_run``) for a longer training.
+
+        Args:
+            arguments: of the command.
+            first: the iteration at which its training would end, and at which it also saves.
+            last: the iteration at which stage 2 ends.
+        """
+        raise NotImplementedError(f"{self.name}: one_run needs lengthened()")
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """The iteration of a training command after which densification is over.

@@ -163,9 +163,8 @@ def _names(node: ast.Import | ast.ImportFrom, package: list[str]) -> list[str]:
 
 def _own(roots: list[HostRepo], name: str) -> list[Module]:
     """The host's own modules that an import of this name runs."""
-    parts, package = name.split("."), roots[-1].package
-    if package and parts[0] != package:
-        return []
+    parts = name.split(".")
+    roots = [root for root in roots if not root.package or parts[0] == root.package]
     prefixes = [".".join(parts[:end]) for end in range(1, len(parts) + 1)]
     return [
         module

@@ -159,21 +159,25 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
     else:
         repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
-    if not isinstance(adapter, ScriptAdapter):
+    driven = adapter if isinstance(adapter, ScriptAdapter) else adapter.trainer(script)
+    if driven is None:
         raise UsageError(
             "fragprune run",
             f"{adapter.info.title}, a library without a training command",
             adapter.use(repo),
             f"See the how-to page of {adapter.name}.",
         )
+    adapter = driven
     host = HostCommand.read(script, arguments, adapter.command_line(repo), module)
     device = process.host_device(options.device, options.engine)
     if options.engine != "auto":
         engine_for(options.engine, device, plugins)  # refuse before stage 1
     started = time.perf_counter()
     trains = script in (repo.root / name for name in host.line.scripts)
+    trains = trains and not (host.line.one_run and host.flags.resume)
     if trains and options.stage != "off":
         ranks.expect_one()  # refuse before stage 1
+        adapter.refuse(repo, arguments)
     dialect = adapter.dialect(repo)
     answered = {*dialect.names(), *(dialect.spares() if device == "cpu" else ())}
     data = Path(host.flags.source) if trains and host.flags.source else None
@@ -241,6 +245,8 @@ class _Runner:
 
     def train_then_finetune(self) -> None:
         """Run stage 1 with a checkpoint at its end, then stage 2 from that checkpoint."""
+        if self.host.line.one_run:
+            return self.one_run()
         if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
             return self.finetune()
         self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
@@ -266,6 +272,18 @@ class _Runner:
         self.trained = Start(total, max(ends)[1], "the end of stage 1")
         self.finetune()
 
+    def one_run(self) -> None:
+        """Run a host that cannot resume once, longer; stage 2 begins where it would have ended."""
+        settings, total = self.options.settings, self.host.iterations
+        last = total + settings.iterations
+        log.info("one run of %d iterations; stage 2 begins after %d", last, total)
+        arguments = self.adapter.lengthened(self.host.arguments, total, last)
+        if not settings.truncate and self.output is not None:  # keeps a learned result in its place
+            self.output /= "control"
+            arguments += [self.host.line.output[-1], str(self.output)]
+        self._execute(arguments, learn=True, from_step=total, settings=settings)
+        self.before, self.after = self._model(total), self._model(last)
+
     def finetune(self) -> None:
         """Run stage 2: resume a model, or begin at ``from_iter`` of one run."""
         settings = self.options.settings
@@ -281,6 +299,13 @@ class _Runner:
             )
             self.after = self._model(total)
             return
+        if self.host.line.one_run:
+            raise UsageError(
+                "--stage finetune",
+                f"{self.host.script.name}, which cannot resume a training",
+                "--from-iter, the iteration of one run after which stage 2 begins",
+                "Add it, or give the trained PLY to fragprune finetune.",
+            )
         self.host = self.host.of(*self.adapter.resumed_by(self.host.script, self.host.arguments))
         self.output = self.output or self.host.output
         start = self.trained or starting.find(self.adapter, self.host, self.output)
@@ -420,11 +445,12 @@ class _Runner:
             learned = "model" if self.options.settings.portable else "thresholds"
             where = "is" if self.options.settings.portable else "are beside"
             found += f"; the {learned} learned so far {where} {saved}"
-            again = (
-                "To continue from there, run fragprune run --stage finetune with "
-                f"{self.host.line.spellings('resume')[-1]} {saved} in the host's command. Without "
-                "that flag, stage 2 starts again."
-            )
+            if not self.host.line.one_run:
+                again = (
+                    "To continue from there, run fragprune run --stage finetune with "
+                    f"{self.host.line.spellings('resume')[-1]} {saved} in the host's command. "
+                    "Without that flag, stage 2 starts again."
+                )
         return stated(self.host.script.name, found, "a run that reaches its end", again)
 
     def summary(self, seconds: float) -> RunSummary:

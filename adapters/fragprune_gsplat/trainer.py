@@ -1,0 +1,225 @@
+"""gsplat's own training script, ``examples/simple_trainer.py`` of its repository.
+
+It cannot resume a training: ``--ckpt`` names models to evaluate. So stage 2 follows stage 1 in one
+run, which is as much longer. The script uses the installed gsplat; its folder needs none.
+"""
+
+from __future__ import annotations
+
+import ast
+import logging
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NoReturn
+
+import torch
+
+from fragprune_gsplat import DEFAULT, MCMC, Gsplat
+from fragprune_gsplat.dialect import GsplatDialect
+from fragprune_plugins.adapting import (
+    CommandLine,
+    HostCall,
+    HostRepo,
+    NotComparedError,
+    Role,
+    ScriptAdapter,
+    Seam,
+    SeamCall,
+    UsageError,
+    stand_ins,
+)
+
+log = logging.getLogger("fragprune")
+
+LISTS = {"eval_steps", "save_steps", "ply_steps"}
+"""Flags that list steps at which the script evaluates and saves."""
+ONLY = {
+    "steps-scaler": ("1", "1.0"),
+    "compression": ("None",),
+    "camera-model": ("pinhole",),
+    "with-ut": ("False",),
+    "with-eval3d": ("False",),
+    "strategy.absgrad": ("False",),
+}
+"""Flags with values that stage 2 cannot follow; these values it can."""
+DEFINES = ("create_splats_with_optimizers", "Runner.train", "main")
+
+
+def recognised(script: Path) -> bool:
+    """Whether a file is this script, in any of its versions; the one for surfels is another."""
+    beside, name = HostRepo(script.parent), script.stem
+    defined = all(beside.function(name, each) for each in DEFINES)
+    states = "max_steps" in defaults(beside.tree(name), "Config")
+    return defined and states and bool(beside.calls(name, "rasterization"))
+
+
+def defaults(tree: ast.AST | None, kind: str) -> dict[str, Any]:
+    """The fields of a dataclass as its source has them, with defaults that are constants."""
+    lines = next(
+        (
+            node.body
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ClassDef) and node.name == kind
+        )
+        if tree
+        else iter(()),
+        [],
+    )
+    return {
+        ast.unparse(line.target): getattr(line.value, "value", None)
+        for line in lines
+        if isinstance(line, ast.AnnAssign)
+    }
+
+
+def given(arguments: list[str]) -> dict[str, list[str]]:
+    """The values of each flag by its name with dashes, the last of several; tyro takes both."""
+    found: dict[str, list[str]] = {}
+    values: list[str] = []
+    for word in arguments:
+        if word.startswith("--"):
+            name, equals, value = word[2:].partition("=")
+            values = found[name.replace("_", "-")] = [value] if equals else []
+        else:
+            values.append(word)
+    return found
+
+
+class Unmeasured(torch.nn.Module):
+    """A metric whose weights cannot be had here."""
+
+    def forward(self, *_: Any) -> torch.Tensor:
+        """NaN."""
+        return torch.tensor(float("nan"))
+
+
+def perceptual(call: SeamCall) -> Any:
+    """LPIPS; NaN where its network cannot be loaded, so that the run goes on."""
+    try:
+        return call.run()
+    except (OSError, ModuleNotFoundError) as error:
+        log.warning("LPIPS cannot be loaded (%s); it is NaN", str(error).splitlines()[0])
+        return Unmeasured()
+
+
+class TrainerDialect(GsplatDialect):
+    """The dialect with a stand-in for the loss's kernel."""
+
+    def present(self, package: str) -> bool:
+        """Whether a compiled package can be imported here, and run."""
+        return super().present(package) and find_spec(package) is not None
+
+    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
+        """The stand-ins, by import name."""
+        return {**super().modules(draw), **stand_ins.fused_ssim()}
+
+
+class SimpleTrainer(Gsplat, ScriptAdapter):
+    """The adapter of a copy of the script, with the installed gsplat.
+
+    Args:
+        script: the file.
+    """
+
+    seams = (
+        *Gsplat.seams,
+        Seam(
+            Role.ANSWER,
+            "torchmetrics.image.lpip",
+            "LearnedPerceptualImagePatchSimilarity",
+            external=True,
+            how=perceptual,
+        ),
+    )
+
+    def __init__(self, script: Path) -> None:
+        self.script = script
+
+    def dialect(self, repo: HostRepo) -> TrainerDialect:
+        """The installed version's."""
+        plain = super().dialect(repo)
+        return TrainerDialect(plain.alpha_max, plain.floor, plain.tight)
+
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """The script's flags, which tyro reads with dashes or underscores."""
+        return CommandLine(
+            scripts=(str(self.script),),
+            iterations=("--max-steps", "--max_steps"),
+            output=("--result-dir", "--result_dir"),
+            source=("--data-dir", "--data_dir"),
+            save_checkpoints="--save_steps",
+            resume="--ckpt",
+            default_iterations=self._fields()["max_steps"],
+            one_run=True,
+        )
+
+    def refuse(self, repo: HostRepo, arguments: list[str]) -> None:
+        """Refuse flags that stage 2 cannot follow.
+
+        Raises:
+            UsageError: names the flag.
+        """
+        for name, values in given(arguments).items():
+            known = ONLY.get(name)
+            if known and (values or ["True"])[0] not in known:
+                raise UsageError(
+                    f"simple_trainer --{name}",
+                    " ".join(values) or "given",
+                    " or ".join(known),
+                    "Remove the flag, or train without fragprune.",
+                )
+
+    def lengthened(self, arguments: list[str], first: int, last: int) -> list[str]:
+        """Arguments with which the script trains on until ``last``, and saves at ``first`` too."""
+        flags, out = given(arguments), [*arguments, "--max_steps", str(last)]
+        for name in LISTS & self._fields().keys():
+            stated = {int(each) for each in flags.get(name.replace("_", "-"), ())}
+            out += [f"--{name}", *map(str, sorted({first, last, *stated}))]
+        return out
+
+    def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
+        """The strategy's ``refine_stop_iter``."""
+        module, kind = (
+            (MCMC, "MCMCStrategy") if "mcmc" in arguments else (DEFAULT, "DefaultStrategy")
+        )
+        stated = given(arguments).get("strategy.refine-stop-iter")
+        if stated:
+            return int(stated[0])
+        return defaults(repo.tree(module), kind).get("refine_stop_iter")
+
+    def _fields(self) -> dict[str, Any]:
+        """The script's flags and their defaults."""
+        return defaults(HostRepo(self.script.parent).tree(self.script.stem), "Config")
+
+    def photographs(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
+        """Refuse: the script moves the world and draws by its own rules; it evaluates itself."""
+        raise NotComparedError(
+            "gsplat's simple_trainer",
+            "a world that the script has turned and scaled",
+            "cameras as the data set has them",
+            "Compare its own figures of held-out views: stats/val_step*.json in --result_dir.",
+        )
+
+    def model_file(self, output: Path, iteration: int) -> Path:
+        """The PLY of an iteration with ``--save_ply``, else its checkpoint."""
+        ply = output / "ply" / f"point_cloud_{iteration - 1}.ply"
+        return ply if ply.exists() else output / "ckpts" / f"ckpt_{iteration - 1}_rank0.pt"
+
+    def save_model(self, model: Any, output: Path, iteration: int) -> Path:
+        """Write a checkpoint as the script does."""
+        path = output / "ckpts" / f"ckpt_{iteration - 1}_rank0.pt"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.save({"step": iteration - 1, "splats": model.state_dict()}, str(path))
+        return path
+
+    def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
+        """None: the script cannot resume."""
+        return []
+
+    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> NoReturn:
+        """Refuse: the script cannot resume."""
+        raise UsageError(
+            "simple_trainer", "a PLY to resume from", "a training from its start", "See --help."
+        )
