@@ -55,18 +55,10 @@ def recognised(script: Path) -> bool:
     return defined and states and bool(beside.calls(name, "rasterization"))
 
 
-def defaults(tree: ast.AST | None, kind: str) -> dict[str, Any]:
-    """The fields of a dataclass as its source has them, with defaults that are constants."""
-    lines = next(
-        (
-            node.body
-            for node in ast.walk(tree)
-            if isinstance(node, ast.ClassDef) and node.name == kind
-        )
-        if tree
-        else iter(()),
-        [],
-    )
+def defaults(tree: ast.Module | None, kind: str) -> dict[str, Any]:
+    """The fields of a dataclass and their defaults, as source has them; None if no constant."""
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)] if tree else []
+    lines = [line for node in classes if node.name == kind for line in node.body]
     return {
         ast.unparse(line.target): getattr(line.value, "value", None)
         for line in lines

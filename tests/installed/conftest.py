@@ -46,6 +46,6 @@ def session_on():
 
 def pytest_ignore_collect(collection_path):
     """Where a host is not installed there is nothing to test it with."""
-    needs = {"test_gaussian_splatting.py": "gaussian_splatting", "test_gsplat.py": "gsplat"}
-    package = needs.get(collection_path.name)
+    needs = {"test_gaussian_splatting.py": "gaussian_splatting"}
+    package = needs.get(collection_path.name, "gsplat")
     return True if package and find_spec(package) is None else None

@@ -1,0 +1,151 @@
+"""``fragprune run`` with gsplat's own training script: a small one with its interface."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from installed.gsplat_host import releases
+
+from fragprune_gsplat import Gsplat
+from fragprune_gsplat.trainer import SimpleTrainer
+from fragprune_plugins.errors import EngineError, SidecarError, UsageError
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.storage import sidecar
+
+SCRIPT = Path(__file__).parents[1] / "miniatures" / "simple_trainer.py"
+RELEASES = releases()
+TOTAL, MORE = 24, 6
+
+
+@pytest.fixture(params=RELEASES.values(), ids=RELEASES.keys())
+def release(request, monkeypatch):
+    """Each gsplat that is here, in front of the installed one."""
+    monkeypatch.syspath_prepend(request.param)
+
+
+@pytest.fixture
+def train(tmp_path, single_thread):
+    """``train(*words, stage=...)``: the script's command."""
+
+    def command(*words, strategy="default", settings=None, **options):
+        settings = settings or Settings(iterations=MORE, threshold_lr=0.5)
+        line = [str(SCRIPT), strategy, "--data_dir", str(tmp_path)]
+        line += ["--result_dir", str(tmp_path / "out"), "--max_steps", str(TOTAL), *map(str, words)]
+        return run(line, RunOptions(device="cpu", settings=settings, **options))
+
+    return command
+
+
+def checkpoint(folder, iteration):
+    return folder / "ckpts" / f"ckpt_{iteration - 1}_rank0.pt"
+
+
+def evaluated(folder, iteration):
+    return json.loads((folder / "stats" / f"val_step{iteration - 1:04d}.json").read_text())
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_stage_two_follows_the_training_in_one_longer_run(release, train, tmp_path, strategy):
+    out = tmp_path / "out"
+    summary = train("--save-steps", 3, strategy=strategy)
+    assert (summary.iterations, len(summary.curves)) == (MORE, MORE)
+    first, last = checkpoint(out, TOTAL), checkpoint(out, TOTAL + MORE)
+    assert (summary.model_before, summary.model_after) == (first, last)
+    assert {path.name for path in out.glob("ckpts/*.pt")} == {
+        path.name for path in (checkpoint(out, 3), first, last)
+    }
+    assert summary.fragments_after < summary.fragments_before
+    before, after = (torch.load(path)["splats"] for path in (first, last))
+    assert len(before["means"]) == len(after["means"]) != 60  # refined until then, not since
+    assert not torch.equal(before["means"], after["means"])
+    store, info = sidecar.load(last, len(after["means"]))
+    assert (info.adapter, store.steps) == ("gsplat", MORE - 1)  # saved before the last step
+    assert not sidecar.path_beside(first).exists()
+    assert {evaluated(out, at)["num_GS"] for at in (TOTAL, TOTAL + MORE)} == {summary.gaussians}
+
+
+def test_an_evaluation_draws_with_the_thresholds_beside_its_checkpoint(release, train, tmp_path):
+    out, last = tmp_path / "out", checkpoint(tmp_path / "out", TOTAL + MORE)
+    train("--eval_steps", 3)
+    seen = []
+    for truncated in (True, False):
+        if not truncated:
+            sidecar.path_beside(last).unlink()
+        (out / "stats" / f"val_step{TOTAL + MORE - 1:04d}.json").unlink()
+        assert train("--ckpt", last).iterations == 0
+        seen.append(evaluated(out, TOTAL + MORE)["mean"])
+    assert seen[0] < seen[1]  # what is truncated is missing on black
+
+
+def test_the_thresholds_of_another_checkpoint_are_refused(train, tmp_path):
+    train()
+    last = checkpoint(tmp_path / "out", TOTAL + MORE)
+    shutil.copy(checkpoint(tmp_path / "out", TOTAL), last)
+    with pytest.raises(SidecarError, match="another"):
+        train("--ckpt", last)
+
+
+def test_the_control_has_a_folder_of_its_own(train, tmp_path):
+    settings = Settings(iterations=MORE, truncate=False)
+    summary = train(settings=settings)
+    assert summary.model_after == checkpoint(tmp_path / "out" / "control", TOTAL + MORE)
+    assert sidecar.load(summary.model_after, summary.gaussians)[0].neutral
+
+
+def test_joint_learning_begins_where_refinement_ends(train, tmp_path):
+    with pytest.raises(UsageError, match="after 15000"):  # by the strategy's own default
+        train(stage="joint")
+    summary = train(stage="joint", from_iter=4)
+    store, _ = sidecar.load(summary.model_after, summary.gaussians)
+    assert (summary.iterations, len(store)) == (TOTAL, summary.gaussians)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--steps-scaler", "0.5"], "steps-scaler"),
+        (["--compression", "png"], "compression"),
+        (["--camera_model=fisheye"], "camera-model"),
+        (["--with_ut", "--packed"], "with-ut"),
+        (["--strategy.absgrad"], "absgrad"),
+    ],
+)
+def test_flags_that_stage_two_cannot_follow_are_refused(words, named):
+    adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
+    adapter.refuse(repo, ["default", "--camera-model", "pinhole", "--steps_scaler=1"])
+    with pytest.raises(UsageError, match=named):
+        adapter.refuse(repo, ["default", *words])
+
+
+def test_they_are_refused_before_the_training(train, tmp_path):
+    with pytest.raises(UsageError, match="compression"):
+        train("--compression", "png")
+    assert not (tmp_path / "out").exists()
+
+
+def test_it_cannot_resume_and_says_how_to_learn(train):
+    with pytest.raises(UsageError, match="from-iter"):
+        train(stage="finetune")
+
+
+def test_several_gpus_would_be_processes_without_thresholds(train, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(EngineError, match="CUDA_VISIBLE_DEVICES"):
+        train()
+
+
+def test_another_script_with_gsplat_is_told_what_to_do(tmp_path):
+    script = tmp_path / "mine.py"
+    script.write_text("from gsplat import rasterization\n")
+    assert Gsplat().trainer(script) is None
+    surfels = SCRIPT.read_text().replace("rasterization", "rasterization_2dgs")
+    script.write_text(surfels)
+    assert Gsplat().trainer(script) is None
+    with pytest.raises(UsageError, match="activate"):
+        run([str(script)], RunOptions(device="cpu"))
