@@ -174,7 +174,12 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         engine_for(options.engine, device, plugins)  # refuse before stage 1
     started = time.perf_counter()
     trains = script in (repo.root / name for name in host.line.scripts)
-    trains = trains and not (host.line.one_run and host.flags.resume)
+    if host.line.one_run and host.flags.resume:
+        from fragprune_plugins.storage import sidecar
+
+        trains = False  # it only evaluates
+        if not sidecar.find(Path(host.flags.resume)):
+            log.warning("%s has no thresholds beside it: drawn without", host.flags.resume)
     if trains and options.stage != "off":
         ranks.expect_one()  # refuse before stage 1
         adapter.refuse(repo, arguments)

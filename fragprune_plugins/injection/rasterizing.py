@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.errors import AlignmentError, SessionError
 from fragprune_plugins.hosts.adapter import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.resuming import draw_nothing
@@ -50,10 +50,11 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     own = len(call.seam.needs) > 1  # a function takes the model; a method belongs to it
     model = call.arguments[call.seam.needs[1]] if own else session.model_of(call)
     if model is None:
+        expect_adopted(session, call)
         if session.learn and torch.is_grad_enabled():
             warn_unknown(session, call.seam)
         return call.run()
-    if session.unpacked is not None and model not in session.models:
+    if session.unpacked is not None:
         adopt(session, model, *session.unpacked)
     state, view = session.models.get(model), session.adapter.view(call.first)
     begins = session.adapter.steps_by_rendering and session.learn and torch.is_grad_enabled()
@@ -68,6 +69,25 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     if state is not None and state.stage is not None:
         state.stage.picture = str(getattr(call.first, "image_name", ""))
     return again()
+
+
+def expect_adopted(session: SessionState, call: SeamCall) -> None:
+    """Refuse to draw an unpacked file's Gaussians without its thresholds.
+
+    Raises:
+        SessionError: no seam attached the model that they are in.
+    """
+    means = session.adapter.model_of(call)
+    if session.unpacked is None or session.pausing.get() or not isinstance(means, Tensor):
+        return
+    if torch.equal(means.detach().cpu(), session.unpacked[0]):
+        raise SessionError(
+            str(call.seam),
+            "Gaussians of a file with thresholds, in a model that no seam attached",
+            "a model with its thresholds",
+            "Attach it first, or load them: session.load(model, path). To draw without, use "
+            "fragprune_plugins.paused().",
+        )
 
 
 def learns(state: ModelState) -> bool:

@@ -94,6 +94,9 @@ def on_unpack(session: SessionState, call: SeamCall) -> Any:
 def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdStore) -> None:
     """Give thresholds of an unpacked file to the model that the host draws next.
 
+    A model that has thresholds already takes these if it has the file's Gaussians: the host
+    resumes it. If not, the file was read for something else.
+
     Args:
         session: the state of the session.
         model: the model that the host draws.
@@ -103,8 +106,14 @@ def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdS
     Raises:
         AlignmentError: the model has other means.
     """
-    means = session.adapter.means(model)
-    if not torch.equal(means.detach().cpu(), expected):
+    means, known = session.adapter.means(model), session.models.get(model)
+    same = torch.equal(means.detach().cpu(), expected)
+    if known is not None:
+        session.unpacked = None
+        if same:
+            known.store.load_state_dict(store.state_dict())
+        return
+    if not same:
         raise AlignmentError(
             f"{session.adapter.name}: unpacked model",
             f"{len(means)} Gaussians that differ from the unpacked file's",

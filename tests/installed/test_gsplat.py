@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import io
 import json
+import math
 import subprocess
 import sys
 from functools import partial
@@ -340,6 +342,84 @@ def test_thresholds_go_through_a_file_beside_ones_own_checkpoint(session_on, tmp
         few, _ = new_params(7)
         with pytest.raises(SidecarError, match="thresholds of 40"):
             session.load(few, file)
+
+
+@pytest.mark.parametrize("nested", [True, False])
+@pytest.mark.parametrize("learn", [True, False])
+def test_torch_saves_and_loads_parameters_with_their_thresholds(
+    session_on, tmp_path, nested, learn
+):
+    file, logits = tmp_path / "splats.pt", torch.randn(40)
+
+    def loaded():
+        saved = torch.load(file)
+        return saved["splats"] if nested else saved
+
+    with session_on(Gsplat()) as session:
+        from gsplat import DefaultStrategy
+
+        params, optimizers = new_params(40)
+        DefaultStrategy().check_sanity(params, optimizers)
+        session.store(params).logits = logits.clone().requires_grad_(True)
+        state = params.state_dict()
+        torch.save({"step": 3, "splats": state} if nested else state, file)
+        with torch.no_grad():
+            picture = draw(params)[0]
+    with session_on(Gsplat(), learn=learn) as session:
+        from gsplat import DefaultStrategy
+
+        again, optimizers = new_params(7, seed=1)
+        saved = loaded()
+        with pytest.raises(SessionError, match="no seam attached"), torch.no_grad():
+            draw(saved)
+        DefaultStrategy().check_sanity(again, optimizers)
+        for name, value in saved.items():
+            again[name].data = value
+        with torch.no_grad():
+            assert torch.equal(draw(again)[0], picture)
+        assert torch.equal(session.store(again).logits, logits)
+        del saved["quats"]
+        torch.save(saved, io.BytesIO())  # neither a file nor all parameters
+
+
+def test_a_file_that_was_read_for_something_else_changes_nothing(session_on, tmp_path):
+    with session_on(Gsplat()) as session:
+        from gsplat import DefaultStrategy
+
+        params, optimizers = new_params(40)
+        DefaultStrategy().check_sanity(params, optimizers)
+        session.store(params).logits = torch.randn(40).requires_grad_(True)
+        torch.save(params.state_dict(), tmp_path / "other.pt")
+        with torch.no_grad():
+            params["means"] += 1
+            kept = session.store(params).logits.clone()
+            torch.load(tmp_path / "other.pt")
+            session.store(params).logits += 1
+            draw(params)
+        assert torch.equal(session.store(params).logits, kept + 1)
+
+
+@pytest.mark.parametrize("count", [1, 2, 51])
+def test_relocation_is_equation_nine_also_for_the_most_copies(session_on, count):
+    """Until 1.5 as printed; 1.6 keeps the new opacity from 0.005 to 1 first."""
+    with session_on(Gsplat()):
+        from gsplat import MCMCStrategy
+        from gsplat.relocation import compute_relocation
+
+        binoms = MCMCStrategy().initialize_state()["binoms"]
+        old, scales = torch.tensor([0.1, 0.6]), torch.full((2, 3), 0.5)
+        opacities, new = compute_relocation(old, scales, torch.full((2,), count), binoms)
+        bounded = "min_opacity" in inspect.signature(compute_relocation).parameters
+        for row, o in enumerate(old.double().tolist()):
+            expected = 1 - (1 - o) ** (1 / count)
+            expected = max(expected, 0.005) if bounded else expected
+            total = sum(
+                math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * expected ** (k + 1)
+                for i in range(1, count + 1)
+                for k in range(i)
+            )
+            assert opacities[row].item() == pytest.approx(expected, rel=1e-5)
+            assert new[row].tolist() == pytest.approx([0.5 * o / total] * 3, rel=1e-4)
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
