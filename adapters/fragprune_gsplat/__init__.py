@@ -130,8 +130,8 @@ class Gsplat(HostAdapter):
         limits=(
             "Refused by name: other cameras, distortion, the unscented transform, distributed, "
             "batches, channels other than three, tiles other than 16 pixels.",
-            "absgrad is refused while positions train; MCMCStrategy of 1.6 needs a GPU until "
-            "stage 2.",
+            "absgrad is refused while positions train; so are several GPUs in one training.",
+            "Its own examples/simple_trainer.py cannot resume: both stages are one run.",
         ),
     )
     installed = (PACKAGE,)

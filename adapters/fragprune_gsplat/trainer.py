@@ -23,6 +23,7 @@ from fragprune_plugins.adapting import (
     HostCall,
     HostRepo,
     NotComparedError,
+    Photographs,
     Role,
     ScriptAdapter,
     Seam,
@@ -185,14 +186,26 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         """The script's flags and their defaults."""
         return defaults(HostRepo(self.script.parent).tree(self.script.stem), "Config")
 
-    def photographs(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
-        """Refuse: the script moves the world and draws by its own rules; it evaluates itself."""
-        raise NotComparedError(
-            "gsplat's simple_trainer",
-            "a world that the script has turned and scaled",
-            "cameras as the data set has them",
-            "Compare its own figures of held-out views: stats/val_step*.json in --result_dir.",
-        )
+    def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
+        """The photographs, where the script leaves the world as it is and saves PLYs."""
+        flags = given(arguments)
+        needed = {
+            "no-normalize-world-space": "a world that the script turns and scales",
+            "save-ply": "checkpoints alone",
+        }
+        found = [why for flag, why in needed.items() if flag not in flags]
+        if flags.get("test-every", ["8"]) != ["8"]:
+            found.append("other held-out views than every eighth")
+        if found:
+            raise NotComparedError(
+                "gsplat's simple_trainer",
+                ", ".join(found),
+                "--no-normalize-world-space --save_ply, and --test_every as it is",
+                "Compare its own figures of held-out views, stats/val_step*.json in --result_dir.",
+            )
+        factor = flags.get("data-factor", [str(self._fields()["data_factor"])])[0]
+        images = "images" if factor == "1" else f"images_{factor}"
+        return Photographs(Path(flags["data-dir"][0]), images=images)
 
     def model_file(self, output: Path, iteration: int) -> Path:
         """The PLY of an iteration with ``--save_ply``, else its checkpoint."""

@@ -12,7 +12,8 @@ from installed.gsplat_host import releases
 
 from fragprune_gsplat import Gsplat
 from fragprune_gsplat.trainer import SimpleTrainer
-from fragprune_plugins.errors import EngineError, SidecarError, UsageError
+from fragprune_plugins.datasets.photographs import Photographs
+from fragprune_plugins.errors import EngineError, NotComparedError, SidecarError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
@@ -127,6 +128,19 @@ def test_they_are_refused_before_the_training(train, tmp_path):
     with pytest.raises(UsageError, match="compression"):
         train("--compression", "png")
     assert not (tmp_path / "out").exists()
+
+
+def test_what_the_script_reads_is_known_where_it_leaves_the_world_as_it_is():
+    adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
+    words = ["default", "--data-dir", "in", "--save_ply"]
+    with pytest.raises(NotComparedError, match="turns and scales"):
+        adapter.photographs(repo, words)
+    words += ["--no_normalize_world_space"]
+    assert adapter.photographs(repo, words) == Photographs(Path("in"), images="images_4")
+    whole = adapter.photographs(repo, [*words, "--data_factor=2", "--data_factor", "1"])
+    assert whole == Photographs(Path("in"))
+    with pytest.raises(NotComparedError, match="every eighth"):
+        adapter.photographs(repo, [*words, "--test_every", "4"])
 
 
 def test_it_cannot_resume_and_says_how_to_learn(train):

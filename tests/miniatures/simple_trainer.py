@@ -21,6 +21,7 @@ from gsplat.strategy import DefaultStrategy, MCMCStrategy
 @dataclass
 class Config:
     data_dir: str = "data"
+    data_factor: int = 4
     result_dir: str = "results"
     ckpt: str | None = None
     max_steps: int = 30_000
