@@ -44,9 +44,7 @@ def test_the_trainer_runs_unmodified_learns_and_evaluates(checkout, strategy, da
             text=True,
             env={**os.environ, "PYTHONPATH": path},
         )
-        if "[host-needs]" in done.stderr + done.stdout:
-            pytest.skip(f"the trainer needs more: {(done.stderr + done.stdout)[-300:]}")
-        assert done.returncode == 0, done.stderr[-4000:]
+        assert done.returncode == 0, (done.stdout, done.stderr[-4000:])
         return json.loads(done.stdout)
 
     report = trainer()
