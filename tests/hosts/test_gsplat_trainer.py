@@ -1,7 +1,8 @@
 """gsplat's checkouts with their own trainer, unmodified, where ``FRAGPRUNE_HOSTS`` points at them.
 
 Its packages are not ours to require: the readers of COLMAP's files, tyro, torchmetrics and others
-(``fragprune run`` names what is missing). Until 1.5 the reader needs numpy below 2.
+(``fragprune run`` names what is missing). Until 1.5 the reader needs numpy below 2, and a COLMAP
+model in binary files: name one by ``FRAGPRUNE_TEST_DATA``.
 """
 
 from __future__ import annotations
