@@ -107,7 +107,8 @@ Module = tuple[HostRepo, str]
 
 def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterator[tuple[str, str]]:
     """Top-level names that a script imports from outside the host, with their places."""
-    if repo.package and script.is_relative_to(repo.root):  # else a script beside the package
+    inside = repo.package and script.is_relative_to(repo.root / repo.package)
+    if inside:  # else a script beside the package
         begin = repo, ".".join(script.relative_to(repo.root).with_suffix("").parts)
     else:
         begin = HostRepo(script.parent), script.stem

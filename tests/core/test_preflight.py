@@ -122,3 +122,14 @@ def test_our_own_small_host_lacks_nothing():
 def test_the_names_that_an_adapter_says_it_answers_are_those_it_makes(adapter):
     dialect = adapter.dialect(HostRepo(HOST))
     assert dialect.names() == set(dialect.modules(lambda call: None))
+
+
+def test_a_script_beside_the_package_it_uses_has_modules_of_its_own(tmp_path):
+    """As in a checkout that is installed in place: its examples are no part of the package."""
+    for name in ("library/__init__.py", "examples/helper.py"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text("")
+    script = tmp_path / "examples" / "train.py"
+    script.write_text("import helper, library, not_here_at_all\n")
+    (missing,) = missing_imports(HostRepo(tmp_path, "library"), [script], ())
+    assert missing.module == "not_here_at_all"
