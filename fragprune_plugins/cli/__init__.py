@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 from importlib import import_module
 from importlib.util import find_spec
 
@@ -65,8 +67,27 @@ def cli() -> None:
     """
 
 
+def _stand() -> None:
+    """Give the process the streams that it may have been started without.
+
+    A file that is opened in the place of a closed stream would get what is written to that. A
+    letter that a stream cannot write becomes an escape.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def main() -> None:
     """Entry point of the ``fragprune`` script."""
+    _stand()
     # By default, OpenMP's threads spin while they wait. On a busy machine, torch on two threads was
     # fifty times slower with spinning threads than with sleeping ones.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 import click
 
 from fragprune_plugins.cli.common import Command, Report
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import PluginError, UsageError
+from fragprune_plugins.storage.reading import said
 
 GROUP = "fragprune.bridges"
 """Entry points: a viewer's name, and the package whose ``MODULE`` is its JavaScript module."""
@@ -31,13 +32,13 @@ def command(viewer: str | None, out: Path | None) -> Report:
     """
     modules = {entry.name: entry for entry in sorted(entry_points(group=GROUP))}
     if viewer is None:
-        found = {name: _module(modules[name].load()) for name in modules}
+        found = {name: _module(entry) for name, entry in modules.items()}
         lines = [f"{name:<16} {module}" for name, module in found.items()]
         data = {"bridges": {name: str(module) for name, module in found.items()}}
         return Report(data, "\n".join(lines) or "No bridge is installed.")
     if viewer not in modules:
         raise UsageError("VIEWER", viewer, " or ".join(modules), "Choose a bridge from the list.")
-    module = _module(modules[viewer].load())
+    module = _module(modules[viewer])
     if out is None:
         return Report({"bridge": viewer, "module": str(module)}, str(module.parent))
     from fragprune_plugins.storage.atomic import replacing
@@ -49,6 +50,21 @@ def command(viewer: str | None, out: Path | None) -> Report:
     return Report({"bridge": viewer, "module": str(to)}, f"Wrote {to}.")
 
 
-def _module(package: object) -> Path:
-    module: Path = package.MODULE  # type: ignore[attr-defined]
-    return module
+def _module(entry: EntryPoint) -> Path:
+    """The module of an installed bridge.
+
+    Raises:
+        PluginError: its package cannot be imported, or names no file.
+    """
+    try:
+        module = entry.load().MODULE
+        if not Path(module).is_file():
+            raise FileNotFoundError(f"no file {module}")
+    except (Exception, SystemExit) as error:
+        raise PluginError(
+            f"bridge {entry.name}",
+            f"{type(error).__name__}: {said(error)}",
+            "a package with the path of its JavaScript module",
+            f"Install {entry.value} again, or remove it.",
+        ) from error
+    return Path(module)

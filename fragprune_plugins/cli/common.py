@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import math
 import os
 import re
 import sys
@@ -61,6 +62,19 @@ class OutFile(click.Path):
         return path
 
 
+class Number(click.FloatRange):
+    """Type of an option for a number; refuses NaN, which passes every range, and infinity."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The option's value; a usage error if it is not finite or out of range."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{number} is not a number in a range.", param, ctx)
+        return number
+
+
 class ModelFile(click.Path):
     """Type of an argument for a model: its file, or the output folder of a training."""
 
@@ -78,7 +92,7 @@ class ModelFile(click.Path):
             found = newest_model(path)
         except ModelFileError as error:
             self.fail(f"'{path}' is {error.found}. {error.remedy}", param, ctx)
-        click.echo(f"Model: {found}", err=True)
+        click.echo(printable(f"Model: {found}"), err=True)
         return found
 
 
@@ -142,7 +156,7 @@ def _read_config(ctx: click.Context, param: click.Parameter, value: Path | None)
     except UsageError as error:
         raise click.BadParameter(str(error), ctx, param) from error
     options = {
-        word.lstrip("-"): each.name
+        word.lstrip("-"): each
         for each in ctx.command.params
         if isinstance(each, click.Option) and each is not param
         for word in each.opts
@@ -155,9 +169,29 @@ def _read_config(ctx: click.Context, param: click.Parameter, value: Path | None)
             raise click.BadParameter(
                 f"{value}: {key!r} is no option of {ctx.command_path}.", ctx, param
             )
-        names[str(options[word])] = setting
+        try:
+            names[str(options[word].name)] = _as_words(options[word], setting)
+        except ValueError as error:
+            raise click.BadParameter(f"{value}: {key}: {error}", ctx, param) from error
     ctx.default_map = {**(ctx.default_map or {}), **names}
     return value
+
+
+def _as_words(option: click.Option, setting: Any) -> Any:
+    """What a line would say in place of a TOML value, so that both are read alike.
+
+    Raises:
+        ValueError: no line can say it.
+    """
+    if isinstance(setting, bool) != option.is_flag or isinstance(setting, list) != option.multiple:
+        kind = "true or false" if option.is_flag else "a list" if option.multiple else "one value"
+        raise ValueError(f"{setting!r:.80}, where {kind} belongs")
+    if option.is_flag:
+        return setting
+    words = setting if option.multiple else [setting]
+    if not all(isinstance(word, str | int | float) and "\0" not in str(word) for word in words):
+        raise ValueError(f"{setting!r:.80}, where text or a number belongs")
+    return [str(word) for word in words] if option.multiple else str(setting)
 
 
 config_option = click.option(
@@ -307,12 +341,13 @@ class Group(click.Group):
 def _machine_stated(where: str) -> Iterator[None]:
     """State what the machine refuses wherever a command meets it: a path, or memory."""
     try:
+        os.getcwd()  # where that folder is gone, torch ends the process without a word of ours
         yield
     except OSError as error:
-        if not error.filename:  # a closed pipe, for one
+        if not (error.filename or isinstance(error, FileNotFoundError)):  # a closed pipe, for one
             raise
         raise PathError(
-            str(error.filename),
+            str(error.filename or where),
             error.strerror or str(error),
             "a path that the system takes",
             "Choose another name or place, or free space and permissions there.",
@@ -494,7 +529,8 @@ def photographs_for(
         changed["resolution"] = Resolution(resolution)
     if white_background:
         changed["white_background"] = True
-    click.echo(f"Photographs: {known.folder}, which the model was trained on", err=True)
+    said = f"Photographs: {known.folder}, which the model was trained on"
+    click.echo(printable(said), err=True)
     return replace(known, **changed)
 
 

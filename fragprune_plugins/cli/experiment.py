@@ -15,6 +15,7 @@ from fragprune_plugins.cli.common import (
     Command,
     Function,
     Group,
+    Number,
     Report,
     data_options,
     engine_option,
@@ -83,7 +84,7 @@ _training_options = together(
     ),
     click.option(
         "--scale",
-        type=click.FloatRange(min=0, min_open=True),
+        type=Number(min=0, min_open=True),
         help="Multiply the default iterations by this instead.",
     ),
     click.option(

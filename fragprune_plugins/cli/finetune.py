@@ -14,6 +14,7 @@ from fragprune_plugins.cli.common import (
     MODEL,
     TRAINED_ON,
     Command,
+    Number,
     OutFile,
     Report,
     config_option,
@@ -109,7 +110,7 @@ def _share(
 @click.option(
     "--checkpoint-every",
     "every",
-    type=click.FloatRange(min=0),
+    type=Number(min=0),
     default=300.0,
     show_default=True,
     metavar="SECONDS",

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from fragprune_plugins.cli.common import Number
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE, PORTABLE_ELASTICITY
 from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS, QUICK_ITERATIONS, Settings
@@ -50,7 +51,7 @@ _OPTIONS = (
     ),
     click.option(
         "--max-drop",
-        type=click.FloatRange(0, 10),
+        type=Number(0, 10),
         metavar="DB",
         help="Find the strongest truncation that loses at most so much PSNR, in dB, against the "
         "control. Trains the control and up to 7 times more, and chooses the pressure on the "

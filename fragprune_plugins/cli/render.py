@@ -12,6 +12,7 @@ from fragprune_plugins.cli.common import (
     FILE,
     MODEL,
     Command,
+    Number,
     Report,
     cameras_of,
     engine_options,
@@ -65,7 +66,7 @@ def _direction(
 )
 @click.option(
     "--seconds",
-    type=click.FloatRange(min=0.1, max=3600),
+    type=Number(min=0.1, max=3600),
     default=8.0,
     show_default=True,
     help="Of a film, or of --orbit.",

@@ -13,6 +13,7 @@ import click
 from fragprune_plugins.cli.common import (
     JSON,
     Command,
+    Number,
     Report,
     bound_threads,
     config_option,
@@ -81,7 +82,7 @@ _CONTROL = (
 @click.option(
     "--checkpoint-every",
     "every",
-    type=click.FloatRange(min=0),
+    type=Number(min=0),
     default=300.0,
     show_default=True,
     metavar="SECONDS",

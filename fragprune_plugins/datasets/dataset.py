@@ -20,7 +20,7 @@ from fragprune_plugins.datasets.lenses import Lens
 from fragprune_plugins.datasets.memory import PICTURES, Slot
 from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.datasets.pinhole import Camera, Posed
-from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.errors import DatasetError, printable
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import View
 
@@ -112,11 +112,13 @@ class Photograph(Shot):
     def _load(self) -> Tensor:
         size = (self.view.width, self.view.height)
         with opened(self.path) as file:
+            whole = file.size
             transparent = "A" in file.getbands() or "transparency" in file.info
             picture = self._fitted(file.convert("RGBA" if transparent else "RGB"), size)
         flat = _over(picture, 255 * self.view.background.cpu().numpy())
         if self.mask is not None:
             with opened(self.mask) as file:
+                _expect_aspect(self.mask, file.size, "its photograph", whole)
                 seen = self._fitted(file.convert("L"), size) >= _SEEN
             shown = seen[..., None].astype(np.uint8)
             flat = np.concatenate([flat * shown, shown], axis=2)
@@ -262,7 +264,8 @@ def _image_folder(folder: Path, images: str) -> str:
     if images == "images" and not (folder / images).exists():
         for smaller in _SMALLER:
             if (folder / smaller).is_dir():
-                log.warning("%s: no images/; reading the photographs of %s/", folder, smaller)
+                said = printable(str(folder))
+                log.warning("%s: no images/; reading the photographs of %s/", said, smaller)
                 return smaller
     return images
 
@@ -275,12 +278,20 @@ def make_shot(row: Posed, background: Tensor, resolution: Resolution) -> Photogr
     """
     width, height = image_size(row.image)
     camera = row.camera
-    if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT_TOLERANCE:
-        raise DatasetError(
-            str(row.image),
-            f"{width}x{height} pixels",
-            f"those of its camera, {camera.width}x{camera.height}, or that aspect",
-            "Use the images that the cameras were calibrated with.",
-        )
+    _expect_aspect(row.image, (width, height), "its camera", (camera.width, camera.height))
     view = camera.resized(*resolution.of(width, height)).view(background)
     return Photograph(row.name, view, row.image, camera, row.lens, row.mask)
+
+
+def _expect_aspect(
+    path: Path, size: tuple[int, int], whose: str, expected: tuple[int, int]
+) -> None:
+    """Raise DatasetError if a picture has another aspect than it should."""
+    (width, height), (wide, high) = size, expected
+    if abs(width * high / (height * wide) - 1) > _ASPECT_TOLERANCE:
+        raise DatasetError(
+            str(path),
+            f"{width}x{height} pixels",
+            f"those of {whose}, {wide}x{high}, or that aspect",
+            "Use the images that the cameras were calibrated with.",
+        )

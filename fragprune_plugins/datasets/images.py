@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.storage.reading import Door
 
@@ -19,6 +20,9 @@ PIXELS_MAX = 160_000_000
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """All that Pillow may take a file for. Some of its other readers run programs."""
+
+_CUT = ("I", "F")
+"""Modes besides 16-bit grey whose values Pillow cuts at 255: a bright photograph is white then."""
 
 DOOR = Door(
     DatasetError,
@@ -66,12 +70,19 @@ def opened(path: Path) -> Iterator[Image]:
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # PIXELS_MAX decides
         with Image.open(reading.file, formats=_FORMATS) as image:
             width, height = image.size
-            if width * height > PIXELS_MAX:
+            if width * height > PIXELS_MAX or max(width, height) > SIDE_MAX:
                 raise DatasetError(
                     str(path),
                     f"{width}x{height} pixels",
-                    f"at most {PIXELS_MAX:,} pixels",
+                    f"at most {PIXELS_MAX:,} pixels, and {SIDE_MAX:,} a side",
                     "Make the image smaller.",
+                )
+            if image.mode in _CUT or image.mode.startswith("I;16"):
+                raise DatasetError(
+                    str(path),
+                    f"pixels of mode {image.mode}, which would all be cut to 8 bits",
+                    "8 bits a channel",
+                    "Save the image with 8 bits a channel.",
                 )
             yield image
 

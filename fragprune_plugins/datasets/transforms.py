@@ -64,13 +64,13 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     content = load_json(path)
     with _TRANSFORMS.stated(path):
         kept, held = (
-            {_name(Path(each)) for key in keys for each in content.get(key, ())}
+            {_listed(each) for key in keys for each in content.get(key, ())}
             for keys in (("train_filenames",), ("test_filenames", "val_filenames"))
         )
-    if not held:
-        return split([row for row in rows if not kept or row.name in kept])
-    test = [row for row in rows if row.name in held]
-    return [row for row in rows if row.name not in held and (not kept or row.name in kept)], test
+        files = [_listed(frame["file_path"]) for frame in content["frames"]]
+    named = [(row, file) for row, file in zip(rows, files, strict=True)]
+    wanted = [row for row, file in named if file not in held and (not kept or file in kept)]
+    return (wanted, [row for row, file in named if file in held]) if held else split(wanted)
 
 
 def read_transforms(path: Path, images: str = "images") -> list[Posed]:
@@ -119,6 +119,12 @@ def opengl_pose(to_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """
     rotation = (to_world[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.contiguous()
     return rotation, -rotation @ to_world[:, 3]
+
+
+def _listed(file: str) -> Path:
+    """A path that a transforms file lists, to compare with others: its suffix may differ."""
+    path = Path(file)
+    return path.with_name(_name(path))
 
 
 def _name(image: Path) -> str:

@@ -259,9 +259,9 @@ class ThresholdStore:
         """
         rows = {key: state[key] for key in ("logits", "exp_avg", "exp_avg_sq")}
         remedy = "Use a sidecar written by fragprune."
-        if len({tuple(t.shape) for t in rows.values()}) != 1 or rows["logits"].ndim != 1:
-            found = f"shapes {[tuple(t.shape) for t in rows.values()]}"
-            raise SidecarError("threshold state", found, "three equal (N,)", remedy)
+        kinds = [(tuple(t.shape), t.dtype) for t in rows.values()]
+        if set(kinds) != {((rows["logits"].numel(),), torch.float32)}:
+            raise SidecarError("threshold state", f"shapes {kinds}", "three (N,) float32", remedy)
         for name, tensor in rows.items():
             wrong = ~tensor.isfinite()
             if name == "exp_avg_sq":

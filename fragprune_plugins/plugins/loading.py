@@ -114,6 +114,7 @@ class Plugins:
     def remove(self, name: str) -> None:
         """Take back a plugin that was registered under a name."""
         self._manager.unregister(name=name)
+        self._off = {each for each in self._off if each[0] != name}
 
     def ask(self, hook: Hook, wrong: Callable[[Any], Wrong | None], **given: Any) -> Any:
         """Ask a hook; returns the first answer that is not None, or None if no plugin answers.

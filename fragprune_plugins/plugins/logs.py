@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -16,6 +17,12 @@ from fragprune_plugins.errors import OutputError, UsageError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins, installed
+
+
+def _open(path: str, flags: int) -> int:
+    """Open a file without waiting for whoever reads a pipe."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
+
 
 COLUMNS = tuple(each.name for each in fields(StepStats))
 
@@ -37,18 +44,28 @@ class CsvLog:
         path: the file.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: it cannot be written, or holds something else than a log.
     """
 
     def __init__(self, path: str) -> None:
         self._path = Path(path)
         try:
-            self._file = open(self._path, "a", newline="", encoding="utf-8")  # noqa: SIM115
-        except OSError as error:
-            why = error.strerror or str(error)
+            if self._path.is_file() and not self._is_ours():
+                raise OSError("a file that is no log")
+            self._file = open(  # noqa: SIM115
+                self._path, "a", newline="", encoding="utf-8", opener=_open
+            )
+        except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+            why = getattr(error, "strerror", None) or str(error)
             raise OutputError(path, why, "a file for --log", "Choose another place.") from error
         self._rows = csv.writer(self._file)
         self._begun = False
+
+    def _is_ours(self) -> bool:
+        """Whether the file is empty, or begins as a log does."""
+        begin = f"{COLUMNS[0]},".encode()
+        with open(self._path, "rb") as file:
+            return file.read(len(begin)) in (b"", begin)
 
     def write(self, stats: StepStats) -> None:
         """Append a row; the first step of all begins the file."""

@@ -71,5 +71,5 @@ def _is_broken(name: str, tensor: Tensor) -> bool:
     """Whether a tensor holds NaN or infinity, or is a negative second moment."""
     if name == "curves":  # a loss that is not known is NaN
         return False
-    negative = name.startswith("exp_avg_sq") and bool((tensor < 0).any())
+    negative = "exp_avg_sq" in name and bool((tensor < 0).any())
     return negative or not bool(tensor.isfinite().all())

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote
 
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.viewer.site import Site
@@ -33,7 +34,7 @@ def open_server(site: Site, port: int = 0) -> ThreadingHTTPServer:
         OutputError: the port cannot be had.
     """
     try:
-        return ThreadingHTTPServer((HOST, port), partial(_Handler, site))
+        return _Server((HOST, port), partial(_Handler, site))
     except OSError as error:
         raise OutputError(
             f"{HOST}:{port}", error.strerror or str(error), "a free port", "Leave out --port."
@@ -43,6 +44,13 @@ def open_server(site: Site, port: int = 0) -> ThreadingHTTPServer:
 def address(server: ThreadingHTTPServer) -> str:
     """Where a browser on this machine finds the viewer."""
     return f"http://{HOST}:{server.server_port}/"
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a browser that goes away before it has read its answer."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -66,7 +74,7 @@ class _Handler(BaseHTTPRequestHandler):
             # A page of another site that has its name point here may not read the model.
             self.send_error(HTTPStatus.FORBIDDEN)
             return
-        name = unquote(urlsplit(self.path).path)[1:] or "index.html"
+        name = unquote(self.path.partition("?")[0])[1:] or "index.html"
         content = self.site.get(name)
         if content is None:
             self.send_error(HTTPStatus.NOT_FOUND)
@@ -77,6 +85,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.end_headers()
         if with_body:
             self.wfile.write(content)

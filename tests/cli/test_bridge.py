@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 from cli.commands import run, run_json
 
 from fragprune_plugins import __version__
+from fragprune_plugins.cli import bridge
 
 VIEWERS = ["playcanvas", "spark"]
 
@@ -47,3 +49,13 @@ def test_a_folder_that_cannot_be_made_is_a_stated_error(tmp_path):
     failed = run("bridge", "spark", "--out", tmp_path / "taken" / "website")
     assert failed.exit_code == 1
     assert str(tmp_path / "taken") in failed.stderr
+
+
+@pytest.mark.parametrize("module", ["no.such.package", "json", "sys:exit"])
+def test_a_broken_bridge_is_named(monkeypatch, module):
+    broken = EntryPoint("mine", module, bridge.GROUP)
+    monkeypatch.setattr(bridge, "entry_points", lambda group: [broken])
+    for words in ((), ("mine",)):
+        failed = run("bridge", *words)
+        assert failed.exit_code == 1
+        assert "[plugin] bridge mine" in failed.stderr

@@ -13,6 +13,7 @@ import pytest
 from cli.commands import run, run_json
 from finetune import tiny
 
+from fragprune_plugins.errors import OutputError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import fragprune_step
 from fragprune_plugins.plugins.loading import Plugins, installed
@@ -184,3 +185,52 @@ def test_bash_completes_commands():
         command, env=os.environ | asked, capture_output=True, text=True, check=True, timeout=60
     )
     assert found.stdout.strip() == "plain,finetune"
+
+
+def test_a_file_that_is_no_log_is_not_begun_anew(tmp_path):
+    data, model, _ = tiny.scene(tmp_path)
+    before = model.read_bytes()
+    words = ("finetune", model, "--data", data, "--out", tmp_path / "p.ply", *WORDS)
+    result = run(*words, "--log", f"csv:{model}")
+    assert result.exit_code == 1
+    assert "a file that is no log" in result.stderr
+    assert model.read_bytes() == before
+
+
+def test_a_pipe_that_nobody_reads_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OutputError, match="pipe"), logging_steps([("csv", str(tmp_path / "pipe"))]):
+        pass
+
+
+VALUES = {
+    "iters = [1]": "where one value belongs",
+    "iters = true": "where one value belongs",
+    "iters = inf": "not a valid integer",
+    "iters = {a = 1}": "where text or a number belongs",
+    "iters = 1979-05-27": "where text or a number belongs",
+    "seed = 1e400": "not a valid integer",
+    "self = []": "where true or false belongs",
+    "white-background = 3": "where true or false belongs",
+    "log = 'csv:a.csv'": "where a list belongs",
+    "log = [['csv:a.csv']]": "where text or a number belongs",
+    'out = "\\u0000.ply"': "where text or a number belongs",
+    "max-drop = nan": "nan is not a number in a range",
+    "checkpoint-every = inf": "inf is not a number in a range",
+}
+
+
+@pytest.mark.parametrize("text", VALUES)
+def test_a_value_is_read_as_on_the_line(tmp_path, text):
+    (tmp_path / "a.toml").write_text(text)
+    words = [] if "out" in text else ["--out", "b.ply"]
+    result = run("finetune", "a.ply", *words, "--config", tmp_path / "a.toml")
+    assert result.exit_code == 2
+    assert VALUES[text] in " ".join(result.stderr.split())
+
+
+def test_a_list_of_a_config_file_is_an_option_given_several_times(tmp_path):
+    data, model, _ = tiny.scene(tmp_path)
+    (tmp_path / "a.toml").write_text(f"data = '{data}'\niters = 2\nlog = ['csv:{tmp_path}/a.csv']")
+    run_json("finetune", model, "--config", tmp_path / "a.toml", "--out", tmp_path / "a.ply")
+    assert len(rows(tmp_path / "a.csv")) == 2

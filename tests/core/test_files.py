@@ -3,6 +3,8 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import tracemalloc
+from pathlib import Path
 
 import pytest
 
@@ -133,6 +135,7 @@ def test_a_lock_whose_file_was_removed_meanwhile_is_no_lock(tmp_path):
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EIO])
 def test_where_there_are_no_locks_writing_goes_on_without(tmp_path, monkeypatch, number):
     def flock(*_):
+        in_flight(tmp_path / "a.txt", "lock").unlink()  # as another process without locks may do
         raise OSError(number, "no")
 
     monkeypatch.setattr(atomic.fcntl, "flock", flock)
@@ -184,3 +187,25 @@ def test_digest_is_sha256(tmp_path):
     content = os.urandom(3_000_000)
     (tmp_path / "x").write_bytes(content)
     assert digest(tmp_path / "x") == hashlib.sha256(content).hexdigest()
+
+
+def test_digest_holds_no_file_in_memory(tmp_path):
+    (tmp_path / "x").write_bytes(bytes(16 << 20))
+    tracemalloc.start()
+    digest(tmp_path / "x")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 << 20
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs a list of open files")
+def test_waiting_for_a_lock_leaves_no_file_open(tmp_path):
+    def waited():
+        with pytest.raises(OutputError), locked(tmp_path / "a.txt", wait=0.1):
+            pass
+
+    with locked(tmp_path / "a.txt"):
+        waited()
+        before = len(os.listdir("/proc/self/fd"))
+        waited()
+        assert len(os.listdir("/proc/self/fd")) == before

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import struct
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ from fragprune_plugins.injection.starting import _read_checkpoint
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import records, sidecar
 from fragprune_plugins.storage.ply import is_marked, read_ply, write_ply
-from fragprune_plugins.storage.reading import NESTING, Door
+from fragprune_plugins.storage.reading import NESTING, Door, parse_json
 from fragprune_plugins.types import View
 
 DOOR = Door(RecordError, "broken", "a file", "Write it again.", limit=100)
@@ -443,3 +444,35 @@ def test_checkpoints_are_loaded_by_the_safe_loader_alone():
     ]
     assert loads
     assert all("weights_only" in safe for _, safe in loads), loads
+
+
+@pytest.mark.parametrize(("asked", "given"), [(1 << 62, 3), (2 << 20, 2), (-1, 3), (None, 3)])
+def test_a_read_takes_no_more_memory_than_the_file_has_bytes_left(tmp_path, asked, given):
+    (tmp_path / "a").write_bytes(bytes(4 << 20))
+    with Door(RecordError, "broken", "a file", "Write it again.").reading(
+        tmp_path / "a"
+    ) as reading:
+        reading.skip(1 << 20)
+        tracemalloc.start()
+        content = reading.file.read(asked)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert len(content) == given << 20
+    assert peak < len(content) + (1 << 20)
+
+
+def test_a_pipe_that_takes_a_files_place_meanwhile_is_not_waited_for(tmp_path, monkeypatch):
+    pipe = tmp_path / "a"
+    os.mkfifo(pipe)
+    before = Path(__file__).stat()
+    monkeypatch.setattr(Path, "stat", lambda path, **_: before)  # as it was when it was looked at
+    with pytest.raises(RecordError, match="no regular file"), DOOR.reading(pipe):
+        pass
+
+
+@pytest.mark.parametrize("ends", [('{"a":', "}"), ("[", "]")])
+def test_objects_nest_as_deep_as_lists(ends):
+    begin, end = ends
+    parse_json(begin * (NESTING - 1) + "1" + end * (NESTING - 1))
+    with pytest.raises(ValueError, match=f"more than {NESTING} levels"):
+        parse_json(begin * NESTING + "1" + end * NESTING)

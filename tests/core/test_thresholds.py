@@ -368,3 +368,18 @@ def test_every_step_is_counted():
     for _ in range(3):
         store.step()
     assert store.steps == 3
+
+
+@pytest.mark.parametrize("key", ["logits", "exp_avg", "exp_avg_sq"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.int32])
+def test_a_state_of_another_type_is_refused(key, dtype):
+    state = ThresholdStore(3).state_dict()
+    state[key] = state[key].to(dtype)
+    with pytest.raises(SidecarError, match="float32"):
+        ThresholdStore(1).load_state_dict(state)
+
+
+def test_the_learning_rate_is_the_one_that_was_asked_for():
+    opacities = torch.tensor([0.5, 0.9])
+    store = ThresholdStore.from_alpha(0.02, opacities, lr=0.25)
+    assert store.optimizer.param_groups[0]["lr"] == 0.25

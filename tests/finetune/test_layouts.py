@@ -224,3 +224,50 @@ def test_copies_of_a_photograph_share_its_pixels(tmp_path, images):
     assert shot.image.shape == (3, tiny.SIDE, tiny.SIDE)
     shot.path.unlink()
     assert torch.equal(shot.to("cpu").image, shot.image)
+
+
+def test_images_of_one_name_in_two_folders_are_two_images(tmp_path, images):
+    """Cameras of a rig number their images alike: a held-out one holds out no other."""
+    names = [f"cam{number % 3}/{number // 3:03d}.png" for number in range(9)]
+    for name, image in zip(names, images, strict=True):
+        tiny.save_png(tmp_path / name, image)
+    content = tiny.transforms(names, tiny.cameras()) | {"w": tiny.SIDE, "h": tiny.SIDE}
+    content |= {"train_filenames": names[2:], "test_filenames": names[:1]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    data = load_dataset(tmp_path)
+    assert [str(shot.path.relative_to(tmp_path)) for shot in data.test] == names[:1]
+    assert [str(shot.path.relative_to(tmp_path)) for shot in data.train] == names[2:]
+
+
+def test_a_file_may_say_which_views_train_and_leave_the_rest_to_us(tmp_path, images):
+    listed = {"train_filenames": [f"images/{name}.png" for name in NAMES[:5]]}
+    data = load_dataset(write_nerfstudio(tmp_path, images, **listed))
+    assert stems(data.test) == NAMES[:1]
+    assert stems(data.train) == NAMES[1:5]
+
+
+def test_a_mask_of_another_aspect_is_refused(tmp_path, images):
+    tiny.write_colmap(tmp_path, images)
+    path = tmp_path / "masks" / "view03.png"
+    path.parent.mkdir()
+    Image.new("L", (tiny.SIDE, 2 * tiny.SIDE), 255).save(path)
+    shot = next(each for each in load_dataset(tmp_path).train if "view03" in each.name)
+    with pytest.raises(DatasetError, match=r"view03\.png: 32x64 pixels"):
+        _ = shot.image
+
+
+DEEP = {
+    "16 bits grey": ("PNG", np.full((tiny.SIDE, tiny.SIDE), 9000, np.uint16)),
+    "32 bits grey": ("TIFF", np.full((tiny.SIDE, tiny.SIDE), 9000, np.int32)),
+    "floats": ("TIFF", np.full((tiny.SIDE, tiny.SIDE), 0.5, np.float32)),
+}
+
+
+@pytest.mark.parametrize("kind", DEEP)
+def test_a_photograph_that_would_be_cut_to_8_bits_is_refused(tmp_path, images, kind):
+    """Pillow makes it white: a model would learn that without a word."""
+    tiny.write_colmap(tmp_path, images)
+    form, pixels = DEEP[kind]
+    Image.fromarray(pixels).save(tmp_path / "images" / "view03.png", format=form)
+    with pytest.raises(DatasetError, match=r"view03\.png: pixels of mode .*8 bits a channel"):
+        load_dataset(tmp_path)

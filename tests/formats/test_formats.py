@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import math
+import struct
+import zipfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -331,3 +334,47 @@ def test_values_that_cannot_be_drawn_are_refused(wrong, tmp_path):
     path.write_bytes(content if wrong == "positions" else content[:40])
     with pytest.raises(FragpruneError, match="NaN" if wrong == "positions" else "multiple"):
         load(path)
+
+
+def sog_with(path: Path, name: str, content: bytes, how: int) -> Path:
+    """A SOG with one image replaced, compressed in another way."""
+    save(path.with_name("good.sog"), Model(tiny.random_model(40), None))
+    with (
+        zipfile.ZipFile(path.with_name("good.sog")) as good,
+        zipfile.ZipFile(path, "w", how) as bomb,
+    ):
+        for each in good.namelist():
+            bomb.writestr(each, content if each == name else good.read(each))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [(zipfile.ZIP_BZIP2, "compression 12"), (zipfile.ZIP_DEFLATED, "64000000 bytes")],
+)
+def test_a_sog_that_unpacks_into_much_more_is_refused(tmp_path, how, words):
+    """Python's zipfile unpacks bzip2 at once, whatever size is asked for."""
+    bomb = sog_with(tmp_path / "bomb.sog", "means_l.webp", bytes(64_000_000), how)
+    assert bomb.stat().st_size < 100_000
+    with pytest.raises(ModelFileError, match=words):
+        load(bomb)
+
+
+def test_an_spz_that_unpacks_into_much_more_is_refused(tmp_path):
+    """190 KB of zeros would be 3,000,000 Gaussians of degree 3."""
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, 300_000, 3, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(300_000 * 65)))
+    with pytest.raises(ModelFileError, match="300000 Gaussians in"):
+        load(tmp_path / "a.spz")
+
+
+def test_a_glb_that_counts_from_the_end_is_refused(tmp_path):
+    save(tmp_path / "a.glb", Model(tiny.random_model(3), None))
+    content = (tmp_path / "a.glb").read_bytes()
+    opacity = b'"KHR_gaussian_splatting:OPACITY":4'
+    assert content.count(opacity) == 1
+    there = content.replace(opacity, opacity[:-1] + b"-5")  # one byte more, for one blank less
+    at = there.index(b"BIN\0") - 4
+    (tmp_path / "a.glb").write_bytes(there[: at - 1] + there[at:])
+    with pytest.raises(ModelFileError, match="negative numbers"):
+        load(tmp_path / "a.glb")

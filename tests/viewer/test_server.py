@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import http.client
+import socket
+import threading
 from threading import Thread
 
 import pytest
@@ -70,3 +72,33 @@ def test_the_page_of_another_site_reads_nothing(port):
 def test_a_port_that_is_taken(port):
     with pytest.raises(OutputError, match=r"127\.0\.0\.1"):
         serving.open_server(SITE, port)
+
+
+@pytest.mark.parametrize("path", ["http://[", "//[", "http://127.0.0.1/etc/passwd", "*", "/?/.."])
+def test_an_address_that_is_none_gets_an_answer_and_no_traceback(port, path, capfd):
+    assert ask(port, path)[0] in (200, 404)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_browser_that_goes_away_is_not_worth_a_word(capfd):
+    with serving.open_server({"index.html": bytes(64 << 20)}) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        for _ in range(3):
+            browser = socket.create_connection(server.server_address)
+            asked = f"GET / HTTP/1.1\r\nHost: localhost:{server.server_port}\r\n\r\n"
+            browser.sendall(asked.encode())
+            browser.recv(10)
+            browser.close()
+        assert ask(server.server_port, "/", "HEAD")[0] == 200
+        server.shutdown()
+        thread.join()
+    for thread in threading.enumerate():  # of the answers that nobody reads
+        if thread is not threading.current_thread():
+            thread.join(timeout=5)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_no_page_of_another_site_shows_a_photograph(port):
+    headers = ask(port, "/photographs/0000.jpg")[1]
+    assert headers["Cross-Origin-Resource-Policy"] == "same-origin"

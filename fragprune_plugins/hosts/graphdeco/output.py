@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.datasets.photographs import Photographs, Resolution
-from fragprune_plugins.errors import DatasetError, ModelFileError
+from fragprune_plugins.errors import DatasetError, ModelFileError, printable
 from fragprune_plugins.hosts.source import parsed
 from fragprune_plugins.storage.reading import MEBIBYTE, Door
 
@@ -92,18 +92,18 @@ def trained_on(model: Path) -> Photographs | None:
         log.warning(
             "%s was trained without --eval: it has seen the held-out views, so figures on them "
             "flatter it",
-            folder,
+            printable(str(folder)),
         )
     return photographs
 
 
 def _call(text: str) -> ast.Call:
-    """The one call that a text is."""
+    """The Namespace that a text is."""
     tree = parsed(text.strip())
     match tree.body if tree else []:
-        case [ast.Expr(value=ast.Call() as call)]:
+        case [ast.Expr(value=ast.Call(func=ast.Name(id="Namespace")) as call)]:
             return call
-    raise ValueError("no call")
+    raise ValueError("no Namespace(...)")
 
 
 def _resolution(asked: int) -> Resolution:

@@ -117,6 +117,8 @@ def _accessor(
     """The numbers of an accessor (N, width)."""
     accessor = scene["accessors"][index]
     view = scene["bufferViews"][accessor["bufferView"]]
+    if min(index, accessor["bufferView"]) < 0:
+        raise ValueError("negative numbers")
     kind, count = accessor["componentType"], accessor["count"]
     code, most = _KINDS[kind] if kind != _FLOAT else ("<f4", 1)
     if _WIDTHS[accessor["type"]] != width or "sparse" in accessor or view.get("buffer") != 0:

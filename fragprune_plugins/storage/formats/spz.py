@@ -56,6 +56,7 @@ _FRACTION_BITS = 12
 _COLOUR_SCALE = 0.15
 _LEVEL = 12  # of zstd, as Niantic's writer has it
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+_NAMED = 8  # extensions in a warning
 _SQRT_HALF = np.float32(0.5**0.5)
 
 
@@ -84,7 +85,8 @@ def read(reading: Reading) -> SplatFile:
     if header.antialiased:
         log.warning("SPZ: it was trained with antialiasing, and is drawn as 3DGS draws, without")
     if unknown := records.keys() - {CUTOFFS, _COORDINATES}:
-        log.warning("SPZ: skipped extension(s) %s", ", ".join(f"{each:#010x}" for each in unknown))
+        named = ", ".join(f"{each:#010x}" for each in sorted(unknown)[:_NAMED])
+        log.warning("SPZ: skipped %d extension(s): %s", len(unknown), named)
     splat = _splat(header, parts, records.get(CUTOFFS))
     return turned(splat, _axes(records.get(_COORDINATES)))
 

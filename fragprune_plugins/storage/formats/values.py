@@ -23,7 +23,7 @@ SH_C0 = 0.28209479177387814
 
 _ALPHA_EDGE = 1e-6  # an 8-bit opacity of 0 or 255 has no finite logit
 
-PER_BYTE = 16
+PER_BYTE = 1
 """Most Gaussians that a byte of a compressed file may stand for; of scenes it is a tenth of one."""
 
 log = logging.getLogger("fragprune")
