@@ -21,7 +21,7 @@ from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.engines.cost import Cost, work_of
-from fragprune_plugins.errors import AlignmentError, CheckpointError, SidecarError, UsageError
+from fragprune_plugins.errors import AlignmentError, CheckpointError, UsageError
 from fragprune_plugins.finetuning.resuming import Checkpoints, configuration
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
@@ -36,6 +36,7 @@ from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.storage import models
+from fragprune_plugins.storage.checkpoints import UNFIT
 from fragprune_plugins.storage.models import Model
 from fragprune_plugins.storage.ply import SplatFile
 from fragprune_plugins.types import RasterInputs, RasterOutputs
@@ -46,7 +47,6 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _MOMENTS = ("exp_avg", "exp_avg_sq")
-_UNFIT = (KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError)
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 _ROUNDS, _SECONDS = 7, 1.5  # at least, of timing frames for a target; a view's least time counts
 
@@ -339,7 +339,7 @@ class _Run:
             return
         try:
             self._load(tensors, values)
-        except (*_UNFIT, SidecarError) as error:
+        except UNFIT as error:
             raise CheckpointError(
                 str(checkpoints.path),
                 f"parts that do not fit together ({error})",
@@ -392,6 +392,8 @@ class _Run:
         for row in tensors["curves"].tolist():
             self.curves.append(StepStats(int(row[0]), *row[1:]))
         self.done = int(values["done"])
+        if not 0 <= self.done == self.stage.steps <= self.settings.iterations:
+            raise ValueError(f"{self.done} steps, of which the thresholds took {self.stage.steps}")
         self._started -= values["seconds"]
 
     def learn(self, progress: bool) -> None:

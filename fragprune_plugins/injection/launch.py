@@ -21,12 +21,14 @@ from typing import Any, Literal
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import (
+    CheckpointError,
     HostFailed,
     Interrupted,
     NotComparedError,
     SidecarError,
     Terminated,
     UsageError,
+    printable,
 )
 from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import ScriptAdapter
@@ -40,6 +42,9 @@ from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupt
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.storage.atomic import digest
+
+UNFINISHED = "stage2.fragprune-unfinished"
+"""The file of an unfinished stage 2, in the host's output folder."""
 
 log = logging.getLogger("fragprune")
 
@@ -316,7 +321,7 @@ class _Runner:
 
     def _going_on(self, start: Start) -> dict[str, Any]:
         """Options of a session that keeps an unfinished stage 2, and goes on from a kept one."""
-        from fragprune_plugins.finetuning.resuming import SUFFIX, Checkpoints, deciding, differences
+        from fragprune_plugins.finetuning.resuming import Checkpoints, deciding, differences
         from fragprune_plugins.plugins.hooks import schedule_for
         from fragprune_plugins.storage import checkpoints
 
@@ -333,12 +338,20 @@ class _Runner:
             "schedule": schedule_for(options.settings, self.plugins).as_dict(),
             **options.settings.as_dict(),
         }
-        kept = Checkpoints(self.output / f"stage2{SUFFIX}", seconds, tell=log.warning)
+        kept = Checkpoints(self.output / UNFINISHED, seconds, tell=log.warning)
         unfinished = None
         if not options.again and kept.path.exists():
             tensors, values = checkpoints.load(kept.path)
             if differ := ", ".join(differences(values.get("configuration", {}), asked)):
-                log.warning("the unfinished stage 2 had other %s; it begins anew", differ)
+                said = printable(differ)
+                log.warning("the unfinished stage 2 had other %s; it begins anew", said)
+            elif values.get("step") not in range(1, options.settings.iterations + 1):
+                raise CheckpointError(
+                    str(kept.path),
+                    f"step {values.get('step')!r:.40}",
+                    "what a stage 2 of this host wrote",
+                    "Begin anew with --again.",
+                )
             else:
                 unfinished = tensors, values
                 log.info(
@@ -425,6 +438,8 @@ class _Runner:
                 f"{self.host.line.spellings('resume')[-1]} {saved} in the host's command. Without "
                 "that flag, stage 2 starts again."
             )
+            if self.output is not None and (self.output / UNFINISHED).exists():
+                again = "With --stage finetune, stage 2 goes on from its last checkpoint."
         return stated(self.host.script.name, found, "a run that reaches its end", again)
 
     def summary(self, seconds: float) -> RunSummary:

@@ -20,6 +20,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import CheckpointError
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.storage.checkpoints import UNFIT
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")
@@ -33,7 +34,15 @@ def between_steps(session: SessionState, model: Any, state: ModelState) -> None:
         return
     if session.unfinished is not None:
         if state.steps == state.replayed:
-            _restore(session, model, state, *session.unfinished)
+            try:
+                _restore(session, model, state, *session.unfinished)
+            except UNFIT as error:
+                raise CheckpointError(
+                    str(session.kept.path),
+                    f"parts that do not fit together ({error})",
+                    "what a stage 2 of this host wrote",
+                    "Begin anew with --again.",
+                ) from error
             session.unfinished = None
             log.info("stage 2 goes on after step %d", state.steps)
     elif state.steps and session.kept.due(state.steps):

@@ -23,6 +23,7 @@ Train = Literal["opacity", "appearance", "all"]
 
 FINETUNE_ITERATIONS = 5000
 QUICK_ITERATIONS = 1000
+ITERATIONS_MAX = 10**9
 _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
 
 
@@ -88,8 +89,9 @@ class Settings:
     nonfinite: Literal["stop", "skip"] = "stop"
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise UsageError("iterations", str(self.iterations), "1 or more", "Raise --iters.")
+        if not 1 <= self.iterations <= ITERATIONS_MAX:
+            found, most = str(self.iterations)[:20], f"{ITERATIONS_MAX:,}"
+            raise UsageError("iterations", found, f"1 to {most}", "Choose another --iters.")
         if self.pressure is not None and not 0 <= self.pressure < 1:
             raise UsageError(
                 "pressure", f"{self.pressure:g}", "0 <= X < 1 (1e-4 is usual)", "Change --pressure."

@@ -75,6 +75,19 @@ _Picture = tuple[Hashable, int]
 """A view, and the part of it."""
 
 
+def _put(thing: object, values: Mapping[str, Any]) -> None:
+    """Set attributes of an object; raises ValueError if one is of another kind than it was."""
+    for name, value in values.items():
+        was = vars(thing).get(name, "none")
+        if isinstance(was, int):  # a count, or a bool
+            fits = type(value) is type(was) and value >= 0
+        else:
+            fits = isinstance(value, list if isinstance(was, list) else int | float | None)
+        if isinstance(was, str) or not fits:
+            raise ValueError(f"{name}: {value!r:.40}")
+        setattr(thing, name, value)
+
+
 def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
     """The store's own, none while it is neutral."""
     return None if store.neutral else store.values
@@ -441,6 +454,7 @@ class Stage2:
 
         Raises:
             SidecarError: the thresholds' parts do not fit together, or are not finite.
+            ValueError: a plain value is none that ``state_dict`` gives.
         """
         adam_step, steps = plain["store"]
         self.store.load_state_dict({**tensors, "adam_step": adam_step, "steps": steps})
@@ -448,11 +462,10 @@ class Stage2:
         for name, figures in (("before", self._before), ("after", self._after)):
             for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):
                 figures[views[view], part] = figure
-        for name in _COUNTED:
-            setattr(self, name, plain[name])
+        _put(self, {name: plain[name] for name in _COUNTED})
         self._seen = Ratios(self._seen)
-        self._views.expected = plain["expected"]
-        vars(self.pressure).update(plain["pressure"])
+        _put(self._views, {"expected": plain["expected"]})
+        _put(self.pressure, plain["pressure"])
 
     def _count(self, outputs: RasterOutputs) -> Tensor:
         fragments = outputs.fragments_per_pixel.detach().reshape(1)

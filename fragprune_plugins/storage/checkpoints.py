@@ -9,12 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import CheckpointError
+from fragprune_plugins.errors import CheckpointError, SidecarError
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.storage.atomic import replacing
 from fragprune_plugins.storage.reading import Door, parse_json
 
 FORMAT = "fragprune-checkpoint-1"
+UNFIT = (
+    *(KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError, OverflowError),
+    SidecarError,
+)
+"""What is raised where the parts of a checkpoint do not fit what they are loaded into."""
+
 _REMEDY = "Remove it, or begin anew with --again."
 _DOOR = Door(CheckpointError, "unreadable", f"a file of format {FORMAT}", _REMEDY)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import shutil
@@ -13,9 +14,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from miniatures.runs import OPTIONS, command
+from miniatures.mcmc import MCMCHost
+from miniatures.mini_splatting import MiniSplattingHost
+from miniatures.runs import OPTIONS, command, written
 from miniatures.vanilla_3dgs import HOST
 
+from adapters import test_mini_splatting as mini_splatting
+from fragprune_plugins.errors import CheckpointError
 from fragprune_plugins.injection import launch, stepping
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import checkpoints, models
@@ -26,22 +31,22 @@ FINETUNE = replace(
 )
 KEPT = "stage2.fragprune-unfinished"
 KILLED = """
-import os, signal, sys
-sys.path[:0] = sys.argv[2:4]
+import sys
+sys.path[:0] = sys.argv[3:5]
 from adapters import test_resuming
-test_resuming.kill_at(int(sys.argv[1]))
-test_resuming.launch.run(sys.argv[4:], test_resuming.FINETUNE)
+test_resuming.kill_at(*map(int, sys.argv[1:3]))
+test_resuming.launch.run(sys.argv[5:], test_resuming.FINETUNE)
 """
 
 
-def kill_at(step):
-    """SIGKILL this process when a step is reported."""
+def kill_at(step, number):
+    """Send this process a signal when a step is reported."""
     report = stepping.report
 
     def killing(session, stats):
         report(session, stats)
         if stats.step == step:
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), number)
 
     stepping.report = killing
 
@@ -63,15 +68,21 @@ def again(trained, folder, *more):
     return target, command(HOST / "train.py", scene, target, 20, *more)
 
 
-def killed(words, step):
+def ended(words, step, number):
+    """The output of a stage 2 that got a signal at a step."""
     tests = Path(__file__).parents[1]
-    done = subprocess.run(
-        [sys.executable, "-c", KILLED, str(step), str(tests), str(tests.parent), *words],
+    words = [str(step), str(int(number)), str(tests), str(tests.parent), *words]
+    return subprocess.run(
+        [sys.executable, "-c", KILLED, *words],
         capture_output=True,
         text=True,
         cwd=tests.parent,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
+
+
+def killed(words, step):
+    done = ended(words, step, signal.SIGKILL)
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
@@ -144,3 +155,75 @@ def test_without_a_wish_for_it_nothing_is_kept(trained, tmp_path, monkeypatch):
     launch.run(words, replace(FINETUNE, checkpoint_every=0))
     assert seen == [False] * 12
     assert not (out / KEPT).exists()
+
+
+def test_after_sigterm_the_model_is_there_and_the_same_command_goes_on(trained, tmp_path):
+    whole, words = again(trained, tmp_path / "whole")
+    launch.run(words, FINETUNE)
+    out, words = again(trained, tmp_path / "ended")
+    done = ended(words, 5, signal.SIGTERM)
+    assert "[terminated]" in done.stderr
+    assert "goes on from its last checkpoint" in done.stderr
+    learned = out / "point_cloud/iteration_25/point_cloud.ply"
+    assert not models.load(learned).thresholds.neutral
+    assert checkpoints.load(out / KEPT)[1]["step"] in (4, 5)
+    launch.run(words, FINETUNE)
+    expect_same(result(whole), result(out))
+    assert not (out / KEPT).exists()
+    assert learned.exists()  # a result of its own
+
+
+def of_mcmc(folder, scene, out, *more):
+    script = written(MCMCHost, folder) / "train.py"
+    return command(script, scene, out, 20, "--noise_lr", 5e7, "--cap_max", 170, *more)
+
+
+def of_mini_splatting(folder, scene, out, *more):
+    return mini_splatting.command(written(MiniSplattingHost, folder), "gs", scene, out, 20, *more)
+
+
+@pytest.mark.parametrize(
+    "words_of", [of_mcmc, pytest.param(of_mini_splatting, marks=pytest.mark.slow)]
+)
+def test_other_hosts_go_on_to_the_same_bits(words_of, photographs, tmp_path):
+    out, kept = tmp_path / "out", tmp_path / "kept"
+    words = words_of(tmp_path / "host", photographs, out)
+    launch.run([*words, "--checkpoint_iterations", "20"], replace(OPTIONS, stage="off"))
+    shutil.copytree(out, kept)
+    launch.run(words, FINETUNE)
+    whole = result(out)
+    shutil.rmtree(out)
+    shutil.copytree(kept, out)
+    killed(words, 5)
+    done = ended(words, 9, signal.SIGTERM)
+    assert "[terminated]" in done.stderr
+    assert checkpoints.load(out / KEPT)[1]["step"] in (8, 9)
+    launch.run(words, FINETUNE)
+    expect_same(whole, result(out))
+
+
+@pytest.fixture(scope="module")
+def unfinished(trained, tmp_path_factory):
+    """The folder of a stage 2 that was killed, its command, and the checkpoint's content."""
+    out, words = again(trained, tmp_path_factory.mktemp("unfinished"))
+    killed(words, 3)
+    return out, words, (out / KEPT).read_bytes()
+
+
+@pytest.mark.parametrize("how", ["another shape", "no part", "step 1000", "step null", "a word"])
+def test_a_forged_checkpoint_is_stated(unfinished, how):
+    out, words, content = unfinished
+    (out / KEPT).write_bytes(content)
+    tensors, values = checkpoints.load(out / KEPT)
+    if how == "another shape":
+        name = next(name for name in tensors if name.startswith("host."))
+        tensors[name] = tensors[name][:5]
+    elif how == "no part":
+        del tensors["curves"]
+    elif how == "a word":
+        values["stage"]["steps"] = "two"
+    else:
+        values["step"] = json.loads(how.removeprefix("step "))
+    checkpoints.save(out / KEPT, tensors, values)
+    with pytest.raises(CheckpointError, match="unfinished"):
+        launch.run(words, FINETUNE)

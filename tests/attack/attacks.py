@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,7 @@ from typing import Any
 import torch
 from attack import hostile
 from attack.running import Outcome, Result, command, in_child, judged, raised
+from attack.surfaces import SURFACES
 from finetune import tiny
 from fuzz.readers import READERS
 from fuzz.running import run as fuzz
@@ -715,4 +717,5 @@ ATTACKS: dict[str, Callable[[Options], Result]] = {
     "SIGKILL while a pair is saved over a pair": kills_while_saving,
     "plugins that raise, exit or answer nonsense": plugins,
     "commands without a network": network,
+    **{name: partial(act, fresh=fresh, words=commands) for name, act in SURFACES.items()},
 }

@@ -207,6 +207,7 @@ VALUES = {
     "iters = [1]": "where one value belongs",
     "iters = true": "where one value belongs",
     "iters = inf": "not a valid integer",
+    "iters = 1" + 400 * "0": "expected 1 to 1,000,000,000",
     "iters = {a = 1}": "where text or a number belongs",
     "iters = 1979-05-27": "where text or a number belongs",
     "seed = 1e400": "not a valid integer",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 
@@ -268,6 +269,13 @@ def spoil(path, how):
         save_file(tensors, path, metadata={"format": files.FORMAT, "values": "{}"})
     elif how == "words for numbers":
         files.save(path, tensors, values | {"done": "many"})
+    elif how == "doubles":
+        files.save(path, tensors | {"exp_avg": tensors["exp_avg"].double()}, values)
+    else:
+        name, word = how.split(": ")
+        inner = values["pressure"] if name.startswith("pressure.") else values
+        inner[name.removeprefix("pressure.")] = json.loads(word)
+        files.save(path, tensors, values)
 
 
 @pytest.mark.parametrize(
@@ -283,6 +291,14 @@ def spoil(path, how):
         "fewer thresholds",
         "not a number",
         "words for numbers",
+        "doubles",
+        "done: 1000",
+        'steps: "x"',
+        "steps: -1",
+        "_open: null",
+        "_median: {}",
+        "_seen: 3",
+        "pressure.observe: 3",
     ],
 )
 def test_a_broken_checkpoint_is_stated(model, dataset, tmp_path, monkeypatch, how):
