@@ -382,10 +382,13 @@ class _Run:
         self.stage.load_state_dict(tensors, values)
         if len(self.stage.store) != len(self.model):
             raise ValueError(f"{len(self.stage.store)} thresholds of {len(self.model)} Gaussians")
+        adam_step, seconds = values["adam_step"], values["seconds"]
+        if min(adam_step, seconds) < 0:
+            raise ValueError(f"{adam_step} steps in {seconds} seconds")
         for name in self.rates:
             parameter = getattr(self.model, name)
             parameter.data.copy_(tensors[f"model.{name}"])
-            state: dict[str, Tensor] = {"step": torch.tensor(values["adam_step"])}
+            state: dict[str, Tensor] = {"step": torch.tensor(float(adam_step))}
             for moment in _MOMENTS:
                 state[moment] = torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
             self.optimizer.state[parameter] = state
@@ -394,7 +397,7 @@ class _Run:
         self.done = int(values["done"])
         if not 0 <= self.done == self.stage.steps <= self.settings.iterations:
             raise ValueError(f"{self.done} steps, of which the thresholds took {self.stage.steps}")
-        self._started -= values["seconds"]
+        self._started -= seconds
 
     def learn(self, progress: bool) -> None:
         """All steps that are not done yet."""
