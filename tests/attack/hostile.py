@@ -404,11 +404,26 @@ def png(width: int, height: int) -> bytes:
 
 def images() -> dict[str, bytes]:
     """Photographs of a scene, in place of one."""
-    out = io.BytesIO()
-    Image.fromarray(np.zeros((32, 32, 3), np.uint8)).save(out, format="PNG")
-    good = out.getvalue()
+
+    def saved(picture: Image.Image, form: str = "PNG", **how: Any) -> bytes:
+        out = io.BytesIO()
+        picture.save(out, format=form, **how)
+        return out.getvalue()
+
+    plain, size = Image.fromarray(np.zeros((32, 32, 3), np.uint8)), (32, 32)
+    good = saved(plain)
     return {
         GOOD + "as it is": good,
+        GOOD + "CMYK": saved(Image.new("CMYK", size, (10, 20, 30, 40)), "JPEG"),
+        GOOD + "a palette": saved(plain.convert("P"), transparency=0),
+        GOOD + "grey and alpha": saved(Image.new("LA", size, (90, 128))),
+        GOOD + "one bit": saved(Image.new("1", size, 1)),
+        GOOD + "two frames": saved(plain, "WEBP", save_all=True, append_images=[plain]),
+        GOOD + "EXIF of nonsense": saved(plain, "JPEG", exif=b"Exif\0\0MM\0*" + b"\xff" * 500),
+        "16 bits grey": saved(Image.fromarray(np.full(size, 9000, np.uint16))),
+        "32 bits grey": saved(Image.fromarray(np.full(size, 9000, np.int32)), "TIFF"),
+        "floats": saved(Image.fromarray(np.full(size, 0.5, np.float32)), "TIFF"),
+        "a side of 16 million": png(1 << 24, 8),
         "nothing": b"",
         "half": good[: len(good) // 2],
         "no picture": b"not a picture",

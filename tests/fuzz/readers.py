@@ -9,17 +9,19 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import click
 import torch
 from finetune import tiny
 from fuzz import seeds
 from miniatures.vanilla_3dgs import HOST
 
-from fragprune_plugins.cli import report
+from fragprune_plugins.cli import finetune, report
 from fragprune_plugins.datasets import colmap
 from fragprune_plugins.datasets.cameras import load_cameras
 from fragprune_plugins.datasets.dataset import Photograph
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cost import UNITS, Cost
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.graphdeco.output import trained_on
 from fragprune_plugins.hosts.preflight import missing_imports
@@ -143,6 +145,21 @@ def _image(file: Path) -> None:
     _sound("a picture of another size", picture.shape == (3, tiny.SIDE, tiny.SIDE))
 
 
+def _mask(file: Path) -> None:
+    good = next((seeds.CORPUS / "image").glob("a.png"))
+    picture = Photograph("a", _view(), good, mask=file).image
+    _sound("a picture of another size", picture.shape == (3, tiny.SIDE, tiny.SIDE))
+
+
+def _settings(file: Path) -> None:
+    words = ["m.ply", "--out", "o.ply", "--config", str(file)]
+    try:
+        finetune.command.make_context("finetune", words)
+    except click.UsageError as error:  # the command prints it, and ends with 2
+        found = error.format_message()
+        raise UsageError("--config", found, "options", "Check the file.") from error
+
+
 def _checkpoint(file: Path) -> None:
     resumed_at(Vanilla3DGS().command_line(HostRepo(HOST)), file)
 
@@ -222,6 +239,8 @@ READERS = [
     Reader("cameras.json", _views),
     Reader("record", _record),
     Reader("image", _image),
+    Reader("mask", _mask),
+    Reader("settings", _settings),
     Reader("checkpoint", _checkpoint),
     Reader("progress", _progress),
     Reader("source", _source),

@@ -56,6 +56,14 @@ _ARGUMENTS = (
     b"resolution=-1, white_background=False, data_device='cuda', eval=True)"
 )
 
+_SETTINGS = b"""iters = 300
+train = "opacity"
+log = ["csv:a.csv"]
+no-truncation = true
+pressure = 1e-3
+images = "images_2"
+"""
+
 GAUSSIANS = 3
 VIEWS = 3
 
@@ -266,6 +274,8 @@ def make() -> dict[str, dict[str, bytes]]:
                 "a.webp": _image("WEBP"),
                 "a.tiff": _image("TIFF"),
             },
+            "mask": {"a.png": _image("PNG"), "alpha.png": _image("PNG", "RGBA")},
+            "settings": {"a.toml": _SETTINGS},
             "checkpoint": {"a.pth": _checkpoint(folder)},
             "progress": {"a.safetensors": _progress(folder)},
             "source": {"renderer.py": _RENDERER},

@@ -1,0 +1,39 @@
+"""Commands in processes without streams, letters, or a folder to stand in."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from fragprune_spark import MODULE
+
+
+def bridge(out, **how):
+    words = [sys.executable, "-m", "fragprune_plugins", "bridge", "spark", "--out", str(out)]
+    return subprocess.run(words, capture_output=True, timeout=100, **how)
+
+
+@pytest.mark.parametrize("numbers", [(0,), (1,), (2,), (0, 1, 2)])
+def test_a_file_never_takes_the_place_of_a_closed_stream(tmp_path, numbers):
+    done = bridge(tmp_path, preexec_fn=lambda: [os.close(number) for number in numbers])
+    assert done.returncode == 0
+    assert (tmp_path / MODULE.name).read_bytes() == MODULE.read_bytes()
+
+
+def test_letters_that_a_stream_cannot_write_become_escapes(tmp_path):
+    done = bridge(tmp_path / "\u2192", env=os.environ | {"PYTHONIOENCODING": "latin-1"})
+    assert done.returncode == 0
+    assert b"\\u2192" in done.stdout
+    assert (tmp_path / "\u2192" / MODULE.name).exists()
+
+
+def test_a_folder_that_is_gone_is_stated(tmp_path):
+    here = tmp_path / "here"
+    here.mkdir()
+    done = bridge(tmp_path / "out", cwd=here, preexec_fn=here.rmdir)
+    assert done.returncode == 1
+    assert done.stderr.startswith(b"[path]")
+    assert b"Traceback" not in done.stderr
