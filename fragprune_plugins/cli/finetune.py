@@ -14,7 +14,6 @@ from fragprune_plugins.cli.common import (
     MODEL,
     TRAINED_ON,
     Command,
-    Number,
     OutFile,
     Report,
     config_option,
@@ -27,7 +26,7 @@ from fragprune_plugins.cli.common import (
     photographs_for,
     require_place,
 )
-from fragprune_plugins.cli.learning import learning_options
+from fragprune_plugins.cli.learning import learning_options, resuming_options
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.ranks import Ranks, joined, launched
@@ -119,18 +118,9 @@ def _share(
     is_flag=True,
     help="Leave out Gaussians that reach no pixel of any training or held-out view.",
 )
-@click.option(
-    "--checkpoint-every",
-    "every",
-    type=Number(min=0),
-    default=300.0,
-    show_default=True,
-    metavar="SECONDS",
-    help="Keep the unfinished fine-tuning in OUT.fragprune-unfinished; 0 keeps it at Ctrl-C and "
+@resuming_options(
+    "Keep the unfinished fine-tuning in OUT.fragprune-unfinished; 0 keeps it at Ctrl-C and "
     "SIGTERM only.",
-)
-@click.option(
-    "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
 )
 @engine_options
 @one_voice()

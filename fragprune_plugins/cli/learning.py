@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.cli.common import Number
+from fragprune_plugins.cli.common import Number, together
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE, PORTABLE_ELASTICITY
 from fragprune_plugins.learning.schedule import (
@@ -158,3 +158,27 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(*args, settings=settings, **kwargs)
 
     return functools.reduce(lambda f, option: option(f), reversed(_OPTIONS), with_settings)
+
+
+def resuming_options(kept: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The options of a stage 2 that goes on after a kill.
+
+    Args:
+        kept: the help of ``--checkpoint-every``: where an unfinished stage 2 is kept.
+    """
+    return together(
+        click.option(
+            "--checkpoint-every",
+            "every",
+            type=Number(min=0),
+            default=300.0,
+            show_default=True,
+            metavar="SECONDS",
+            help=kept,
+        ),
+        click.option(
+            "--again",
+            is_flag=True,
+            help="Begin stage 2 anew, though it is finished or there is a checkpoint.",
+        ),
+    )

@@ -13,7 +13,6 @@ import click
 from fragprune_plugins.cli.common import (
     JSON,
     Command,
-    Number,
     Report,
     bound_threads,
     config_option,
@@ -23,7 +22,7 @@ from fragprune_plugins.cli.common import (
     open_engine,
     threads_option,
 )
-from fragprune_plugins.cli.learning import learning_options
+from fragprune_plugins.cli.learning import learning_options, resuming_options
 from fragprune_plugins.errors import FragpruneError, UsageError
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.storage import records
@@ -76,18 +75,8 @@ _CONTROL = (
     show_default=True,
     help="Compare before and after on the views that the host holds out (--eval).",
 )
-@click.option(
-    "--again", is_flag=True, help="finetune: learn again, though the result is there already."
-)
-@click.option(
-    "--checkpoint-every",
-    "every",
-    type=Number(min=0),
-    default=300.0,
-    show_default=True,
-    metavar="SECONDS",
-    help="Keep an unfinished stage 2 in stage2.fragprune-unfinished in the output folder; "
-    "0 keeps none.",
+@resuming_options(
+    "Keep an unfinished stage 2 in stage2.fragprune-unfinished in the output folder; 0 keeps none."
 )
 @click.pass_context
 def command(
