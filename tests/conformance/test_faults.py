@@ -139,7 +139,7 @@ class Misread(GaussianSplatting):
         (invariants.freeze, Resetting, GsplatHost, "reset opacity changed opacities"),
         (invariants.alignment, Inheriting, GsplatHost, "two rows have the moments of one"),
         (invariants.neutral_is_the_host, Littering, GsplatHost, "became"),
-        (invariants.model_file, Unexported, GsplatHost, "no seam for SAVE"),
+        (invariants.model_file, Unexported, GsplatHost, "no sidecar was written"),
         (invariants.freeze, Skipping, GaussianSplattingHost, "0 threshold steps of 4"),
         (invariants.alignment, Untraced, GaussianSplattingHost, "one per threshold"),
         (invariants.refuse, Misread, GaussianSplattingHost, "takes one value more"),
