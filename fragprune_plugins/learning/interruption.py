@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
 EXIT_CODE = 128 + signal.SIGTERM
 """Exit code that a shell reports for a process which SIGTERM ended: 143."""
+
+_AFTER_A_FINALIZER = 0.02  # seconds
 
 
 class Terminate(KeyboardInterrupt):
@@ -21,6 +24,7 @@ class Terminate(KeyboardInterrupt):
 def sigterm_interrupts() -> Iterator[None]:
     """Raise ``Terminate`` on the first SIGTERM inside the block, and ignore later ones.
 
+    Python drops an exception that a signal raises inside a finalizer. It is raised again after that.
     Outside the main thread, or if SIGTERM is already ignored, the block changes nothing.
     """
     before = signal.getsignal(signal.SIGTERM)
@@ -28,7 +32,7 @@ def sigterm_interrupts() -> Iterator[None]:
     if not main or before in (None, signal.SIG_IGN):
         yield
         return
-    process = os.getpid()
+    process, unraisable = os.getpid(), sys.unraisablehook
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if os.getpid() != process:  # a worker that was forked off: it has nothing to save
@@ -36,10 +40,21 @@ def sigterm_interrupts() -> Iterator[None]:
         signal.signal(number, signal.SIG_IGN)
         raise Terminate
 
+    def dropped(report: sys.UnraisableHookArgs) -> None:
+        if not isinstance(report.exc_value, Terminate):
+            return unraisable(report)
+        signal.signal(signal.SIGTERM, interrupt)
+        again = threading.Timer(_AFTER_A_FINALIZER, signal.raise_signal, (signal.SIGTERM,))
+        again.daemon = True
+        again.start()
+
     signal.signal(signal.SIGTERM, interrupt)
+    sys.unraisablehook = dropped
     try:
         yield
     finally:
+        if sys.unraisablehook is dropped:
+            sys.unraisablehook = unraisable
         signal.signal(signal.SIGTERM, before)
 
 

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
+import time
 
 import pytest
 
@@ -113,3 +115,20 @@ def test_between_steps_in_another_thread_than_the_main_one_changes_nothing():
     thread.start()
     thread.join()
     assert seen == [signal.default_int_handler]
+
+
+def test_sigterm_inside_a_finalizer_is_not_lost():
+    """Python drops what a finalizer raises."""
+
+    class Released:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+            time.sleep(0)  # the handler runs here at the latest
+
+    before = sys.unraisablehook
+    with pytest.raises(Terminate), sigterm_interrupts():
+        released = Released()
+        del released
+        while True:
+            time.sleep(0.001)
+    assert sys.unraisablehook is before
