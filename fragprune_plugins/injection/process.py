@@ -113,11 +113,15 @@ def run_main(script: Path, module: str = "") -> None:
             ) from error
 
 
+_ENVIRONMENT = {"site-packages", "dist-packages"}
+
+
 def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) -> None:
     """Drop the host's own modules, so that its script can run again from the start.
 
     Args:
-        root: the checkout's folder. Packages of an environment inside it are kept.
+        root: the host's folder, itself perhaps part of an environment. Packages of an environment
+            that is this folder, or inside it, are kept.
         known: names of modules that were imported before the host ran.
         packages: import names of an installed host; its compiled modules are kept.
     """
@@ -126,7 +130,9 @@ def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) 
         if name.split(".")[0] in packages:
             own = not file or file.endswith(".py")
         else:
-            own = file != "" and Path(file).is_relative_to(root) and "site-packages" not in file
+            own = Path(file).is_relative_to(root) and _ENVIRONMENT.isdisjoint(
+                Path(file).relative_to(root.parent).parts
+            )
         if own:
             del sys.modules[name]
     gc.collect()  # closes objects of module globals, such as the viewer's socket

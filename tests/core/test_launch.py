@@ -77,6 +77,22 @@ def test_modules_of_an_installed_host_are_forgotten_and_its_compiled_ones_kept(
     assert {"toy._C", "other"} <= sys.modules.keys()
 
 
+def test_modules_of_a_host_within_an_environment_are_forgotten(tmp_path, monkeypatch):
+    """The demo's host is one, where fragprune is installed from a wheel."""
+    root = tmp_path / "site-packages" / "fragprune_plugins" / "demo" / "host"
+    files = {
+        "toy_scene": root / "toy_scene.py",
+        "toy_library": root / ".venv/lib/python3/site-packages/toy_library.py",
+        "toy_neighbour": root.parent / "toy_neighbour.py",
+    }
+    for name, file in files.items():
+        module = ModuleType(name)
+        module.__file__ = str(file)
+        monkeypatch.setitem(sys.modules, name, module)
+    forget_modules(root, sys.modules.keys() - files.keys())
+    assert [name for name in files if name in sys.modules] == ["toy_library", "toy_neighbour"]
+
+
 def test_any_spelling_of_a_flag_is_read_and_the_last_is_written(tmp_path):
     line = replace(
         Vanilla3DGS().command_line(skeleton(tmp_path)),

@@ -31,7 +31,9 @@
 #define FRAGPRUNE_NEUTRAL_LOGIT -30.0
 #define FRAGPRUNE_MARGINAL_MIN 0.05
 
-#if defined(__GNUC__)
+#if defined(_WIN32)
+#define FRAGPRUNE_EXPORT __declspec(dllexport)
+#elif defined(__GNUC__)
 #define FRAGPRUNE_EXPORT __attribute__((visibility("default")))
 #else
 #define FRAGPRUNE_EXPORT

@@ -1,5 +1,7 @@
 """The cpu engine on 64-bit ARM: cross-compiled, run under an emulator, beside the build of here.
 
+The numbers are compared for the program's own copy of the engine, and for the library of a wheel.
+
 Debian: apt install g++-aarch64-linux-gnu qemu-user. Instructions are counted, since an emulator's
 time says nothing:
 
@@ -8,9 +10,12 @@ time says nothing:
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
+import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -71,13 +76,63 @@ def test_any_call_holds_what_it_promises(arm):
     assert tally["calls"] >= 200
 
 
-def test_pictures_and_gradients_are_those_of_the_build_of_here(arm, here):
-    numbers = {}
-    for name, before, toolchain in (("arm", [EMULATOR], arm), ("here", [], here)):
-        program = toolchain.program("arm/numbers.cpp", "baseline", ("-static",))
-        file = toolchain.folder / "numbers.bin"
-        run(*before, program, file, 0, SCENES)
-        numbers[name] = arrays(file)
+def numbers_of(program: Path, *before: object) -> list[np.ndarray]:
+    """What a program draws and differentiates."""
+    file = program.with_suffix(".bin")
+    run(*before, program, file, 0, SCENES)
+    return arrays(file)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The unpacked wheel for 64-bit ARM, built as docs/how-to/wheels.md says."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    files = subprocess.check_output(["git", "ls-files", "-z"], cwd=building.ROOT, text=True)
+    for name in filter(None, files.split("\0")):
+        if not name.startswith(("tests/", "docs/")):
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(building.ROOT / name, source / name)
+    platform = {"CXX": COMPILER, "_PYTHON_HOST_PLATFORM": "linux-aarch64"}
+    subprocess.run(
+        [sys.executable, "setup.py", "-q", "bdist_wheel", "-d", str(folder)],
+        cwd=source,
+        env=os.environ | platform,
+        check=True,
+        capture_output=True,
+        timeout=240,
+    )
+    (made,) = folder.glob("*-py3-none-linux_aarch64.whl")
+    with zipfile.ZipFile(made) as content:
+        content.extractall(folder / "installed")
+    return folder / "installed"
+
+
+def test_a_wheel_holds_one_library_for_arm(wheel):
+    (library,) = wheel.rglob("*.so")
+    assert library.name == "_cpu_baseline.so"
+    head = library.read_bytes()[:20]
+    assert head[:6] == b"\x7fELF\x02\x01"  # 64 bits, little-endian
+    assert head[16:] == b"\x03\x00\xb7\x00"  # a shared object, AArch64
+    code = run("aarch64-linux-gnu-objdump", "-d", library)
+    assert len(re.findall(r"\tfmla\tv\d+\.4s", code)) > 100  # four floats at once
+
+
+@pytest.mark.parametrize("linked", ["engine", "wheel"])
+def test_pictures_and_gradients_are_those_of_the_build_of_here(arm, here, linked, request):
+    if linked == "engine":
+        program = arm.program("arm/numbers.cpp", "baseline", ("-static",))
+    else:
+        (library,) = request.getfixturevalue("wheel").rglob("*.so")
+        program = arm.folder / "numbers_of_wheel"
+        includes = [f"-I{building.ROOT / 'fragprune_plugins/native/include'}"]
+        includes += [f"-I{building.TESTS / 'sanitize'}", f"-Wl,-rpath,{library.parent}"]
+        source = HERE / "numbers.cpp"
+        run(COMPILER, "-std=c++17", "-O2", *includes, source, library, "-o", program)
+    numbers = {
+        "arm": numbers_of(program, EMULATOR, "-L", "/usr/aarch64-linux-gnu"),
+        "here": numbers_of(here.program("arm/numbers.cpp", "baseline", ("-static",))),
+    }
     assert list(map(len, numbers["arm"])) == list(map(len, numbers["here"]))
     apart: dict[str, list[float]] = {name: [] for name in NAMES}
     for k, (a, b) in enumerate(zip(numbers["arm"], numbers["here"], strict=True)):
