@@ -24,7 +24,7 @@ class Terminate(KeyboardInterrupt):
 def sigterm_interrupts() -> Iterator[None]:
     """Raise ``Terminate`` on the first SIGTERM inside the block, and ignore later ones.
 
-    Python drops an exception that a signal raises inside a finalizer. It is raised again after that.
+    Python drops an exception that a signal raises inside a finalizer; then it is raised again.
     Outside the main thread, or if SIGTERM is already ignored, the block changes nothing.
     """
     before = signal.getsignal(signal.SIGTERM)

@@ -125,10 +125,13 @@ def test_sigterm_inside_a_finalizer_is_not_lost():
             signal.raise_signal(signal.SIGTERM)
             time.sleep(0)  # the handler runs here at the latest
 
-    before = sys.unraisablehook
-    with pytest.raises(Terminate), sigterm_interrupts():
-        released = Released()
-        del released
+    @sigterm_interrupts()
+    def work():
+        Released()
         while True:
             time.sleep(0.001)
+
+    before = sys.unraisablehook
+    with pytest.raises(Terminate):
+        work()
     assert sys.unraisablehook is before
