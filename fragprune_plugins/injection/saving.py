@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
 from fragprune_plugins.hosts.seams import Role, SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.atomic import staging
 
@@ -72,8 +70,10 @@ def on_pack(session: SessionState, call: SeamCall) -> Any:
     state = session.models.get(model) if model is not None else None
     if packed is None or state is None or state.store.neutral:
         return result
-    path, means = packed
-    rows = rows_of(means, session.adapter.means(model), str(call.seam))
+    path, which = packed
+    rows = which
+    if which.ndim > 1:
+        rows = rows_of(which, session.adapter.means(model), str(call.seam))
     store = ThresholdStore(0)
     store.load_state_dict(state.store.state_dict())
     store.rearrange(rows, torch.zeros(len(rows), dtype=torch.bool))
@@ -120,11 +120,7 @@ def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdS
             f"the file's {len(expected)} Gaussians in its order",
             "Report this with the host's commit: it draws another model after unpacking.",
         )
-    placed = ThresholdStore(0, means.device)
-    placed.load_state_dict(store.state_dict())
-    session.models[model] = ModelState(placed, loaded=weakref.ref(means))
-    session.follow(model, session.models[model])
-    session.plugins.tell(hookspecs.fragprune_attached, model=model, store=placed)
+    session.take_up(model, store.state_dict())
     session.unpacked = None
 
 
