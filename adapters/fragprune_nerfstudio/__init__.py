@@ -22,6 +22,7 @@ from fragprune_plugins.adapting import (
     HostAdapter,
     HostInfo,
     HostRepo,
+    MethodAdapter,
     Role,
     Seam,
     SeamCall,
@@ -30,6 +31,8 @@ from fragprune_plugins.adapting import (
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from fragprune_plugins import Settings
 
 PACKAGE = "nerfstudio"
 METHOD = "fragprune-splatfacto"
@@ -71,7 +74,7 @@ def exported(call: SeamCall) -> tuple[Path, Tensor]:
         raise
 
 
-class Nerfstudio(HostAdapter):
+class Nerfstudio(MethodAdapter):
     """The adapter of nerfstudio's splatfacto."""
 
     name = "nerfstudio"
@@ -87,6 +90,7 @@ class Nerfstudio(HostAdapter):
         ),
     )
     installed = (PACKAGE,)
+    scripts = (f"{PACKAGE}/scripts/train.py",)
     seams = (
         # of ours: called where the iteration comes at which stage 2 begins
         Seam(
@@ -144,6 +148,16 @@ class Nerfstudio(HostAdapter):
     def use(self, repo: HostRepo) -> str:
         """The command that a user of this host types, as text for people."""
         return f"ns-train {METHOD} ..."
+
+    def rewritten(self, arguments: list[str], settings: Settings, **options: Any) -> list[str]:
+        """The arguments of ns-train for our method, which trains as splatfacto does."""
+        from fragprune_nerfstudio.command import rewritten
+
+        return rewritten(METHOD, arguments, settings, **options)
+
+    def evaluated(self) -> str:
+        """The command that measures held-out views, as text for people."""
+        return "ns-eval --load-config CONFIG"
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
         """By the parameter; None for cameras and bilateral grids."""

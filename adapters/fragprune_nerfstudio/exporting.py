@@ -80,9 +80,6 @@ def rows_among(known: Mapping[str, Tensor], chosen: Mapping[str, Tensor], where:
 
 def _bits(values: Mapping[str, Tensor]) -> np.ndarray[Any, Any]:
     """(N,) one value of raw bytes for each row."""
-    table = np.concatenate(
-        [each.cpu().numpy().reshape(len(each), -1).astype(np.float32) for each in values.values()],
-        axis=1,
-    )
-    table = np.ascontiguousarray(table)
+    parts = [each.cpu().numpy().astype(np.float32) for each in values.values()]
+    table = np.ascontiguousarray(np.concatenate(parts, axis=1))
     return table.view(np.dtype((np.void, table.shape[1] * table.itemsize))).reshape(-1)

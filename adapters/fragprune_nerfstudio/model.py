@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from copy import copy
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -25,10 +26,14 @@ import fragprune_plugins
 from fragprune_nerfstudio import METHOD
 from fragprune_plugins import Settings
 from fragprune_plugins.adapting import AlignmentError, SessionError, UsageError
+from fragprune_plugins.injection.process import checkpoint_values
 from fragprune_plugins.injection.session import Session, active_session
 
 PLAIN = 0.25
 """gsplat's threshold of plain gradients over that of absolute ones, 0.0002 over 0.0008."""
+
+# torch's loader is safe by default since 2.6, and nerfstudio's schedulers save NumPy scalars
+torch.serialization.add_safe_globals(checkpoint_values())
 
 
 @dataclass
@@ -74,6 +79,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
     config: FragpruneSplatfactoConfig
     begin: int | None = None  # iteration at which stage 2 begins, once it is known
     saved: dict[str, Any] | None = None  # of the checkpoint
+    checkpoints: Path | None = None  # their folder
 
     def populate_modules(self) -> None:
         """As splatfacto; on the CPU without CUDA, and offline without LPIPS."""
@@ -89,13 +95,9 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
             )
         cpu = torch.device(self.kwargs.get("device", "cpu")).type == "cpu"
         if cpu and self.config.use_absgrad:
-            threshold = PLAIN * self.config.densify_grad_thresh
-            CONSOLE.log(
-                "fragprune: on a CPU densification follows plain gradients, not absolute ones: "
-                f"threshold {threshold:g} for {self.config.densify_grad_thresh:g}"
-            )
             self.config = copy(self.config)
-            self.config.use_absgrad, self.config.densify_grad_thresh = False, threshold
+            self.config.use_absgrad = False
+            self.config.densify_grad_thresh *= PLAIN
         with _on_cpu(cpu), _without_downloads():
             super().populate_modules()
 
@@ -110,9 +112,14 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
         """As splatfacto, once it is known when stage 2 begins; at the end the gain is said."""
         trainer = training_callback_attributes.trainer
-        self.begin = self.beginning(trainer)
+        self.begin, self.checkpoints = self.beginning(trainer), trainer.checkpoint_dir
         self.follow_parameters(training_callback_attributes.optimizers)
         CONSOLE.log(f"fragprune: stage 2 begins at iteration {self.begin}")
+        if self.config is not trainer.config.pipeline.model:
+            CONSOLE.log(
+                "fragprune: on a CPU densification follows plain gradients, not absolute ones, "
+                f"above {self.config.densify_grad_thresh:g}"
+            )
         callbacks: list[Any] = super().get_training_callbacks(training_callback_attributes)
         return [*callbacks, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self.tell)]
 
@@ -128,12 +135,14 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
             raise UsageError(
                 METHOD, "mixed precision", "float32", "Drop --mixed-precision, --use-grad-scaler."
             )
-        if settings.target_time is not None:
+        if trainer.world_size > 1:
+            raise UsageError(METHOD, "several GPUs", "one", "Set --machine.num-devices 1.")
+        if settings.target_time is not None or settings.itself:
             raise UsageError(
                 METHOD,
-                "a target in frame time",
-                "a target in fragments",
-                "Use --pipeline.model.fragprune.target-speedup.",
+                "a target in frame time, or the model's own pictures as target",
+                "a target in fragments, and photographs",
+                "Use --pipeline.model.fragprune.target-speedup, or fragprune finetune on the PLY.",
             )
         if self.saved is not None:
             return int(self.saved["begin"])
@@ -169,6 +178,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
             session = fragprune_plugins.activate(
                 "nerfstudio", settings=self.config.fragprune, engine=self.config.fragprune_engine
             )
+            session.output = self.checkpoints
             if self.saved is not None:
                 session.take_up(self, thresholds_of(self.saved))
             self.begin_stage2(optimizers)

@@ -140,6 +140,7 @@ KNOWN = {
         "fragprune_gsplat.dialect",
         "fragprune_plugins",
         "fragprune_plugins.adapting",
+        "fragprune_plugins.injection.process",
         "fragprune_plugins.injection.session",
     },
 }
