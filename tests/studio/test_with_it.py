@@ -1,4 +1,4 @@
-"""The real nerfstudio, on the CPU: ``pytest -m nerfstudio tests/nerfstudio``.
+"""The real nerfstudio, on the CPU: ``pytest -m nerfstudio tests/studio``.
 
 docs/how-to/nerfstudio.md says what to install.
 """
@@ -10,6 +10,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from copy import deepcopy
 from pathlib import Path
 
@@ -103,11 +104,11 @@ def run(methods, scene, tmp_path_factory):
     config = configured(methods, scene, tmp_path_factory.mktemp("out"))
     from nerfstudio.models.splatfacto import SplatfactoModel
 
-    counts, step = [], SplatfactoModel.step_cb
+    counts, original = [], SplatfactoModel.step_cb
 
-    def counting(self, optimizers, number):
+    def counting(self, optimizers, step):
         counts.append(self.num_points)
-        return step(self, optimizers, number)
+        return original(self, optimizers, step)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SplatfactoModel, "step_cb", counting)
@@ -150,6 +151,16 @@ def test_a_model_that_is_loaded_draws_the_same_to_the_bit_and_truncated(run):
         with fragprune_plugins.paused():
             assert torch.equal(picture(pipeline), whole)
     assert not torch.equal(view, whole)
+
+
+def test_the_viewers_thread_draws_with_thresholds_too(run):
+    """Its pictures are drawn by ``get_outputs_for_camera`` in a thread of its own."""
+    config, _, (view, _), *_ = run
+    pipeline, drawn = loaded(config), []
+    thread = threading.Thread(target=lambda: drawn.append(picture(pipeline)))
+    thread.start()
+    thread.join()
+    assert torch.equal(drawn[0], view)
 
 
 def test_the_crop_box_of_the_viewer_draws_with_the_thresholds_of_its_rows(run):
