@@ -68,9 +68,12 @@ def on_pack(session: SessionState, call: SeamCall) -> Any:
     packed = call.how()
     model = session.last() if session.last else None
     state = session.models.get(model) if model is not None else None
-    if packed is None or state is None or state.store.neutral:
+    if packed is None:
         return result
     path, which = packed
+    if state is None or state.store.neutral:  # loading would refuse an earlier file's as stale
+        sidecar.path_beside(path).unlink(missing_ok=True)
+        return result
     rows = which
     if which.ndim > 1:
         rows = rows_of(which, session.adapter.means(model), str(call.seam))

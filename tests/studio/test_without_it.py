@@ -19,6 +19,7 @@ from fragprune_plugins.errors import AlignmentError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import command, saving
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import sidecar
 
 # -- what it costs whoever has no nerfstudio
 
@@ -236,6 +237,15 @@ def test_the_sidecar_of_an_exported_file_has_the_thresholds_of_its_rows(tmp_path
     call = SimpleNamespace(run=lambda: "done", how=lambda: (path, rows), seam="exporter")
     assert saving.on_pack(session, call) == "done"
     torch.testing.assert_close(written[path].values.detach(), torch.tensor([0.1, 0.4]))
+
+
+def test_an_export_without_thresholds_leaves_none_of_an_earlier_one(tmp_path):
+    path = tmp_path / "splat.ply"
+    sidecar.path_beside(path).write_text("of an earlier export")
+    session = SimpleNamespace(last=None, models={})
+    call = SimpleNamespace(run=lambda: None, how=lambda: (path, torch.arange(2)), seam="exporter")
+    saving.on_pack(session, call)
+    assert not sidecar.path_beside(path).exists()
 
 
 def test_an_adapter_of_a_method_can_be_asked_for_before_its_host_is_there(monkeypatch):
