@@ -56,19 +56,23 @@ def optimizers(call: SeamCall) -> list[Any]:
 
 
 def exported(call: SeamCall) -> tuple[Path, Tensor]:
-    """The exported PLY, and the model's rows that are in it.
+    """The exported PLY, and the model's rows that are in it; none of a model without thresholds.
 
     Raises:
         AlignmentError: the file holds other Gaussians than the model. It is removed.
     """
+    import torch
+
     from fragprune_nerfstudio.exporting import rows_exported
     from fragprune_plugins.injection.session import active_session
 
     path, columns = Path(call.arguments["filename"]), call.arguments["map_to_tensors"]
     session = active_session()
     model = session.last() if session is not None and session.last is not None else None
+    if model is None:
+        return path, torch.arange(0)
     try:
-        return path, rows_exported({} if model is None else model.gauss_params, columns)
+        return path, rows_exported(model.gauss_params, columns)
     except AlignmentError:
         path.unlink(missing_ok=True)
         raise

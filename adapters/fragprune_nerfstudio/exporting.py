@@ -32,23 +32,20 @@ def rows_exported(params: Mapping[str, Tensor], columns: Mapping[str, Any]) -> T
     Raises:
         AlignmentError: the file's rows are not the model's in their order.
     """
-    names = [name for name in COLUMNS if name in params]
-    absent = [each for name in COLUMNS for each in COLUMNS[name] if each not in columns]
-    if len(names) < len(COLUMNS) or absent:
-        lacking = f"a file without {', '.join(absent)}" if absent else "no model"
+    if absent := [each for names in COLUMNS.values() for each in names if each not in columns]:
         raise AlignmentError(
             "ns-export gaussian-splat",
-            lacking,
+            f"a file without {', '.join(absent)}",
             "the model's positions, opacities, scales and rotations",
             "Report this with nerfstudio's version: it exports in another way.",
         )
     files = {
         name: torch.from_numpy(
-            np.stack([np.asarray(columns[each]).reshape(-1) for each in COLUMNS[name]], axis=1)
+            np.stack([np.asarray(columns[each]).reshape(-1) for each in names], axis=1)
         )
-        for name in names
+        for name, names in COLUMNS.items()
     }
-    return rows_among({name: params[name].detach() for name in names}, files, "ns-export")
+    return rows_among({name: params[name].detach() for name in COLUMNS}, files, "ns-export")
 
 
 def rows_among(known: Mapping[str, Tensor], chosen: Mapping[str, Tensor], where: str) -> Tensor:

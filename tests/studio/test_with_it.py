@@ -309,6 +309,13 @@ def test_an_exported_ply_has_its_thresholds_beside_it(run, tmp_path):
     assert thresholds is not None
 
 
+def test_a_model_without_thresholds_is_exported_without(run, tmp_path):
+    def plain(state):
+        del state["_model._extra_state"]
+
+    assert not sidecar.lies_beside(export(altered(run, tmp_path, plain), tmp_path))
+
+
 def test_thresholds_follow_the_exporters_filter(run, tmp_path):
     """It leaves out rows with NaN and of low opacity; and rows with equal positions are there."""
     *_, store, _ = run

@@ -11,13 +11,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fragprune_nerfstudio import METHOD, Nerfstudio
+from fragprune_nerfstudio import METHOD, Nerfstudio, exported
 from fragprune_nerfstudio.command import rewritten
 from fragprune_nerfstudio.exporting import COLUMNS, rows_among, rows_exported
 from fragprune_plugins import Settings
 from fragprune_plugins.errors import AlignmentError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection import command, saving
+from fragprune_plugins.injection import command, saving, session
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import sidecar
 
@@ -191,16 +191,14 @@ def test_a_file_without_a_column_is_refused(name):
         rows_exported(params, columns)
 
 
-def test_a_file_of_no_model_is_refused():
-    params = model(3)
-    with pytest.raises(AlignmentError, match="no model"):
-        rows_exported({}, exporters(params, torch.arange(3)))
+def test_of_a_model_without_thresholds_nothing_is_followed(monkeypatch):
+    monkeypatch.setattr(session, "_active", SimpleNamespace(last=None))
+    call = SimpleNamespace(arguments={"filename": "splat.ply", "map_to_tensors": {}})
+    path, rows = exported(call)
+    assert (path.name, len(rows)) == ("splat.ply", 0)
 
 
 def test_a_file_of_other_gaussians_is_removed_before_anybody_takes_it(tmp_path, monkeypatch):
-    from fragprune_nerfstudio import exported
-    from fragprune_plugins.injection import session
-
     file = tmp_path / "splat.ply"
     file.write_text("of another model")
     own = SimpleNamespace(gauss_params=model(3))
@@ -226,25 +224,23 @@ def test_the_sidecar_of_an_exported_file_has_the_thresholds_of_its_rows(tmp_path
     written = {}
     store = ThresholdStore.from_falloff(torch.tensor([0.1, 0.2, 0.3, 0.4]))
     own = SimpleNamespace()
-    session = SimpleNamespace(
+    known = SimpleNamespace(
         last=lambda: own,
-        models={id(own): None},
+        models=SimpleNamespace(get=lambda model: SimpleNamespace(store=store)),
         adapter=None,
         write_sidecar=lambda path, store: written.update({path: store}),
     )
-    session.models = SimpleNamespace(get=lambda model: SimpleNamespace(store=store))
     path, rows = tmp_path / "splat.ply", torch.tensor([0, 3])
     call = SimpleNamespace(run=lambda: "done", how=lambda: (path, rows), seam="exporter")
-    assert saving.on_pack(session, call) == "done"
+    assert saving.on_pack(known, call) == "done"
     torch.testing.assert_close(written[path].values.detach(), torch.tensor([0.1, 0.4]))
 
 
 def test_an_export_without_thresholds_leaves_none_of_an_earlier_one(tmp_path):
     path = tmp_path / "splat.ply"
     sidecar.path_beside(path).write_text("of an earlier export")
-    session = SimpleNamespace(last=None, models={})
     call = SimpleNamespace(run=lambda: None, how=lambda: (path, torch.arange(2)), seam="exporter")
-    saving.on_pack(session, call)
+    saving.on_pack(SimpleNamespace(last=None, models={}), call)
     assert not sidecar.path_beside(path).exists()
 
 
