@@ -152,8 +152,6 @@ class PatchLedger:
         if head != seam.attribute:
             return  # a method is patched on its class, which all modules share
         original = getattr(module, head, None)
-        if getattr(original, "__module__", seam.module) != seam.module:
-            return  # the seam names a module's own copy of a function, and only that one is patched
         holders = [
             name
             for name, other in list(sys.modules.items())

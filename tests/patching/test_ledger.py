@@ -178,18 +178,3 @@ def test_positional_keyword_and_static_calls_reach_the_wrapper_alike(host):
     assert calls == [(("a",), {}), ((), {"path": "a"})]
     assert ledger.undo() == []
     assert isinstance(vars(host.Model)["fixed"], staticmethod)
-
-
-def test_a_modules_own_copy_of_a_function_can_be_wrapped_alone(host, monkeypatch):
-    """As a library calls another's function; whoever else holds it is no matter of the seam."""
-    user = ModuleType("a_user_of_the_ledgers_tests")
-    host.render.__module__, user.render = NAME, host.render
-    monkeypatch.setitem(sys.modules, user.__name__, user)
-    original, calls = host.render, []
-    ledger = PatchLedger()
-    ledger.wrap(Seam(Role.VIEW, user.__name__, "render", ("view",), external=True), noting(calls))
-    assert host.render is original
-    assert user.render("view", "model") == original("view", "model")
-    assert calls == [(("view", "model"), {})]
-    assert ledger.undo() == []
-    assert user.render is host.render is original
