@@ -1,6 +1,7 @@
 """Everything that an adapter imports: ``from fragprune_plugins.adapting import ...``.
 
-a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo, Finding
+a host      HostAdapter, or ScriptAdapter where it has training scripts, or MethodAdapter where
+            stage 2 is one of its own methods; HostInfo, HostRepo, Finding
 its seams   Seam, Role, SeamCall, RowTrace, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs, slice_at
 its script  CommandLine, ConfigFile, Photographs
@@ -38,6 +39,7 @@ from fragprune_plugins.hosts.adapter import (
     HostAdapter,
     HostCall,
     HostInfo,
+    MethodAdapter,
     ScriptAdapter,
 )
 from fragprune_plugins.hosts.findings import Finding
@@ -87,6 +89,7 @@ __all__ = [
     "HostInfo",
     "HostRepo",
     "InputError",
+    "MethodAdapter",
     "ModelFileError",
     "Moment",
     "NotComparedError",

@@ -58,6 +58,7 @@ def command(table: bool) -> Report:
 def support(adapters: Sequence[HostAdapter]) -> str:
     """The support page in Markdown, made from the adapters alone."""
     from fragprune_plugins.engines import ENGINES
+    from fragprune_plugins.hosts.adapter import MethodAdapter
 
     head = ["host", "adapter", "states", "scripts that train"]
     rows = [head, ["---"] * len(head)]
@@ -72,7 +73,10 @@ def support(adapters: Sequence[HostAdapter]) -> str:
     return _SUPPORT.substitute(
         table=table,
         engines=", ".join(f"`{name}`" for name in ENGINES),
-        installed=" and ".join(f"`{a.name}`" for a in adapters if a.installed),
+        installed=" and ".join(
+            f"`{a.name}`" for a in adapters if a.installed and not isinstance(a, MethodAdapter)
+        ),
+        methods=" and ".join(f"`{a.name}`" for a in adapters if isinstance(a, MethodAdapter)),
         limits="\n".join(limits),
     )
 
@@ -82,9 +86,11 @@ def _scripts(adapter: HostAdapter) -> tuple[str, ...]:
 
     They are the same for all revisions.
     """
-    from fragprune_plugins.hosts.adapter import ScriptAdapter
+    from fragprune_plugins.hosts.adapter import MethodAdapter, ScriptAdapter
     from fragprune_plugins.hosts.source import HostRepo
 
+    if isinstance(adapter, MethodAdapter):
+        return adapter.scripts
     if not isinstance(adapter, ScriptAdapter):
         return ()
     return adapter.command_line(HostRepo(Path("/nonexistent"))).scripts
@@ -98,7 +104,8 @@ Scripts that do not train (render, evaluate) also run under `fragprune run`, wit
 beside their models. Every adapter draws with every engine: $engines. `fragprune check DIR` says
 which adapter fits a checkout, and why others do not. Our adapters pass the
 [conformance kit](conformance.md): $installed on the installed packages, the others on miniatures of
-their hosts.
+their hosts. $methods is a method of its host, with
+[tests of its own](../how-to/nerfstudio.md#test-it).
 
 $table
 

@@ -199,6 +199,12 @@ def command(
     return Report(data, _describe(summary, data, not_compared))
 
 
+def _saved(summary: RunSummary) -> str:
+    """Where a model is that is no PLY."""
+    kept = summary.output is not None and any(summary.output.glob("*.ckpt"))
+    return f"the last checkpoint in {summary.output}" if kept else "not saved by the host"
+
+
 def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
@@ -280,6 +286,6 @@ def _describe(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
         f"{summary.iterations} iterations {_WHERE.get(summary.stage, 'of stage 2')}{pressure}, "
         f"{summary.train_seconds:.0f} s in all. "
-        f"Model: {summary.model_after or 'not saved by the host'}."
+        f"Model: {summary.model_after or _saved(summary)}."
     )
     return "\n".join(lines)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from fragprune_plugins.engines import Engine
+    from fragprune_plugins.learning.schedule import Settings
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 CHECKPOINT_KEY = "fragprune"
@@ -511,3 +512,37 @@ class ScriptAdapter(HostAdapter):
     @abstractmethod
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
         """Make a checkpoint from a PLY of the host, from which the host can resume."""
+
+
+class MethodAdapter(HostAdapter):
+    """An adapter of a host in which stage 2 is a training method of its own.
+
+    ``fragprune run`` asks for the command of that method, and runs it. The method activates a
+    session itself, also without ``fragprune run``.
+
+    Attributes:
+        scripts: modules of the host's package that train, as paths.
+    """
+
+    scripts: tuple[str, ...]
+
+    @abstractmethod
+    def rewritten(
+        self,
+        arguments: list[str],
+        settings: Settings,
+        *,
+        stage: str,
+        from_iter: int | None,
+        engine: str,
+        device: str,
+    ) -> list[str]:
+        """The method's arguments for a training command's; other values are options of a run.
+
+        Raises:
+            UsageError: the method cannot do what they ask for.
+        """
+
+    def evaluated(self) -> str:
+        """The command that measures held-out views, as text for people."""
+        return "the host's own evaluation"

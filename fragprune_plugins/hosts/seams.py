@@ -64,10 +64,13 @@ class Role(Enum):
     LOAD = "read the sidecar beside the model's file", "after: the file (the path as passed)"
     PACK = (
         "write the sidecar of a file with the model's Gaussians in another order",
-        "after: the file's path, and its means (M, 3), in its order and bit for bit the model's; "
-        "None if the call was about something else",
+        "after: the file's path, and in its order its means (M, 3), bit for bit the model's, or "
+        "the model's rows (M,) int64; None if the call was about something else",
     )
-    UNPACK = "read that sidecar for the model that will be made from the file", "after: as PACK"
+    UNPACK = (
+        "read that sidecar for the model that will be made from the file",
+        "after: as PACK, with means",
+    )
     CAPTURE = "put thresholds into the host's checkpoint"
     RESTORE = (
         "take thresholds out of the host's checkpoint",

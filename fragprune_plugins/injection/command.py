@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,8 @@ def split(command: list[str]) -> tuple[Path, list[str], str]:
         words = words[1:]
     if words[:1] == ["-m"] and len(words) > 1:
         return _script_of(words[1]), words[2:], words[1]
+    for entry in entry_points(group="console_scripts", name=words[0]) if words else ():
+        return _script_of(entry.module), words[1:], entry.module  # as pip installed the command
     if not words or not words[0].endswith(".py"):
         raise UsageError(
             "command",

@@ -13,7 +13,7 @@ import logging
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -31,15 +31,16 @@ from fragprune_plugins.errors import (
     printable,
 )
 from fragprune_plugins.hosts import preflight
-from fragprune_plugins.hosts.adapter import ScriptAdapter
+from fragprune_plugins.hosts.adapter import MethodAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process, ranks, starting
 from fragprune_plugins.injection.command import HostCommand, split
 from fragprune_plugins.injection.starting import Start
-from fragprune_plugins.learning.events import Summary
+from fragprune_plugins.learning.events import StepStats, Summary
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.storage.atomic import digest
 
@@ -165,6 +166,8 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
     else:
         repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
+    if isinstance(adapter, MethodAdapter) and script in map(repo.root.joinpath, adapter.scripts):
+        return _run_method(adapter, repo, (script, arguments, module), options)
     driven = adapter if isinstance(adapter, ScriptAdapter) else adapter.trainer(script)
     if driven is None:
         raise UsageError(
@@ -211,6 +214,99 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         else:
             runner.train_then_finetune()
     return runner.summary(time.perf_counter() - started)
+
+
+class _Ear:
+    """Hears the summary of a session that a host activates itself, and its learning curves."""
+
+    def __init__(self) -> None:
+        self.summary: Summary | None = None
+        self.curves: list[dict[str, float]] = []
+
+    @hookimpl
+    def fragprune_step(self, stats: StepStats) -> None:
+        self.curves.append(asdict(stats))
+
+    @hookimpl
+    def fragprune_finished(self, summary: Summary) -> None:
+        self.summary = summary
+
+
+def _run_method(
+    adapter: MethodAdapter,
+    repo: HostRepo,
+    command: tuple[Path, list[str], str],
+    options: RunOptions,
+) -> RunSummary:
+    """Run the host's own method that has stage 2 in it, in place of the method that was named.
+
+    Args:
+        adapter: knows the method's command.
+        repo: the host's package.
+        command: its script, arguments and module.
+        options: of the run.
+    """
+    from fragprune_plugins.injection.session import active_session
+
+    script, arguments, module = command
+    started, ear, plugins = time.perf_counter(), _Ear(), installed()
+    ranks.expect_one()
+    device = process.host_device(options.device, options.engine)
+    words = adapter.rewritten(
+        arguments,
+        options.settings,
+        stage=options.stage,
+        from_iter=options.from_iter,
+        engine=options.engine,
+        device=device,
+    )
+    log.info("runs %s %s", script.stem, " ".join(words))
+    plugins.register(ear, "run")
+    try:
+        with (
+            process.telling(script, repo.root),
+            process.host_process(script, words, device, Path.cwd()),
+            sigterm_interrupts(),
+        ):
+            process.run_main(script, module)
+    finally:
+        plugins.remove("run")
+        session = active_session()
+        output = session.output if session is not None else None
+        if session is not None:
+            session.deactivate()
+    if ear.summary is None:
+        raise HostFailed(
+            script.name,
+            "ended before the end of stage 2",
+            "a training that runs to its end",
+            "Read the host's own message above.",
+        )
+    learned = ear.summary
+    not_compared = NotComparedError(
+        adapter.name,
+        "photographs and cameras in the host's own frame",
+        "its own evaluation",
+        f"Run: {adapter.evaluated()}",
+    )
+    return RunSummary(
+        adapter=adapter.name,
+        engine=learned.engine,
+        device=device,
+        stage=options.stage,
+        iterations=learned.steps,
+        gaussians=learned.gaussians,
+        fragments_before=learned.fragments_before,
+        fragments_after=learned.fragments_after,
+        model_before=None,
+        model_after=None,
+        train_seconds=time.perf_counter() - started,
+        target_reached=learned.target_reached,
+        curves=ear.curves,
+        settings=learned.settings,
+        output=output,
+        not_compared=not_compared,
+    )
 
 
 class _Runner:

@@ -171,14 +171,19 @@ def current_gpu(device: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def host_checkpoints() -> Iterator[None]:
-    """Inside, torch's safe loader reads hosts' checkpoints, which hold NumPy scalars."""
-    import numpy as np
+    """Inside, torch's safe loader reads hosts' checkpoints."""
     import torch
 
-    scalar: Any = np.float64(0).__reduce__()[0]
-    kinds: list[Any] = [type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8")]
-    with torch.serialization.safe_globals([scalar, np.dtype, *kinds]):
+    with torch.serialization.safe_globals(checkpoint_values()):
         yield
+
+
+def checkpoint_values() -> list[Any]:
+    """What torch's safe loader does not know of what hosts save: NumPy scalars."""
+    import numpy as np
+
+    scalar: Any = np.float64(0).__reduce__()[0]
+    return [scalar, np.dtype, *(type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8"))]
 
 
 @contextlib.contextmanager

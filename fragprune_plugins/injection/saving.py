@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
 from fragprune_plugins.hosts.seams import Role, SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.atomic import staging
 
@@ -70,10 +68,15 @@ def on_pack(session: SessionState, call: SeamCall) -> Any:
     packed = call.how()
     model = session.last() if session.last else None
     state = session.models.get(model) if model is not None else None
-    if packed is None or state is None or state.store.neutral:
+    if packed is None:
         return result
-    path, means = packed
-    rows = rows_of(means, session.adapter.means(model), str(call.seam))
+    path, which = packed
+    if state is None or state.store.neutral:  # loading would refuse an earlier file's as stale
+        sidecar.path_beside(path).unlink(missing_ok=True)
+        return result
+    rows = which
+    if which.ndim > 1:
+        rows = rows_of(which, session.adapter.means(model), str(call.seam))
     store = ThresholdStore(0)
     store.load_state_dict(state.store.state_dict())
     store.rearrange(rows, torch.zeros(len(rows), dtype=torch.bool))
@@ -120,11 +123,7 @@ def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdS
             f"the file's {len(expected)} Gaussians in its order",
             "Report this with the host's commit: it draws another model after unpacking.",
         )
-    placed = ThresholdStore(0, means.device)
-    placed.load_state_dict(store.state_dict())
-    session.models[model] = ModelState(placed, loaded=weakref.ref(means))
-    session.follow(model, session.models[model])
-    session.plugins.tell(hookspecs.fragprune_attached, model=model, store=placed)
+    session.take_up(model, store.state_dict())
     session.unpacked = None
 
 

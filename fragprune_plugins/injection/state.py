@@ -280,6 +280,22 @@ class SessionState:
         self.follow(model, state)
         self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)
 
+    def take_up(self, model: Any, saved: dict[str, Any]) -> None:
+        """Give a model the thresholds that ``ThresholdStore.state_dict`` gave for its Gaussians.
+
+        Raises:
+            SidecarError: the saved parts do not fit together, or are not finite.
+            AlignmentError: the model has another number of rows.
+        """
+        means = self.adapter.means(model)
+        store = ThresholdStore(0, means.device, self.settings.threshold_lr)
+        store.load_state_dict(saved)
+        state = ModelState(store, loaded=weakref.ref(means))
+        self.expect_rows(model, state, "the saved thresholds")
+        self.models[model] = state
+        self.follow(model, state)
+        self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)
+
     def expect_rows(self, model: Any, state: ModelState, where: str) -> None:
         """Raise AlignmentError unless a model has one threshold per Gaussian."""
         rows = self.adapter.rows(model)

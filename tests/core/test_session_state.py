@@ -246,3 +246,20 @@ def test_a_loaded_model_has_the_thresholds_beside_its_file(tmp_path):
     assert session.plugins.told == [("fragprune_attached", {"model": model, "store": known.store})]
     with pytest.raises(SidecarError, match=r"2 Gaussian\(s\)"):
         session.load(Model(3), path)
+
+
+def test_thresholds_of_a_hosts_own_checkpoint_are_taken_up_as_they_were_saved():
+    saved = ThresholdStore.from_falloff(torch.tensor([0.1, 0.2]))
+    session, model = state(), Model(2)
+    session.take_up(model, saved.state_dict())
+    taken = session.models[model]
+    assert torch.equal(taken.store.logits, saved.logits)
+    assert taken.loaded() is session.adapter.means(model)
+    assert session.last() is model
+
+
+def test_thresholds_of_another_number_of_gaussians_are_not_taken_up():
+    session, model = state(), Model(3)
+    with pytest.raises(AlignmentError, match="saved thresholds"):
+        session.take_up(model, ThresholdStore(2).state_dict())
+    assert model not in session.models

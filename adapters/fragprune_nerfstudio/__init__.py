@@ -1,0 +1,193 @@
+"""nerfstudio-project/nerfstudio: its method splatfacto, whose Gaussians gsplat draws.
+
+``ns-train fragprune-splatfacto`` is splatfacto with stage 2 as its last iterations. ``method``
+tells nerfstudio of it, ``model`` is its model: there a session begins, so that every tool of
+nerfstudio that loads the model (``ns-eval``, ``ns-export``, ``ns-render``, the viewer) has the
+thresholds.
+
+Importing this module imports no nerfstudio; only nerfstudio's own entry point does.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.adapting import (
+    AlignmentError,
+    Dialect,
+    Finding,
+    HostAdapter,
+    HostInfo,
+    HostRepo,
+    MethodAdapter,
+    Role,
+    Seam,
+    SeamCall,
+    hookimpl,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins import Settings
+
+PACKAGE = "nerfstudio"
+METHOD = "fragprune-splatfacto"
+SPLATFACTO = f"{PACKAGE}.models.splatfacto"
+MODEL = "fragprune_nerfstudio.model"
+GROUPS = {
+    "means": "xyz",
+    "features_dc": "f_dc",
+    "features_rest": "f_rest",
+    "opacities": "opacity",
+    "scales": "scaling",
+    "quats": "rotation",
+}
+"""splatfacto's keys and what the rest of the field calls them."""
+
+
+def optimizers(call: SeamCall) -> list[Any]:
+    """The optimizers, one for each group; the one of the means first."""
+    known = call.arguments["optimizers"].optimizers
+    return [known["means"], *(each for name, each in known.items() if name != "means")]
+
+
+def exported(call: SeamCall) -> tuple[Path, Tensor]:
+    """The exported PLY, and the model's rows that are in it; none of a model without thresholds.
+
+    Raises:
+        AlignmentError: the file holds other Gaussians than the model. It is removed.
+    """
+    import torch
+
+    from fragprune_nerfstudio.exporting import rows_exported
+    from fragprune_plugins.injection.session import active_session
+
+    path, columns = Path(call.arguments["filename"]), call.arguments["map_to_tensors"]
+    session = active_session()
+    model = session.last() if session is not None and session.last is not None else None
+    if model is None:
+        return path, torch.arange(0)
+    try:
+        return path, rows_exported(model.gauss_params, columns)
+    except AlignmentError:
+        path.unlink(missing_ok=True)
+        raise
+
+
+class Nerfstudio(MethodAdapter):
+    """The adapter of nerfstudio's splatfacto."""
+
+    name = "nerfstudio"
+    info = HostInfo(
+        "nerfstudio",
+        repo="nerfstudio-project/nerfstudio",
+        states="1.1.5 with gsplat 1.4: `splatfacto`",
+        limits=(
+            "Refused: several GPUs, mixed precision; on a CPU densification follows plain "
+            "gradients, because our engines have no absolute gradients per axis.",
+            "`ns-render` and `ns-viewer` draw with thresholds; other exports than gaussian-splat "
+            "and other viewers know none.",
+        ),
+    )
+    installed = (PACKAGE,)
+    scripts = (f"{PACKAGE}/scripts/train.py",)
+    seams = (
+        # of ours: called where the iteration comes at which stage 2 begins
+        Seam(
+            Role.ATTACH,
+            MODEL,
+            "FragpruneSplatfacto.begin_stage2",
+            ("optimizers",),
+            external=True,
+            how=optimizers,
+        ),
+        Seam(Role.STEP, SPLATFACTO, "SplatfactoModel.step_cb", ("optimizers", "step")),
+        Seam(Role.VIEW, SPLATFACTO, "SplatfactoModel.get_outputs", ("camera",)),
+        # gsplat's function under the name by which the model calls it
+        Seam(
+            Role.RASTERIZE,
+            SPLATFACTO,
+            "rasterization",
+            ("means", "opacities", "viewmats", "Ks", "covars"),
+            external=True,
+        ),
+        Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
+        Seam(
+            Role.PACK,
+            f"{PACKAGE}.scripts.exporter",
+            "ExportGaussianSplat.write_ply",
+            ("filename", "count", "map_to_tensors"),
+            how=exported,
+        ),
+    )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Check that this is the installed package, and that gsplat is installed beside it."""
+        if repo.package == PACKAGE and HostRepo.installed("gsplat") is not None:
+            return [Finding("info", "revision", PACKAGE, repo.commit)]
+        found = "no gsplat beside it" if repo.package == PACKAGE else "a folder"
+        return [
+            Finding(
+                "error",
+                "other-host",
+                str(repo.root),
+                found,
+                "the installed packages nerfstudio and gsplat",
+                f"Train with: ns-train {METHOD}",
+            )
+        ]
+
+    def dialect(self, repo: HostRepo) -> Dialect:
+        """That of the installed gsplat."""
+        from fragprune_gsplat import Gsplat
+        from fragprune_nerfstudio.dialect import NerfstudioDialect
+
+        gsplat = Gsplat().dialect(HostRepo.installed("gsplat") or repo)
+        return NerfstudioDialect(**vars(gsplat))
+
+    def use(self, repo: HostRepo) -> str:
+        """The command that a user of this host types, as text for people."""
+        return f"ns-train {METHOD} ..."
+
+    def rewritten(self, arguments: list[str], settings: Settings, **options: Any) -> list[str]:
+        """The arguments of ns-train for our method, which trains as splatfacto does."""
+        from fragprune_nerfstudio.command import rewritten
+
+        return rewritten(METHOD, arguments, settings, **options)
+
+    def evaluated(self) -> str:
+        """The command that measures held-out views, as text for people."""
+        return "ns-eval --load-config CONFIG"
+
+    def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
+        """By the parameter; None for cameras and bilateral grids."""
+        own = {id(each): name for name, each in model.gauss_params.items()}
+        return next((GROUPS.get(own.get(id(each), "")) for each in group["params"]), None)
+
+    def means(self, model: Any) -> Tensor:
+        """(N, 3) the parameter itself."""
+        means: Tensor = model.gauss_params["means"]
+        return means
+
+    def opacities(self, model: Any) -> Tensor:
+        """(N,) after the sigmoid."""
+        opacities: Tensor = model.gauss_params["opacities"]
+        return opacities.detach().sigmoid().reshape(-1)
+
+    def view(self, camera: Any) -> int:
+        """A key from the camera's pose, because loaders make a new camera for every step.
+
+        It is the same in every process, because checkpoints keep it.
+        """
+        pose = camera.camera_to_worlds.detach().cpu().numpy().tobytes()
+        return int.from_bytes(hashlib.blake2b(pose, digest_size=7).digest(), "big")
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Register the adapter of nerfstudio."""
+    register(Nerfstudio())

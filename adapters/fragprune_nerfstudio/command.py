@@ -1,0 +1,116 @@
+"""``fragprune run -- ns-train splatfacto ...``: the same training, by our method."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+from fragprune_plugins import Settings
+from fragprune_plugins.adapting import UsageError
+
+HOST = "splatfacto"
+ITERATIONS = 30_000
+"""nerfstudio's default for splatfacto."""
+LENGTH, MODEL = "--max-num-iterations", "--pipeline.model"
+LOADS = ("--load-dir", "--load-checkpoint")
+ELSEWHERE = {
+    "splatfacto-big": f"splatfacto {MODEL}.cull-alpha-thresh 0.005 "
+    f"{MODEL}.densify-grad-thresh 0.0005",
+}
+
+
+def rewritten(
+    method: str,
+    arguments: list[str],
+    settings: Settings,
+    *,
+    stage: str,
+    from_iter: int | None,
+    engine: str,
+    device: str,
+) -> list[str]:
+    """The arguments of ns-train that make stage 2 follow the training that they ask for.
+
+    Args:
+        method: the name of our method.
+        arguments: of ns-train.
+        settings: of stage 2.
+        stage: "auto" for stage 2 after the training, "finetune" for stage 2 alone, of a checkpoint
+            or from ``from_iter`` on.
+        from_iter: iteration at which stage 2 begins.
+        engine: that draws with thresholds.
+        device: "cpu", "cuda" or "cuda:N".
+
+    Raises:
+        UsageError: the arguments ask for another method, or for what ns-train cannot do.
+    """
+    if not arguments or arguments[0] not in (HOST, method):
+        found = arguments[0] if arguments else "no method"
+        instead = ELSEWHERE.get(found, HOST)
+        raise UsageError("ns-train", found, HOST, f"Train with: ns-train {instead} ...")
+    given, rest = _split_off(arguments[1:], LENGTH)
+    loads = any(_flag(word) in LOADS for word in rest)
+    if any(_flag(word) == "--load-config" for word in rest):
+        raise UsageError(
+            "ns-train --load-config",
+            "a configuration that replaces all other flags",
+            "flags alone",
+            f"Name the checkpoints with {LOADS[0]}, and give the other flags again.",
+        )
+    if stage not in ("auto", "finetune"):
+        raise UsageError(
+            f"--stage {stage}",
+            "ns-train",
+            "auto or finetune",
+            "Drop --stage; ns-eval, ns-export and the viewer need no fragprune run.",
+        )
+    total = ITERATIONS if given is None else given
+    ours: dict[str, Any] = {}
+    if from_iter is not None:
+        if from_iter >= total:
+            raise UsageError(
+                "--from-iter", str(from_iter), f"less than {total}", f"Lower it, or raise {LENGTH}."
+            )
+        settings = replace(settings, iterations=total - from_iter)
+        ours[f"{MODEL}.fragprune-from"] = from_iter
+    elif stage == "auto":
+        total += settings.iterations
+    elif loads:
+        total = settings.iterations
+    else:
+        raise UsageError(
+            "--stage finetune",
+            "no checkpoint to start from",
+            f"{LOADS[0]} with a run's nerfstudio_models",
+            f"Add {LOADS[0]} to the command, or --from-iter.",
+        )
+    default = Settings()
+    for name in (field.name for field in fields(Settings)):
+        if getattr(settings, name) != getattr(default, name):
+            flag = f"{MODEL}.fragprune.{name.replace('_', '-')}"
+            ours[flag] = getattr(settings, name)
+    if engine != "auto":
+        ours[f"{MODEL}.fragprune-engine"] = engine
+    ours |= {LENGTH: total, "--machine.device-type": device.split(":")[0]}
+    flags = [word for flag, value in ours.items() for word in (flag, str(value))]
+    return [method, *flags, *rest]
+
+
+def _flag(word: str) -> str:
+    """The flag that a word names, as nerfstudio's help spells it."""
+    return word.split("=")[0].replace("_", "-") if word.startswith("--") else ""
+
+
+def _split_off(words: list[str], flag: str) -> tuple[int | None, list[str]]:
+    """(the last value of a number's flag, the words without it)."""
+    value: Any = None
+    rest: list[str] = []
+    waiting = iter(words)
+    for word in waiting:
+        if _flag(word) != flag:
+            rest.append(word)
+            continue
+        value = word.partition("=")[2] if "=" in word else next(waiting, "")
+        if not value.isdigit():
+            raise UsageError(flag, repr(value), "a number of iterations", "Correct it.")
+    return None if value is None else int(value), rest

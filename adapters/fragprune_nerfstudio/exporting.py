@@ -1,0 +1,82 @@
+"""Which rows of a model a selection of them has, proved bit by bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fragprune_plugins.adapting import AlignmentError
+
+COLUMNS = {
+    "means": ("x", "y", "z"),
+    "opacities": ("opacity",),
+    "scales": ("scale_0", "scale_1", "scale_2"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+"""What the exporter calls the columns of each parameter."""
+
+
+def rows_exported(params: Mapping[str, Tensor], columns: Mapping[str, Any]) -> Tensor:
+    """(M,) int64 rows of the model that are in an exported file, in its order.
+
+    The exporter leaves out rows outside its box, rows with NaN and rows of low opacity.
+
+    Args:
+        params: the model's parameters, (N, C) each.
+        columns: of the file by name, (M,) or (M, 1) each.
+
+    Raises:
+        AlignmentError: the file's rows are not the model's in their order.
+    """
+    if absent := [each for names in COLUMNS.values() for each in names if each not in columns]:
+        raise AlignmentError(
+            "ns-export gaussian-splat",
+            f"a file without {', '.join(absent)}",
+            "the model's positions, opacities, scales and rotations",
+            "Report this with nerfstudio's version: it exports in another way.",
+        )
+    files = {
+        name: torch.from_numpy(
+            np.stack([np.asarray(columns[each]).reshape(-1) for each in names], axis=1)
+        )
+        for name, names in COLUMNS.items()
+    }
+    return rows_among({name: params[name].detach() for name in COLUMNS}, files, "ns-export")
+
+
+def rows_among(known: Mapping[str, Tensor], chosen: Mapping[str, Tensor], where: str) -> Tensor:
+    """(M,) int64 rows of ``known`` that ``chosen`` has, a selection by values in the same order.
+
+    Rows that are equal in every value are selected together, so equal ones keep their order.
+
+    Args:
+        known: (N, C) values of the model, by name.
+        chosen: (M, C) values under the same names.
+        where: for messages.
+
+    Raises:
+        AlignmentError: it is no such selection.
+    """
+    ours, theirs = _bits(known), _bits({name: chosen[name] for name in known})
+    _, which = np.unique(np.concatenate([ours, theirs]), return_inverse=True)
+    ours, theirs = which[: len(ours)], which[len(ours) :]
+    rows = np.flatnonzero(np.isin(ours, theirs))
+    if not np.array_equal(ours[rows], theirs):
+        raise AlignmentError(
+            where,
+            f"{len(theirs)} Gaussians, of which {len(rows)} are the model's in its order",
+            f"a selection of the model's {len(ours)} Gaussians",
+            "Report this with nerfstudio's version: it selects in another way.",
+        )
+    return torch.from_numpy(rows)
+
+
+def _bits(values: Mapping[str, Tensor]) -> np.ndarray[Any, Any]:
+    """(N,) one value of raw bytes for each row."""
+    parts = [each.cpu().numpy().astype(np.float32) for each in values.values()]
+    table = np.ascontiguousarray(np.concatenate(parts, axis=1))
+    return table.view(np.dtype((np.void, table.shape[1] * table.itemsize))).reshape(-1)

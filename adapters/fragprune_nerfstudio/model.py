@@ -1,0 +1,304 @@
+"""splatfacto with stage 2 as the last iterations of its training.
+
+The class is named in a run's ``config.yml``, so every tool of nerfstudio loads it, and through it
+the thresholds. It starts a session of fragprune, which does the rest: this module says when.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from copy import copy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+from gsplat.strategy.base import Strategy
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch.overrides import TorchFunctionMode
+
+import fragprune_plugins
+from fragprune_nerfstudio import METHOD
+from fragprune_plugins import Settings
+from fragprune_plugins.adapting import AlignmentError, SessionError, UsageError
+from fragprune_plugins.injection.process import checkpoint_values
+from fragprune_plugins.injection.session import Session, active_session
+
+PLAIN = 0.25
+"""gsplat's threshold of plain gradients over that of absolute ones, 0.0002 over 0.0008."""
+
+# torch's loader is safe by default since 2.6, and nerfstudio's schedulers save NumPy scalars
+torch.serialization.add_safe_globals(checkpoint_values())
+
+
+@dataclass
+class FragpruneSplatfactoConfig(SplatfactoModelConfig):  # type: ignore[misc]
+    """splatfacto's, and stage 2."""
+
+    _target: type = field(default_factory=lambda: FragpruneSplatfacto)
+    fragprune: Settings = field(default_factory=Settings)
+    """Stage 2, the last iterations of the training, in which thresholds learn."""
+    fragprune_from: int | None = None
+    """Iteration at which stage 2 begins, instead of fragprune.iterations before the last one."""
+    fragprune_engine: str = "auto"
+    """Engine that draws with thresholds: auto, reference, cpu, cuda, or that of a plugin."""
+
+
+class _NoCuda(TorchFunctionMode):
+    """Inside, ``.cuda()`` returns its tensor: splatfacto calls it whatever the device is."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return args[0] if func is torch.Tensor.cuda else func(*args, **(kwargs or {}))
+
+
+class Still(Strategy):  # type: ignore[misc]
+    """gsplat's strategy that changes nothing, for stage 2."""
+
+    absgrad = False
+
+
+class NoMetric(torch.nn.Module):
+    """Stands for a metric whose weights cannot be downloaded."""
+
+    def forward(self, *pictures: torch.Tensor) -> torch.Tensor:
+        """NaN."""
+        return torch.tensor(torch.nan)
+
+
+class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
+    """splatfacto; from one iteration on its thresholds learn, and its Gaussians are frozen.
+
+    ``config.fragprune.train`` says what moves beside the thresholds.
+    """
+
+    config: FragpruneSplatfactoConfig
+    begin: int | None = None  # iteration at which stage 2 begins, once it is known
+    saved: dict[str, Any] | None = None  # of the checkpoint
+    checkpoints: Path | None = None  # their folder
+
+    def populate_modules(self) -> None:
+        """As splatfacto; on the CPU without CUDA, and offline without LPIPS."""
+        expect_no_script()
+        session = active_session()
+        if session is None:  # it draws, with the thresholds of a checkpoint, and learns nothing
+            fragprune_plugins.activate(
+                "nerfstudio", stage="off", engine=self.config.fragprune_engine
+            )
+        elif session.adapter.name != "nerfstudio":
+            raise SessionError(
+                METHOD, f"a session of {session.adapter.name}", "none", "Deactivate it first."
+            )
+        cpu = torch.device(self.kwargs.get("device", "cpu")).type == "cpu"
+        if cpu and self.config.use_absgrad:
+            self.config = copy(self.config)
+            self.config.use_absgrad = False
+            self.config.densify_grad_thresh *= PLAIN
+        with _on_cpu(cpu), _without_downloads():
+            super().populate_modules()
+
+    def get_outputs(self, camera: Any) -> Any:
+        """As splatfacto; only training asks for gradients."""
+        wanted = torch.is_grad_enabled() and self.training
+        with _on_cpu(self.device.type == "cpu"), torch.set_grad_enabled(wanted):
+            return super().get_outputs(camera)
+
+    # -- training --------------------------------------------------------------------------------
+
+    def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
+        """As splatfacto, once it is known when stage 2 begins; at the end the gain is said."""
+        trainer = training_callback_attributes.trainer
+        self.begin, self.checkpoints = self.beginning(trainer), trainer.checkpoint_dir
+        self.follow_parameters(training_callback_attributes.optimizers)
+        CONSOLE.log(f"fragprune: stage 2 begins at iteration {self.begin}")
+        if self.config is not trainer.config.pipeline.model:
+            CONSOLE.log(
+                "fragprune: on a CPU densification follows plain gradients, not absolute ones, "
+                f"above {self.config.densify_grad_thresh:g}"
+            )
+        callbacks: list[Any] = super().get_training_callbacks(training_callback_attributes)
+        return [*callbacks, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self.tell)]
+
+    def beginning(self, trainer: Any) -> int:
+        """The iteration at which stage 2 begins: that of the checkpoint, if it has begun there.
+
+        Raises:
+            UsageError: nothing would be learned, or from nothing, or not as this host trains.
+        """
+        settings, start = self.config.fragprune, trainer._start_step
+        end = start + trainer.config.max_num_iterations
+        if trainer.mixed_precision or trainer.use_grad_scaler:
+            raise UsageError(
+                METHOD, "mixed precision", "float32", "Drop --mixed-precision, --use-grad-scaler."
+            )
+        if trainer.world_size > 1:
+            raise UsageError(METHOD, "several GPUs", "one", "Set --machine.num-devices 1.")
+        if settings.target_time is not None or settings.itself:
+            raise UsageError(
+                METHOD,
+                "a target in frame time, or the model's own pictures as target",
+                "a target in fragments, and photographs",
+                "Use --pipeline.model.fragprune.target-speedup, or fragprune finetune on the PLY.",
+            )
+        if self.saved is not None:
+            return int(self.saved["begin"])
+        wanted = self.config.fragprune_from
+        begin: int = max(start, end - settings.iterations if wanted is None else wanted)
+        if begin == 0 or begin >= end:
+            raise UsageError(
+                METHOD,
+                f"stage 2 from iteration {begin} on in a training of iterations {start} to {end}",
+                "some iterations that train, and some of stage 2 after them",
+                "Change --max-num-iterations or --pipeline.model.fragprune.iterations.",
+            )
+        return begin
+
+    def follow_parameters(self, optimizers: Any) -> None:
+        """Give the optimizers the parameters of a loaded checkpoint.
+
+        nerfstudio makes them before it loads, and loading makes new parameters.
+        """
+        for name, parameter in self.gauss_params.items():
+            (group,) = (optimizer := optimizers.optimizers[name]).param_groups
+            (known,) = group["params"]
+            if known is not parameter:
+                group["params"] = optimizers.parameters[name] = [parameter]
+                if known in optimizer.state:
+                    optimizer.state[parameter] = optimizer.state.pop(known)
+
+    def step_cb(self, optimizers: Any, step: int) -> None:
+        """As splatfacto; stage 2 begins here."""
+        learning = isinstance(self.strategy, Still)
+        if self.begin is not None and step >= self.begin and not learning:
+            fragprune_plugins.deactivate()
+            session = fragprune_plugins.activate(
+                "nerfstudio", settings=self.config.fragprune, engine=self.config.fragprune_engine
+            )
+            session.output = self.checkpoints
+            if self.saved is not None:
+                session.take_up(self, thresholds_of(self.saved))
+            self.begin_stage2(optimizers)
+            self.go_on(session)
+        super().step_cb(optimizers, step)
+
+    def begin_stage2(self, optimizers: Any) -> None:
+        """Densification ends. The session attaches here."""
+        self.strategy = Still()
+        factor = self._get_downscale_factor()
+        if factor > 1:
+            CONSOLE.log(
+                f"fragprune: stage 2 learns on photographs of 1/{factor} of their size; "
+                "--pipeline.model.num-downscales 0 gives their own"
+            )
+
+    def go_on(self, session: Session) -> None:
+        """Continue the stage 2 of a checkpoint where it was saved."""
+        state = session.models[self]
+        if self.saved is not None and state.stage is not None:
+            plain = json.loads(self.saved["plain"])
+            state.seen.update(dict.fromkeys(self.saved["views"]))
+            state.stage.load_state_dict(self.saved["tensors"], plain, self.saved["views"])
+
+    def tell(self, step: int) -> None:
+        """Say what was gained, at the end of a training."""
+        session = active_session()
+        if session is None or session.store(self) is None:
+            return
+        session.expect_drawn()
+        done = session.finish()
+        if done.fragments_before is not None and done.fragments_after is not None:
+            CONSOLE.print(
+                f"fragprune: {done.steps} iterations of stage 2 ({done.engine} engine), "
+                f"{done.gaussians} Gaussians; fragments per pixel over training views: "
+                f"{done.fragments_before:.2f} -> {done.fragments_after:.2f}"
+            )
+
+    # -- checkpoints -----------------------------------------------------------------------------
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Thresholds and the state of their learning, for a checkpoint; empty before stage 2."""
+        session = active_session()
+        state = session.models.get(self) if session is not None else None
+        if session is None or state is None:
+            return {}
+        session.expect_rows(self, state, "the checkpoint")
+        if state.stage is None:
+            return self.saved or {}
+        state.stage.check()
+        views = list(state.seen)
+        tensors, plain = state.stage.state_dict(views)
+        return {
+            "begin": self.begin,
+            "views": views,
+            "tensors": tensors,
+            "plain": json.dumps(plain),
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Keep what a checkpoint holds until its Gaussians are there."""
+        self.saved = state or None
+
+    def load_state_dict(self, dict: Any, **kwargs: Any) -> Any:
+        """As splatfacto; then the thresholds apply to what is drawn."""
+        self.saved = None
+        result = super().load_state_dict(dict, **kwargs)
+        session = active_session()
+        if self.saved is not None and session is not None:
+            session.take_up(self, thresholds_of(self.saved))
+        return result
+
+
+def thresholds_of(saved: dict[str, Any]) -> dict[str, Any]:
+    """The state of the store in what a checkpoint holds."""
+    adam_step, steps = json.loads(saved["plain"])["store"]
+    return {**saved["tensors"], "adam_step": adam_step, "steps": steps}
+
+
+def expect_no_script() -> None:
+    """Refuse an exporter that runs as a script: its copy of the exporter is not ours to follow.
+
+    Raises:
+        AlignmentError: it would export without thresholds.
+    """
+    import __main__
+
+    own = getattr(__main__, "ExportGaussianSplat", None)
+    if own is not None and own.__module__ == "__main__":
+        raise AlignmentError(
+            "nerfstudio.scripts.exporter",
+            "run as a script, where thresholds cannot follow its filter",
+            "the command ns-export",
+            "Run: ns-export gaussian-splat ...",
+        )
+
+
+@contextmanager
+def _on_cpu(cpu: bool) -> Iterator[None]:
+    """Inside, nothing goes to a GPU where the model is on the CPU."""
+    with ExitStack() as stack:
+        if cpu:
+            stack.enter_context(_NoCuda())
+        yield
+
+
+@contextmanager
+def _without_downloads() -> Iterator[None]:
+    """Inside, LPIPS is NaN where its weights cannot be downloaded."""
+    from torchmetrics.image import lpip
+
+    original = lpip.LearnedPerceptualImagePatchSimilarity
+
+    def made(*args: Any, **kwargs: Any) -> torch.nn.Module:
+        try:
+            metric: torch.nn.Module = original(*args, **kwargs)
+        except OSError as error:
+            CONSOLE.log(f"fragprune: LPIPS is NaN, its weights cannot be had ({error})")
+            return NoMetric()
+        return metric
+
+    with mock.patch.object(lpip, "LearnedPerceptualImagePatchSimilarity", made):
+        yield

@@ -1,0 +1,96 @@
+"""fragprune run, where stage 2 is a method of the host itself."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from fragprune_plugins.adapting import Finding, HostInfo, MethodAdapter, hookimpl
+from fragprune_plugins.errors import HostFailed, UsageError
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+
+PACKAGE = "a_studio_of_the_tests"
+TRAIN = """
+import sys
+from fragprune_plugins.learning.events import StepStats, Summary
+from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.loading import installed
+
+method, iterations, *rest = sys.argv[1:]
+assert method == "theirs-with-stage-two", method
+if "stops" not in rest:
+    for step in range(int(iterations)):
+        stats = StepStats(step + 1, 9.0, 1e-3, 0.1)
+        installed().tell(hookspecs.fragprune_step, stats=stats)
+    summary = Summary("studio", "cpu", int(iterations), 7, 9.0, 3.0, None, {})
+    installed().tell(hookspecs.fragprune_finished, summary=summary)
+"""
+
+
+class Studio(MethodAdapter):
+    name = "studio"
+    info = HostInfo("Studio", repo="me/studio")
+    seams = ()
+    installed = (PACKAGE,)
+    scripts = (f"{PACKAGE}/train.py",)
+
+    def fingerprint(self, repo):
+        ours = repo.package == PACKAGE
+        return [] if ours else [Finding("error", "other-host", str(repo.root), "a folder")]
+
+    def rewritten(self, arguments, settings, *, stage, from_iter, engine, device):
+        if stage == "joint":
+            raise UsageError("--stage", stage, "auto", "Drop it.")
+        return [f"{arguments[0]}-with-stage-two", str(settings.iterations), *arguments[1:]]
+
+    def dialect(self, repo):
+        raise NotImplementedError
+
+    means = opacities = dialect
+
+
+class Plugin:
+    @hookimpl
+    def fragprune_register_adapters(self, register):
+        register(Studio())
+
+
+@pytest.fixture(autouse=True)
+def _studio(tmp_path, monkeypatch, plug):
+    folder = tmp_path / PACKAGE
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+    (folder / "train.py").write_text(TRAIN)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(Path(__file__).parent)
+    plug(Plugin(), "studio")
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] == PACKAGE]:
+        del sys.modules[name]
+
+
+def ran(*words, **options):
+    options = RunOptions(device="cpu", settings=Settings(iterations=3), **options)
+    return run(["python", "-m", f"{PACKAGE}.train", "theirs", *words], options)
+
+
+def test_the_method_runs_in_place_of_the_named_one_and_its_summary_is_the_runs():
+    summary = ran()
+    assert (summary.adapter, summary.engine, summary.device) == ("studio", "cpu", "cpu")
+    assert (summary.iterations, summary.gaussians) == (3, 7)
+    assert (summary.fragments_before, summary.fragments_after) == (9.0, 3.0)
+    assert [curve["step"] for curve in summary.curves] == [1, 2, 3]
+    assert "own evaluation" in summary.not_compared.remedy
+
+
+def test_a_method_that_ends_before_stage_two_did_not_do_what_was_asked():
+    with pytest.raises(HostFailed, match="before the end of stage 2"):
+        ran("stops")
+
+
+def test_what_the_method_cannot_do_is_refused_before_the_host_runs():
+    with pytest.raises(UsageError, match="Drop it"):
+        ran(stage="joint")

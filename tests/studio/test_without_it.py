@@ -1,0 +1,259 @@
+"""What nerfstudio's adapter promises where nerfstudio is not installed."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import entry_points
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fragprune_nerfstudio import METHOD, Nerfstudio, exported
+from fragprune_nerfstudio.command import rewritten
+from fragprune_nerfstudio.exporting import COLUMNS, rows_among, rows_exported
+from fragprune_plugins import Settings
+from fragprune_plugins.errors import AlignmentError, UsageError
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import command, saving, session
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage import sidecar
+
+# -- what it costs whoever has no nerfstudio
+
+
+def test_nerfstudio_finds_the_method_and_nobody_else_imports_it(python):
+    (entry,) = entry_points(group="nerfstudio.method_configs", name=METHOD)
+    assert entry.value == "fragprune_nerfstudio.method:splatfacto"
+    assert python(
+        "import json, sys\n"
+        "from fragprune_plugins.plugins.loading import load_plugins\n"
+        "names = [adapter.name for adapter in load_plugins().adapters]\n"
+        "print(json.dumps(['nerfstudio' in names, [name for name in sys.modules\n"
+        "    if name.split('.')[0] in ('nerfstudio', 'gsplat', 'torch')]]))"
+    ) == [True, []]
+
+
+def test_a_folder_is_no_nerfstudio(tmp_path):
+    (finding,) = Nerfstudio().fingerprint(HostRepo(tmp_path))
+    assert (finding.level, finding.found) == ("error", "a folder")
+    assert METHOD in finding.remedy
+
+
+# -- the command
+
+
+def rewrite(*words, stage="auto", settings=None, from_iter=None, engine="auto", device="cuda"):
+    settings = settings or Settings(iterations=100)
+    options = {"stage": stage, "from_iter": from_iter, "engine": engine, "device": device}
+    return rewritten(METHOD, list(words), settings, **options)
+
+
+DATA = ["colmap", "--data", "scene"]
+OWN = "--pipeline.model.fragprune"
+
+
+@pytest.mark.parametrize(
+    ("words", "options", "expected"),
+    [
+        ([], {}, {"--max-num-iterations": "30100", f"{OWN}.iterations": "100"}),
+        (["--max-num-iterations", "50"], {}, {"--max-num-iterations": "150"}),
+        (["--max_num_iterations=50"], {}, {"--max-num-iterations": "150"}),
+        (["--load-dir", "x"], {"stage": "finetune"}, {"--max-num-iterations": "100"}),
+        (
+            ["--max-num-iterations", "50"],
+            {"stage": "finetune", "from_iter": 30},
+            {"--max-num-iterations": "50", f"{OWN}-from": "30", f"{OWN}.iterations": "20"},
+        ),
+        ([], {"device": "cuda:1"}, {"--machine.device-type": "cuda"}),
+        ([], {"device": "cpu", "engine": "cpu"}, {f"{OWN}-engine": "cpu"}),
+        ([], {"settings": Settings(train="opacity")}, {f"{OWN}.train": "opacity"}),
+        ([], {"settings": Settings(truncate=False)}, {f"{OWN}.truncate": "False"}),
+    ],
+)
+def test_a_run_of_splatfacto_is_one_of_ours_that_is_longer_by_stage_two(words, options, expected):
+    """Flags of the method go before the words of the data parser, which has its own."""
+    got = rewrite("splatfacto", *words, *DATA, **options)
+    end = got.index("colmap")
+    flags = dict(zip(got[1:end:2], got[2:end:2], strict=True))
+    assert got[0] == METHOD
+    assert got[end:] == DATA
+    assert expected.items() <= flags.items()
+    assert sum("max" in word for word in got) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "options", "remedy"),
+    [
+        ([], {}, "splatfacto"),
+        (["nerfacto"], {}, "splatfacto"),
+        (["splatfacto-big"], {}, "cull-alpha-thresh"),
+        (["splatfacto", "--load-config", "x"], {}, "--load-dir"),
+        (["splatfacto"], {"stage": "joint"}, "--stage"),
+        (["splatfacto"], {"stage": "off"}, "ns-eval"),
+        (["splatfacto"], {"stage": "finetune"}, "--load-dir"),
+        (["splatfacto"], {"stage": "finetune", "from_iter": 30_000}, "--max-num-iterations"),
+        (["splatfacto", "--max-num-iterations", "many"], {}, "Correct it"),
+        (["splatfacto", "--max-num-iterations"], {}, "Correct it"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused(words, options, remedy):
+    with pytest.raises(UsageError) as error:
+        rewrite(*words, **options)
+    assert remedy in error.value.remedy
+
+
+def test_a_command_that_pip_installed_is_run_as_its_module(monkeypatch):
+    entry = SimpleNamespace(module="fragprune_plugins.cli.run")
+    asked = []
+
+    def installed(**words):
+        asked.append(words)
+        return [entry]
+
+    monkeypatch.setattr(command, "entry_points", installed)
+    script, arguments, module = command.split(["ns-train", "splatfacto", "--x"])
+    assert (arguments, module) == (["splatfacto", "--x"], "fragprune_plugins.cli.run")
+    assert script.parts[-2:] == ("cli", "run.py")
+    assert asked == [{"group": "console_scripts", "name": "ns-train"}]
+
+
+def test_a_command_that_is_not_installed_is_refused():
+    with pytest.raises(UsageError, match="ns-nothing"):
+        command.split(["ns-nothing", "splatfacto"])
+
+
+# -- an exported file has some of the model's rows
+
+
+def model(rows: int, seed: int = 0) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    widths = {name: len(columns) for name, columns in COLUMNS.items()}
+    return {name: torch.randn(rows, width, generator=generator) for name, width in widths.items()}
+
+
+def exporters(params, kept):
+    """The exporter's columns: some (M,), some (M, 1)."""
+    return {
+        column: params[name][kept, place].numpy().reshape((-1,) if name == "means" else (-1, 1))
+        for name, columns in COLUMNS.items()
+        for place, column in enumerate(columns)
+    }
+
+
+@given(
+    keys=st.lists(st.integers(0, 3), min_size=1, max_size=12),
+    chosen=st.sets(st.integers(0, 3)),
+)
+def test_any_selection_by_values_is_followed_even_among_equal_rows(keys, chosen):
+    """The exporter's filters look at values, so equal rows stay or go together."""
+    params = {name: each[keys] for name, each in model(4).items()}
+    kept = torch.tensor([key in chosen for key in keys]).nonzero()[:, 0]
+    assert torch.equal(rows_exported(params, exporters(params, kept)), kept)
+
+
+def test_rows_with_nan_are_left_out_by_the_exporter_and_by_us():
+    params = model(5)
+    params["scales"][2, 1] = torch.nan
+    kept = torch.tensor([0, 1, 3, 4])
+    assert torch.equal(rows_exported(params, exporters(params, kept)), kept)
+
+
+@pytest.mark.parametrize("order", [[1, 0, 2], [0, 0, 1], [2, 1]])
+def test_another_order_is_refused(order):
+    params = model(3)
+    with pytest.raises(AlignmentError, match="in its order"):
+        rows_exported(params, exporters(params, torch.tensor(order)))
+
+
+def test_other_values_are_refused():
+    params = model(3)
+    columns = exporters(params, torch.arange(3))
+    columns["opacity"] = columns["opacity"] + 1e-3
+    with pytest.raises(AlignmentError):
+        rows_exported(params, columns)
+
+
+def test_one_of_two_equal_rows_cannot_be_told_and_is_refused():
+    params = {name: each[[0, 0, 1]] for name, each in model(2).items()}
+    with pytest.raises(AlignmentError):
+        rows_exported(params, exporters(params, torch.tensor([0, 2])))
+
+
+@pytest.mark.parametrize("name", ["x", "rot_3"])
+def test_a_file_without_a_column_is_refused(name):
+    params = model(3)
+    columns = exporters(params, torch.arange(3))
+    del columns[name]
+    with pytest.raises(AlignmentError, match=name):
+        rows_exported(params, columns)
+
+
+def test_of_a_model_without_thresholds_nothing_is_followed(monkeypatch):
+    monkeypatch.setattr(session, "_active", SimpleNamespace(last=None))
+    call = SimpleNamespace(arguments={"filename": "splat.ply", "map_to_tensors": {}})
+    path, rows = exported(call)
+    assert (path.name, len(rows)) == ("splat.ply", 0)
+
+
+def test_a_file_of_other_gaussians_is_removed_before_anybody_takes_it(tmp_path, monkeypatch):
+    file = tmp_path / "splat.ply"
+    file.write_text("of another model")
+    own = SimpleNamespace(gauss_params=model(3))
+    monkeypatch.setattr(session, "_active", SimpleNamespace(last=lambda: own))
+    columns = exporters(model(3, seed=1), torch.arange(3))
+    call = SimpleNamespace(arguments={"filename": str(file), "map_to_tensors": columns})
+    with pytest.raises(AlignmentError):
+        exported(call)
+    assert not file.exists()
+
+
+def test_the_crop_of_a_view_has_the_models_rows_by_position_and_rotation():
+    params = model(6)
+    keys = ("means", "quats")
+    inside = torch.tensor([1, 2, 5])
+    drawn = {key: params[key][inside] for key in keys}
+    rows = rows_among({key: params[key] for key in keys}, drawn, "crop")
+    assert torch.equal(rows, inside)
+
+
+def test_the_sidecar_of_an_exported_file_has_the_thresholds_of_its_rows(tmp_path):
+    """A host may say which rows a file has, where positions do not tell."""
+    written = {}
+    store = ThresholdStore.from_falloff(torch.tensor([0.1, 0.2, 0.3, 0.4]))
+    own = SimpleNamespace()
+    known = SimpleNamespace(
+        last=lambda: own,
+        models=SimpleNamespace(get=lambda model: SimpleNamespace(store=store)),
+        adapter=None,
+        write_sidecar=lambda path, store: written.update({path: store}),
+    )
+    path, rows = tmp_path / "splat.ply", torch.tensor([0, 3])
+    call = SimpleNamespace(run=lambda: "done", how=lambda: (path, rows), seam="exporter")
+    assert saving.on_pack(known, call) == "done"
+    torch.testing.assert_close(written[path].values.detach(), torch.tensor([0.1, 0.4]))
+
+
+def test_an_export_without_thresholds_leaves_none_of_an_earlier_one(tmp_path):
+    path = tmp_path / "splat.ply"
+    sidecar.path_beside(path).write_text("of an earlier export")
+    call = SimpleNamespace(run=lambda: None, how=lambda: (path, torch.arange(2)), seam="exporter")
+    saving.on_pack(SimpleNamespace(last=None, models={}), call)
+    assert not sidecar.path_beside(path).exists()
+
+
+def test_an_adapter_of_a_method_can_be_asked_for_before_its_host_is_there(monkeypatch):
+    monkeypatch.setitem(sys.modules, "nerfstudio", None)
+    adapter = Nerfstudio()
+    words = adapter.rewritten(
+        ["splatfacto"],
+        Settings(),
+        stage="auto",
+        from_iter=None,
+        engine="auto",
+        device="cpu",
+    )
+    assert words[0] == METHOD
+    assert METHOD in adapter.use(HostRepo.__new__(HostRepo))
