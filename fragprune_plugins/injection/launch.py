@@ -558,6 +558,8 @@ class _Runner:
             UsageError: nothing would be learned.
         """
         total, file = self.host.iterations, self.host.flags.resume
+        if file:
+            self.adapter.expect_resumable(Path(file))
         resumed = starting.resumed_at(self.host.line, Path(file)) if file else 0
         start = max(resumed, from_iter)
         if start < total - self.host.line.skipped:
