@@ -71,7 +71,7 @@ class HostCommand:
         """
         if self.line.checkpoints_only:
             extra["save_checkpoints"] = self.checkpoints(last)
-        if self.flags.config:
+        if self.line.config and self.flags.config:
             extra["iterations"] = last
         return self.with_flags(scratch, **extra) if extra else self.arguments
 
