@@ -10,13 +10,16 @@ with --data all training views of another data set.
 from __future__ import annotations
 
 import ast
+import contextlib
 import statistics
 import sys
 import time
 from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 
@@ -65,6 +68,20 @@ def milliseconds() -> float:
     return 1e3 * (time.process_time() if args.device == "cpu" else time.perf_counter())
 
 
+@contextlib.contextmanager
+def counted(engine: Any) -> Iterator[list[float]]:
+    """Inside, fragments per pixel of each view that our engine draws are noted."""
+    rasterize, fragments = engine.rasterize, []
+
+    def noting(*given: Any) -> Any:
+        outputs = rasterize(*given)
+        fragments.append(float(outputs.fragments_per_pixel))
+        return outputs
+
+    with mock.patch.object(engine, "rasterize", noting):
+        yield fragments
+
+
 @torch.no_grad()
 def main() -> None:
     """Print quality at the photographs' size, then frame times."""
@@ -82,9 +99,13 @@ def main() -> None:
         return render(camera, model, given, background, cam_type=scene.dataset_type)["render"]
 
     for folder, model in zip(args.models, models, strict=True):
-        pairs = [(draw(c, model).clamp(0, 1), c.original_image[:3].cuda()) for c in cameras]
+        with counted(session.engine(background.device)) as fragments:
+            pairs = [(draw(c, model).clamp(0, 1), c.original_image[:3].cuda()) for c in cameras]
         quality, likeness = (statistics.fmean(f(*pair) for pair in pairs) for f in (psnr, ssim))
-        print(f"{folder}: {len(model.get_xyz)} Gaussians, {quality:.2f} dB, SSIM {likeness:.4f}")
+        each = f"{statistics.fmean(fragments):.2f} fragments per pixel, " if fragments else ""
+        print(
+            f"{folder}: {len(model.get_xyz)} Gaussians, {each}{quality:.2f} dB, SSIM {likeness:.4f}"
+        )
 
     for camera in cameras:
         camera.image_width *= args.enlarge

@@ -91,7 +91,7 @@ def test_training_then_fine_tuning(host, recording, tmp_path, python):
     drawn = subprocess.run(
         [*frames, "--rounds", "1", "--device", "cpu"], check=True, capture_output=True, text=True
     ).stdout
-    first, second = re.findall(r"(\d+) Gaussians, .* dB, SSIM", drawn)
+    first, second = re.findall(r"(\d+) Gaussians, .* per pixel, .* dB, SSIM", drawn)
     assert first == second == str(report["rows"][0])
     assert "2 views of 800x800 pixels" in drawn
     assert len(re.findall(r"ms, least .*x$", drawn, re.MULTILINE)) == 2
