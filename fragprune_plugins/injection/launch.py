@@ -516,6 +516,7 @@ class _Runner:
         if not self.learned:
             return None, {}, None
         try:
+            drawing = self.adapter.drawing(self.repo, self.host.arguments)
             joint = self.options.stage == "joint"  # the model of before is another training's
             if not self.after or not (self.before or joint):
                 raise NotComparedError(
@@ -524,7 +525,6 @@ class _Runner:
                     "a model that the host saved",
                     "Name two models to fragprune compare.",
                 )
-            drawing = self.adapter.drawing(self.repo, self.host.arguments)
             return self.adapter.photographs(self.repo, self.host.arguments), drawing, None
         except NotComparedError as error:
             return None, {}, error
