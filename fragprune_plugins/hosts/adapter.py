@@ -165,6 +165,10 @@ class ConfigFile:
         """Replace the file's values by these; returns the new text."""
         return json.dumps(json.loads(text) | values)
 
+    def copied(self, path: Path, values: dict[str, Any]) -> str:
+        """The text of a copy with these values, which may lie in any folder."""
+        return self.overrule(path.read_text(encoding="utf-8"), values)
+
 
 def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
     """The values of a configuration file by argument name.
@@ -204,6 +208,7 @@ class CommandLine:
         checkpoints_only: only checkpoints hold the model, so every stage writes one at its end.
         skipped: number of iterations of a run without an optimizer step; hosts take none in their
             last one. Stage 2 runs as many extra iterations, so it makes all its steps.
+        made: name of a checkpoint that is made from a PLY, with ``{}`` for the iteration.
         restarts: the host has no checkpoints. ``resume`` names a PLY, from which a new run begins.
             The run counts from 0 and empties its output folder, so stage 2 gets its own folder.
         resolution: flags of the images' size; () if there are none.
@@ -225,6 +230,7 @@ class CommandLine:
     config: ConfigFile | None = None
     checkpoints_only: bool = False
     skipped: int = 0
+    made: str = ".fragprune_{}.pth"
     restarts: bool = False
     resolution: tuple[str, ...] = ()
     images: tuple[str, ...] = ()
@@ -307,6 +313,8 @@ class HostAdapter(ABC):
         installed: import names of the host's packages, if it is installed instead of checked out.
         steps_by_rendering: the host does not call the STEP seam in every iteration. In an iteration
             without that call, the first view drawn with gradients begins the step.
+        scheduled: param groups whose learning rate the host sets in every iteration, also in stage
+            2.
         appearance: param groups of the colour, which ``--train appearance`` also trains.
         inherited: param groups that children copy from their parents bit for bit; this is checked.
         gradients_read: param groups whose gradient the host reads in every iteration. While frozen,
@@ -321,6 +329,7 @@ class HostAdapter(ABC):
     descends_from: tuple[str, ...] = ()
     installed: tuple[str, ...] = ()
     steps_by_rendering = False
+    scheduled: frozenset[str] = frozenset({"xyz"})
     appearance: frozenset[str] = frozenset({"f_dc", "f_rest"})
     inherited: tuple[str, ...] = ()
     gradients_read: frozenset[str] = frozenset()
@@ -389,6 +398,13 @@ class HostAdapter(ABC):
     def view(self, camera: Any) -> int:
         """A key that identifies a training view; by default the object's id."""
         return id(camera)
+
+    def begins_step(self, call: SeamCall) -> bool:
+        """Whether a view drawn with gradients may begin a step; see ``steps_by_rendering``.
+
+        A host may train in several phases, of which not all count.
+        """
+        return True
 
     def model_of(self, call: SeamCall) -> Any:
         """The model of a seam's call: by default the object of the method.
@@ -461,6 +477,9 @@ class ScriptAdapter(HostAdapter):
             last: the iteration at which stage 2 ends.
         """
         raise NotImplementedError(f"{self.name}: one_run needs lengthened()")
+
+    def expect_resumable(self, checkpoint: Path) -> None:
+        """Raise UsageError unless the host can resume from this file and count on from it."""
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """The iteration of a training command after which densification is over.

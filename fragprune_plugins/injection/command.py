@@ -72,13 +72,16 @@ class HostCommand:
         """
         if self.line.checkpoints_only:
             extra["save_checkpoints"] = self.checkpoints(last)
+        if self.line.config and self.flags.config:
+            extra["iterations"] = last
         return self.with_flags(scratch, **extra) if extra else self.arguments
 
     def with_flags(self, scratch: Path, **extra: Any) -> list[str]:
         """Arguments with flags appended; argparse takes the last value of a flag.
 
         A host's configuration file overrides flags. If the command names one, a changed copy
-        replaces it.
+        replaces it. The flags are appended as well, because a host may read the iterations to save
+        at before it reads the file.
 
         Args:
             scratch: folder for that copy.
@@ -89,13 +92,13 @@ class HostCommand:
         """
         given = {self.line.spellings(name)[-1]: value for name, value in extra.items()}
         out = list(self.arguments)
-        if self.line.config and self.flags.config:
-            copy = scratch / self.flags.config.name
-            overrule(self.line.config, self.flags.config, copy, given)
-            return [*out, self.line.config.flag, str(copy)]
         for flag, value in given.items():
             values = value if isinstance(value, list) else [value]
             out += [flag, *map(str, values)]
+        if self.line.config and self.flags.config:
+            copy = scratch / self.flags.config.name
+            overrule(self.line.config, self.flags.config, copy, given)
+            out += [self.line.config.flag, str(copy)]
         return out
 
 
@@ -164,7 +167,7 @@ def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) 
         UsageError: the copy does not hold the values.
     """
     values = {flag.lstrip("-"): value for flag, value in given.items()}
-    copy.write_text(config.overrule(path.read_text(encoding="utf-8"), values), encoding="utf-8")
+    copy.write_text(config.copied(path, values), encoding="utf-8")
     said = read_config(config, copy)
     if ignored := sorted(name for name in values if said.get(name) != values[name]):
         raise UsageError(

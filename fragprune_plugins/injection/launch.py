@@ -612,6 +612,7 @@ class _Runner:
         if not self.learned:
             return None, {}, None
         try:
+            drawing = self.adapter.drawing(self.repo, self.host.arguments)
             joint = self.options.stage == "joint"  # the model of before is another training's
             if not self.after or not (self.before or joint):
                 raise NotComparedError(
@@ -620,7 +621,6 @@ class _Runner:
                     "a model that the host saved",
                     "Name two models to fragprune compare.",
                 )
-            drawing = self.adapter.drawing(self.repo, self.host.arguments)
             return self.adapter.photographs(self.repo, self.host.arguments), drawing, None
         except NotComparedError as error:
             return None, {}, error
@@ -654,6 +654,8 @@ class _Runner:
             UsageError: nothing would be learned.
         """
         total, file = self.host.iterations, self.host.flags.resume
+        if file:
+            self.adapter.expect_resumable(Path(file))
         resumed = starting.resumed_at(self.host.line, Path(file)) if file else 0
         start = max(resumed, from_iter)
         if start < total - self.host.line.skipped:

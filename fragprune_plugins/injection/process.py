@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import runpy
 import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from unittest import mock
 
 from fragprune_plugins.errors import FragpruneError, HostFailed
@@ -84,6 +85,7 @@ def surroundings(device: str) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         stack.enter_context(host_checkpoints())
         stack.enter_context(_host_pictures())
+        stack.enter_context(mock.patch.object(os, "execv", _refuse_to_start_again))
         stack.enter_context(cpu_only() if device == "cpu" else current_gpu(device))
         yield
 
@@ -184,6 +186,16 @@ def checkpoint_values() -> list[Any]:
 
     scalar: Any = np.float64(0).__reduce__()[0]
     return [scalar, np.dtype, *(type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8"))]
+
+
+def _refuse_to_start_again(program: str, arguments: list[str]) -> NoReturn:
+    """In place of ``os.execv``: a host that starts itself again would run without fragprune."""
+    raise HostFailed(
+        Path(sys.argv[0]).name,
+        "an attempt to start itself again, as some hosts do where their loss is NaN",
+        "a run that reaches its end",
+        "Read the host's own message above.",
+    )
 
 
 @contextlib.contextmanager

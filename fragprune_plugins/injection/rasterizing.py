@@ -58,7 +58,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
         adopt(session, model, *session.unpacked)
     state, view = session.models.get(model), session.adapter.view(call.first)
     begins = session.adapter.steps_by_rendering and session.learn and torch.is_grad_enabled()
-    if begins and state is not None and not state.begun:
+    if begins and state is not None and not state.begun and session.adapter.begins_step(call):
         begin_step(session, model, state)
     again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
     measured = session.settings.target_speedup is not None  # a kept view keeps its model alive

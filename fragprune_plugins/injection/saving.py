@@ -44,6 +44,12 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
     return result
 
 
+def on_also(session: SessionState, call: SeamCall) -> Any:
+    """Save, unless the host repeats steps: the run before saved it, and nothing has trained."""
+    state = session.models.get(call.model)
+    return None if state is not None and state.replaying else call.run()
+
+
 def check_learned(session: SessionState, model: Any) -> None:
     """Raise DivergedError, before a save, if a learning model has NaN or infinity."""
     state = session.models.get(model)
@@ -212,6 +218,7 @@ OF_CALLS: dict[Role, Callable[..., Any]] = {
 
 OF_MODELS: dict[Role, Callable[..., Any]] = {
     Role.SAVE: on_save,
+    Role.ALSO: on_also,
     Role.LOAD: on_load,
     Role.CAPTURE: on_capture,
     Role.RESTORE: on_restore,

@@ -102,9 +102,11 @@ def resumed_at(line: CommandLine, checkpoint: Path) -> int:
 def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterator[Path]:
     """Yields a file that the host can resume; a checkpoint made from a PLY exists only inside."""
     if start.path.suffix != ".ply" or line.restarts:
+        adapter.expect_resumable(start.path)
         yield start.path
         return
-    made = start.path.with_name(f".fragprune_{start.iteration}.pth")
+    made = start.path.with_name(line.made.format(start.iteration))
+    adapter.expect_resumable(made)
     adapter.checkpoint_from_ply(start.path, start.iteration, made)
     try:
         yield made

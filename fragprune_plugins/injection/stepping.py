@@ -142,7 +142,7 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
         if trained is not None and name not in trained:
             for parameter in group["params"]:
                 parameter.grad = None
-        elif stage is not None and name in rates and name != "xyz":  # the host sets this rate
+        elif stage is not None and name in rates and name not in session.adapter.scheduled:
             lent.append((group, group["lr"]))
             group["lr"] = stage.rate(name, rates[name])
     expect_sound(session, model, state)

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from fragprune_plugins.storage.ply import SplatFile
 
 
+DEFORMATION = "deformation.pth"
+"""The network that 4DGaussians saves beside a PLY."""
+
+
 class Model(NamedTuple):
     """A trained splat and how far each of its Gaussians reaches.
 
@@ -40,7 +44,7 @@ def load(
         device: the device of the result.
 
     Raises:
-        ModelFileError: the model cannot be read.
+        ModelFileError: the model cannot be read, or is drawn only after a network has moved it.
         SidecarError: the sidecar is lost, broken, another model's, or has another number of rows.
     """
     from fragprune_plugins.errors import SidecarError
@@ -48,6 +52,7 @@ def load(
     from fragprune_plugins.storage import formats, sidecar
 
     path = Path(path)
+    _expect_whole(path)
     paired = truncation and formats.found(path).paired
     while True:  # until nobody replaced the pair meanwhile
         before = _versions(path)
@@ -64,6 +69,20 @@ def load(
         else:
             if _versions(path) == before:
                 return Model(splat, None if store.neutral else store)
+
+
+def _expect_whole(path: Path) -> None:
+    """Raise ModelFileError if the file is drawn only after a network has moved its Gaussians."""
+    from fragprune_plugins.errors import ModelFileError
+
+    if path.with_name(DEFORMATION).exists():
+        raise ModelFileError(
+            str(path),
+            f"Gaussians that no view shows: the network beside them ({DEFORMATION}) moves them for "
+            "each moment",
+            "a model that one file holds",
+            "Draw it with its training code: fragprune run -- python render.py -m OUTPUT.",
+        )
 
 
 def _versions(path: Path) -> list[tuple[int, ...] | None]:

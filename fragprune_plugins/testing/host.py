@@ -314,12 +314,12 @@ def densify_and_prune(model: Any, arguments: Any, chance: Chance, *more: Any) ->
 
 
 def _takes_radii(method: Any) -> bool:
-    return "radii" in inspect.signature(method).parameters
+    return method is not None and "radii" in inspect.signature(method).parameters
 
 
 def _with_radii(model: Any) -> None:
     """Keep radii on the model meanwhile, as revisions do whose ``densify_and_prune`` takes them."""
-    if _takes_radii(model.densify_and_prune):
+    if _takes_radii(getattr(model, "densify_and_prune", None)):
         model.tmp_radii = torch.ones(len(model.get_xyz))
 
 

@@ -11,6 +11,7 @@ from miniatures.lp_3dgs import LPHost
 from miniatures.mcmc import MCMCHost
 from miniatures.mini_splatting import MiniSplattingHost
 from miniatures.mip_splatting import MipHost
+from miniatures.moving import MovingHost
 from miniatures.rain_gs import RainHost
 from miniatures.rt_4dgs import RT4DGSHost
 from miniatures.speedy_splat import SpeedyHost
@@ -20,7 +21,7 @@ from fragprune_plugins.testing import Host
 
 HOSTS = (
     *(Host, MCMCHost, LightGaussianHost, MiniSplattingHost, MipHost, RainHost, RT4DGSHost),
-    *(SpeedyHost, LPHost, SurfelHost),
+    *(SpeedyHost, LPHost, SurfelHost, MovingHost),
 )
 OURS = {path.stem for path in Path(__file__).parents[1].iterdir()}
 

@@ -170,6 +170,7 @@ class GraphdecoAdapter(ScriptAdapter):
         own_names: "module:name" of names that only this host's source mentions, not its ancestors'.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
+        checkpoints: how names of checkpoints begin, before the iteration.
         densifies_until: arguments with the iterations after which the host adds, relocates, prunes
             and resets no Gaussian; () if it does so to its end.
     """
@@ -184,6 +185,7 @@ class GraphdecoAdapter(ScriptAdapter):
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
     densifies_until: tuple[str, ...] = ("densify_until_iter",)
+    checkpoints = "chkpnt"
     inherited = ("f_dc", "rotation")
     seams = (
         *MODEL_SEAMS,
@@ -334,11 +336,20 @@ class GraphdecoAdapter(ScriptAdapter):
         return read_ply(ply)
 
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
-        """Write the tuple of ``capture``, with fresh moments and the sidecar's thresholds."""
+        """Write the tuple of ``captured``."""
+        import torch
+
+        from fragprune_plugins.storage.atomic import replacing
+
+        capture = self.captured(ply)
+        with replacing(target) as temporary:
+            torch.save((capture, iteration), temporary)
+
+    def captured(self, ply: Path) -> tuple[Any, ...]:
+        """The host's ``capture`` of a PLY: fresh moments, and the sidecar's thresholds."""
         import torch
 
         from fragprune_plugins.storage import sidecar
-        from fragprune_plugins.storage.atomic import replacing
 
         m = self.read_model(ply)
         rows = len(m.xyz)
@@ -358,7 +369,7 @@ class GraphdecoAdapter(ScriptAdapter):
         state: dict[str, Any] = optimizer.state_dict()
         if sidecar.lies_beside(ply):
             state[CHECKPOINT_KEY] = sidecar.load(ply, rows)[0].state_dict()
-        capture = (
+        return (
             m.sh_degree,
             parameters["xyz"],
             parameters["f_dc"],
@@ -372,8 +383,6 @@ class GraphdecoAdapter(ScriptAdapter):
             state,
             0.0,
         )
-        with replacing(target) as temporary:
-            torch.save((capture, iteration), temporary)
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
         """The command's photographs, if it holds views out (``--eval``)."""
@@ -410,7 +419,7 @@ class GraphdecoAdapter(ScriptAdapter):
         return output / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """``chkpnt*.pth`` and PLYs.
+        """Checkpoints and PLYs.
 
         The host writes a checkpoint after the PLY of the same iteration.
         """
@@ -419,7 +428,8 @@ class GraphdecoAdapter(ScriptAdapter):
             for path in output.glob("point_cloud/iteration_*/point_cloud.ply")
         }
         checkpoints = {
-            path: path.stem.removeprefix("chkpnt") for path in output.glob("chkpnt*.pth")
+            path: path.stem.removeprefix(self.checkpoints)
+            for path in output.glob(f"{self.checkpoints}*.pth")
         }
         found = [
             (path.stat().st_mtime_ns, int(number), path in checkpoints, path)

@@ -1,0 +1,238 @@
+"""hustvl/4DGaussians: Gaussians that a network moves, turns and scales with time.
+
+A training has two phases in one process, each of which counts its iterations from 1. "coarse"
+trains still Gaussians. "fine" also trains the network, which changes them for each view's moment.
+Stage 2 belongs to "fine" alone. The phase is an argument of ``render``, so the first view drawn in
+an iteration tells whether a step of stage 2 begins.
+
+The PLY holds the Gaussians as the network finds them, which no moment shows. The network lies
+beside it, in ``deformation.pth``.
+"""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NoReturn
+
+from fragprune_4dgaussians.config import PythonFile
+from fragprune_plugins.adapting import (
+    CommandLine,
+    Door,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    HostRepo,
+    ModelFileError,
+    NotComparedError,
+    RasterInputs,
+    RasterizerCall,
+    RasterOutputs,
+    Role,
+    Seam,
+    SeamCall,
+    UsageError,
+    graphdeco,
+    hookimpl,
+    revised,
+)
+
+OUTPUTS = 3
+"""Colour, radii and depth."""
+
+STATE = 12
+"""The place of the optimizer's state in a checkpoint."""
+
+_NETWORK = Door(
+    ModelFileError,
+    "not readable as a part of the model",
+    "deformation.pth and deformation_table.pth, which the host writes beside a PLY",
+    "Name a checkpoint instead.",
+)
+
+
+@dataclass(frozen=True)
+class MovingDialect(GraphdecoDialect):
+    """Vanilla's call of 2023 with depth as third output."""
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Translate the call; depth is drawn as a feature.
+
+        Matrices of PanopticSports scenes have one more dimension, of size 1.
+        """
+        s = call.settings
+        flat = {name: getattr(s, name).reshape(4, 4) for name in ("viewmatrix", "projmatrix")}
+        inputs = super().unpack(replace(call, settings=s._replace(**flat)))
+        view = flat["viewmatrix"]
+        depth = call["means3D"].detach() @ view[:3, 2:3] + view[3, 2]
+        return replace(inputs, splats=replace(inputs.splats, features=depth), planes=())
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
+        """(colour (3, H, W), radii (P,) int32, depth (1, H, W): the sum of z alpha T).
+
+        The host's rasterizer does not differentiate depth.
+        """
+        assert outputs.features is not None  # unpack asked for it
+        return outputs.image, outputs.radii, outputs.features.detach()
+
+    def spares(self) -> dict[str, ModuleType]:
+        """Stand-ins for packages that the host imports and does not use to train or draw."""
+        names = ("open3d", "lpips", "tkinter")
+        spares = {name: ModuleType(name, "Stand-in of fragprune: empty.") for name in names}
+        vars(spares["tkinter"])["W"] = "w"  # imported by name
+        return spares
+
+
+def completed(call: SeamCall) -> Any:
+    """Add to a checkpoint made from a PLY what only the new model has.
+
+    These are the scene's extent and the optimizer's groups, whose number of parameters depends on
+    the network.
+    """
+    capture = list(call.first)
+    if not capture[STATE]["param_groups"]:
+        capture[STATE] = capture[STATE] | call.model.optimizer.state_dict()
+        capture[-1] = call.model.spatial_lr_scale
+    return tuple(capture)
+
+
+class MovingGaussians(GraphdecoAdapter):
+    """The adapter of 4DGaussians."""
+
+    name = "4dgaussians"
+    descends_from = ("vanilla-3dgs",)
+    info = HostInfo(
+        "4DGaussians",
+        repo="hustvl/4DGaussians",
+        states="October 2024",
+        limits=(
+            "Its PLY alone is no model: fragprune finetune, render and compare refuse it; its own "
+            "render.py draws it with thresholds.",
+            "merge_many_4dgs.py and export_perframe_3DGS.py know no thresholds.",
+            "No path of an output folder may contain 'coarse', which the host takes for a phase.",
+        ),
+    )
+    calls = (RasterizerCall(outputs=OUTPUTS),)
+    groups = ("xyz", "deformation", "grid", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+    scheduled = frozenset({"xyz", "deformation", "grid"})
+    own_names = (f"{graphdeco.MODEL}:save_deformation", f"{graphdeco.MODEL}:_deformation_table")
+    dialect_type = MovingDialect
+    steps_by_rendering = True
+    checkpoints = "chkpnt_fine_"
+    seams = (
+        *revised(
+            GraphdecoAdapter.seams,
+            {
+                "GaussianModel.update_learning_rate": None,  # it does not know the phase
+                "GaussianModel.densify_and_prune": {"attribute": "GaussianModel.densify"},
+                "GaussianModel.restore": {"how": completed},
+                "render": {"needs": ("viewpoint_camera", "pc", "stage")},
+            },
+        ),
+        Seam(Role.STILL, graphdeco.MODEL, "GaussianModel.prune"),
+        Seam(Role.ALSO, graphdeco.MODEL, "GaussianModel.save_deformation", ("path",)),
+    )
+
+    # -- its command line ------------------------------------------------------------------------
+
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """The flags, and a Python file that overrides them."""
+        return replace(
+            super().command_line(repo),
+            config=PythonFile("--configs"),
+            made=".fragprune_fine_{}.pth",
+            hold_out=(),
+        )
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """The same command, with the output folder that ``--expname`` means.
+
+        Raises:
+            UsageError: the host would not resume from a file in that folder.
+        """
+        parser = ArgumentParser(add_help=False)
+        parser.add_argument("-m", "--model_path", default="")
+        parser.add_argument("--expname", default="")
+        flags, _ = parser.parse_known_args(arguments)
+        named = bool(flags.model_path) or not flags.expname
+        folder = flags.model_path if named else os.path.join("output", flags.expname)
+        self.expect_resumable(Path(folder, f"{self.checkpoints}0.pth"))
+        return script, arguments if named else [*arguments, "--model_path", folder]
+
+    def expect_resumable(self, checkpoint: Path) -> None:
+        """Raise UsageError unless the host takes a checkpoint for one of "fine".
+
+        The host looks for the words "coarse" and "fine" in the whole path.
+        """
+        path = str(checkpoint)
+        if "fine" in path and "coarse" not in path:
+            return
+        of_coarse = checkpoint.name.startswith("chkpnt_coarse")
+        raise UsageError(
+            path,
+            "a checkpoint of the phase coarse" if of_coarse else "a path that the host misreads",
+            "a path with 'fine' and without 'coarse', by which the host tells phases apart",
+            "Finish the training first, with --stage off."
+            if of_coarse
+            else "Rename the file or its folder, or name it by a shorter path.",
+        )
+
+    def begins_step(self, call: SeamCall) -> bool:
+        """Whether the view is of the phase "fine"."""
+        return "fine" in call.arguments["stage"]
+
+    def view(self, camera: Any) -> int:
+        """The camera's number, because the host copies cameras and loads them again.
+
+        Cameras of PanopticSports are dicts without a number: their moment and place tell them
+        apart.
+        """
+        if isinstance(camera, dict):
+            place = camera["camera"].viewmatrix.flatten().tolist()
+            return hash((camera["time"], *place))
+        return int(camera.uid)
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
+        """Refuse: our readers do not know the network."""
+        raise NotComparedError(
+            "4DGaussians",
+            "Gaussians that a network moves for each moment",
+            "models that our readers can draw",
+            "Draw with fragprune run -- python render.py -m OUTPUT --skip_train --skip_video; "
+            "the host's metrics.py measures the pictures.",
+        )
+
+    # -- its files -------------------------------------------------------------------------------
+
+    def save_model(self, model: Any, output: Path, iteration: int) -> Path:
+        """Save PLY and network, as ``scene.save`` does."""
+        path = super().save_model(model, output, iteration)
+        model.save_deformation(str(path.parent))
+        return path
+
+    def captured(self, ply: Path) -> tuple[Any, ...]:
+        """The host's ``capture`` of a PLY and of the network beside it; see ``completed``."""
+        degree, means, *rest, state, extent = super().captured(ply)
+        network, table = (_part(ply, name) for name in ("deformation", "deformation_table"))
+        unknown: dict[str, Any] = {"state": {}, "param_groups": []}
+        return degree, means, network, table, *rest, state | unknown, extent
+
+
+def _part(ply: Path, name: str) -> Any:
+    """A file that the host wrote beside a PLY."""
+    import torch
+
+    with _NETWORK.reading(ply.with_name(f"{name}.pth")) as reading:
+        return torch.load(reading.file, map_location="cpu", weights_only=True)
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Register the adapter of 4DGaussians."""
+    register(MovingGaussians())

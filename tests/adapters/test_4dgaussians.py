@@ -1,0 +1,472 @@
+"""4DGaussians: two phases, a network beside the PLY and Python configurations, on a miniature."""
+
+from __future__ import annotations
+
+import os
+import runpy
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import torch
+from miniatures import runs
+from miniatures.moving import MovingHost
+from PIL import Image
+
+from fragprune_4dgaussians import MovingGaussians
+from fragprune_4dgaussians.config import PythonFile
+from fragprune_plugins.errors import HostFailed, Interrupted, ModelFileError, UsageError
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import stepping
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.storage import models, sidecar
+from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.testing.host import joint, running
+from reference_renderer import Camera, Gaussians, render
+
+LAST = 20
+OPTIONS = runs.OPTIONS
+EVERYTHING = replace(OPTIONS, settings=Settings(iterations=8, threshold_lr=0.3))
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    return runs.written(MovingHost, tmp_path_factory.mktemp("moving"))
+
+
+@pytest.fixture(scope="module")
+def trained(mini, photographs, tmp_path_factory):
+    """An output folder after the host's own training."""
+    out = tmp_path_factory.mktemp("trained") / "out"
+    words = command(mini, photographs, out, "--checkpoint_iterations", 6, LAST)
+    run(words, replace(OPTIONS, stage="off"))
+    return out
+
+
+@pytest.fixture
+def output(trained, tmp_path):
+    """A copy of it, with the times of its files."""
+    return Path(shutil.copytree(trained, tmp_path / "out"))
+
+
+def command(mini, photographs, out, *more, iterations=LAST):
+    return runs.command(mini / "train.py", photographs, out, iterations, *more)
+
+
+def of(mini, **options):
+    return {"path": mini, "adapter": MovingGaussians(), "driver": MovingHost()} | options
+
+
+def load(path):
+    return torch.load(path, weights_only=False)
+
+
+def network(ply):
+    return load(ply.with_name("deformation.pth"))
+
+
+def same(one, other):
+    return all(torch.equal(one[name], other[name]) for name in one)
+
+
+# -- runs ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [OPTIONS, EVERYTHING], ids=["opacity", "all"])
+def test_stage_2_goes_on_from_the_fine_phase_and_repeats_no_coarse_one(
+    mini, photographs, tmp_path, options
+):
+    words = command(mini, photographs, tmp_path / "out")
+    summary = run(words, options)
+    before, after = summary.model_before, summary.model_after
+    assert (before.parent.name, after.parent.name) == ("iteration_20", "iteration_29")
+    assert summary.iterations == 8
+    assert summary.fragments_after < summary.fragments_before
+    frozen = options is OPTIONS
+    assert (runs.frozen_differences(before, after) == []) == frozen
+    assert same(network(before), network(after)) == frozen
+    store, info = sidecar.load(after)
+    assert (len(store), store.steps) == (summary.gaussians, 8)
+    assert info.adapter == "4dgaussians"
+    assert summary.photographs is None
+    assert "network" in summary.not_compared.found
+    assert not list((tmp_path / "out").glob("chkpnt_coarse*"))
+
+
+def test_one_run_learns_after_an_iteration_of_the_fine_phase_alone(mini, photographs, tmp_path):
+    """The coarse phase reaches that iteration first, and must train on as if nothing were."""
+    more = ("--coarse_iterations", 14, "--checkpoint_iterations", 9, 14, 16, LAST)
+    summary = run(
+        command(mini, photographs, tmp_path / "out", *more),
+        replace(OPTIONS, stage="finetune", from_iter=9),
+    )
+    assert summary.iterations == LAST - 9 - 1
+    assert "network" in summary.not_compared.found  # whatever else is missing
+    files = ("coarse_9", "coarse_14", "fine_9", "fine_16", f"fine_{LAST}")
+    nine, fourteen, fine, early, late = (
+        load(tmp_path / "out" / f"chkpnt_{name}.pth")[0] for name in files
+    )
+    assert nine[1].shape != fourteen[1].shape or not torch.equal(nine[1], fourteen[1])
+    assert not any("fragprune" in each[12] for each in (nine, fourteen, fine))
+    assert torch.equal(early[1], late[1])
+    assert not torch.equal(early[8], late[8])
+    assert late[12]["fragprune"]["steps"] == LAST - 9 - 1
+
+
+def test_joint_learning_counts_fine_iterations_and_follows_rows(mini, photographs, tmp_path):
+    options = replace(OPTIONS, stage="joint", from_iter=3)
+    summary = run(command(mini, photographs, tmp_path / "out"), options)
+    store, _ = sidecar.load(summary.model_after)
+    assert summary.iterations == LAST - 1
+    assert store.steps == LAST - 1 - 3
+    assert len(store) == summary.gaussians != 150
+
+
+def test_the_end_of_densification_is_that_of_the_command(mini):
+    adapter, repo = MovingGaussians(), HostRepo(mini)
+    script = mini / "train.py"
+    assert adapter.densified(repo, script, ["--densify_until_iter", "77"]) == 77
+    assert adapter.densified(repo, script, []) == 15_000
+
+
+def test_a_newer_checkpoint_of_the_first_phase_is_no_start(mini, photographs, output):
+    coarse = output / "chkpnt_coarse_6.pth"
+    os.utime(coarse)
+    summary = run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
+    assert summary.model_after.parent.name == f"iteration_{LAST + 9}"
+
+
+@pytest.mark.parametrize("stage", ["auto", "finetune", "joint"])
+def test_checkpoints_of_the_first_phase_are_refused(mini, photographs, output, stage):
+    words = command(mini, photographs, output, "--start_checkpoint", output / "chkpnt_coarse_6.pth")
+    with pytest.raises(UsageError, match="phase coarse") as caught:
+        run(words, replace(OPTIONS, stage=stage, from_iter=3 if stage == "joint" else None))
+    assert "--stage off" in caught.value.remedy
+
+
+def test_a_folder_whose_name_the_host_takes_for_a_phase_is_refused_before_training(
+    mini, photographs, tmp_path
+):
+    out = tmp_path / "coarse-to-fine"
+    with pytest.raises(UsageError, match="coarse-to-fine"):
+        run(command(mini, photographs, out), OPTIONS)
+    assert not out.exists()
+
+
+def test_stage_2_starts_from_a_ply_and_the_network_beside_it(mini, photographs, output):
+    for checkpoint in output.glob("*.pth"):
+        checkpoint.unlink()
+    summary = run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
+    before, after = summary.model_before, summary.model_after
+    assert runs.frozen_differences(before, after) == []
+    assert same(network(before), network(after))
+    assert summary.fragments_after < summary.fragments_before
+    assert not list(output.rglob(".fragprune*"))
+
+
+def test_a_ply_without_its_network_is_no_start(mini, photographs, output):
+    for file in [*output.glob("*.pth"), *output.rglob("deformation.pth")]:
+        file.unlink()
+    with pytest.raises(ModelFileError, match=r"deformation\.pth"):
+        run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
+
+
+def test_the_folder_that_expname_means_is_found(mini, photographs, trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(trained, tmp_path / "output" / "a" / "b")
+    words = command(mini, photographs, "x", "--expname", "a/b")
+    place = words.index("-m")
+    summary = run(words[:place] + words[place + 2 :], replace(OPTIONS, stage="finetune"))
+    assert summary.model_after.resolve().is_relative_to(tmp_path / "output" / "a" / "b")
+
+
+def test_a_host_that_starts_itself_again_fails(mini, photographs, tmp_path):
+    words = command(mini, photographs, tmp_path / "out", "--nan_at", 3)
+    with pytest.raises(HostFailed, match="start itself again"):
+        run(words, replace(OPTIONS, stage="off"))
+
+
+def test_its_render_script_draws_with_thresholds(mini, photographs, output):
+    summary = run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
+    words = [str(mini / "render.py"), "-m", str(output), "--skip_train", "--iteration"]
+    drawn = []
+    for thresholds in (True, False):
+        if not thresholds:
+            summary.model_after.with_suffix(".fragprune.safetensors").unlink()
+        run([*words, str(LAST + 9)], RunOptions(device="cpu", stage="off"))
+        (picture,) = (output / "test" / f"ours_{LAST + 9}" / "renders").glob("*.png")
+        drawn.append(Image.open(picture).tobytes())
+    assert drawn[0] != drawn[1]
+
+
+# -- configuration ---------------------------------------------------------------------------------
+
+
+class Config(dict):
+    """What mmcv 1 makes of a file of plain dicts."""
+
+    @classmethod
+    def fromfile(cls, path):
+        values = {k: v for k, v in runpy.run_path(path).items() if not k.startswith("__")}
+        bases = values.pop("_base_", [])
+        found = cls()
+        for base in [bases] if isinstance(bases, str) else bases:
+            found = cls(_merged(found, cls.fromfile(str(Path(path).parent / base))))
+        return cls(_merged(found, values))
+
+
+def _merged(one, other):
+    both = [key for key in other if isinstance(one.get(key), dict)]
+    return {**one, **other, **{key: _merged(one[key], other[key]) for key in both}}
+
+
+@pytest.fixture(params=["as mmcv reads", "mmcv"])
+def mmcv(request, monkeypatch):
+    if request.param == "mmcv":
+        module = pytest.importorskip("mmcv")
+        if not hasattr(module, "Config"):
+            pytest.skip("mmcv 2 reads no configurations; the host needs mmcv 1")
+        return
+    module = ModuleType("mmcv")
+    module.Config = Config
+    monkeypatch.setitem(sys.modules, "mmcv", module)
+
+
+@pytest.fixture
+def config(tmp_path):
+    (tmp_path / "base.py").write_text(
+        "ModelHiddenParams = dict(net_width=4, resolution_t=3)\n"
+        f"OptimizationParams = dict(iterations={LAST}, coarse_iterations=3)\n"
+    )
+    file = tmp_path / "scene.py"
+    file.write_text(
+        "_base_ = './base.py'\nModelHiddenParams = dict(resolution_t=4)\n"
+        "PipelineParams = dict(debug=False)\n"
+    )
+    return file
+
+
+def test_a_copy_in_another_folder_says_the_same_and_the_new_values(mmcv, config, tmp_path):
+    file = PythonFile("--configs")
+    known = {"net_width": 4, "resolution_t": 4, "iterations": LAST, "coarse_iterations": 3}
+    known["debug"] = False
+    assert file.read(config) == known
+    values = {"iterations": 7, "start_checkpoint": "a b/c'd.pth", "checkpoint_iterations": [3, 7]}
+    copy = tmp_path / "elsewhere" / "copy.py"
+    copy.parent.mkdir()
+    copy.write_text(file.copied(config, values))
+    assert file.read(copy) == known | values
+    again = tmp_path / "elsewhere" / "again.py"
+    again.write_text(file.copied(copy, {"iterations": 9}))
+    assert file.read(again) == known | values | {"iterations": 9}
+
+
+def test_the_file_wins_and_stage_2_still_ends_where_it_should(
+    mmcv, mini, photographs, config, tmp_path
+):
+    text = config.read_text()
+    words = command(mini, photographs, tmp_path / "out", "--configs", config, iterations=1000)
+    summary = run(words, OPTIONS)
+    assert summary.iterations == 8
+    assert summary.model_after.parent.name == f"iteration_{LAST + 9}"
+    assert load(tmp_path / "out" / f"chkpnt_fine_{LAST}.pth")[1] == LAST
+    assert network(summary.model_after)["grid_planes"].shape == (4, 4)
+    assert config.read_text() == text
+
+
+def test_one_run_saves_its_model_where_the_file_ends_it(mmcv, mini, photographs, config, tmp_path):
+    words = command(mini, photographs, tmp_path / "out", "--configs", config, iterations=1000)
+    summary = run(words, replace(OPTIONS, stage="joint", from_iter=3))
+    assert summary.model_after.parent.name == f"iteration_{LAST}"
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # mmcv's own
+@pytest.mark.parametrize("text", [None, "x = (", "OptimizationParams = 3", "raise SystemError"])
+def test_a_file_that_cannot_be_read_is_refused(mmcv, mini, photographs, tmp_path, text):
+    file = tmp_path / "broken.py"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(UsageError, match="--configs"):
+        run(command(mini, photographs, tmp_path / "out", "--configs", file), OPTIONS)
+
+
+def test_without_mmcv_the_error_names_it(mini, photographs, config, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mmcv", None)
+    with pytest.raises(UsageError, match="mmcv 1"):
+        run(command(mini, photographs, tmp_path / "out", "--configs", config), OPTIONS)
+
+
+# -- the model and its files -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("read", ["truncated", "plain"])
+def test_no_command_of_ours_draws_the_ply_as_if_it_were_the_model(output, read):
+    ply = output / "point_cloud" / f"iteration_{LAST}" / "point_cloud.ply"
+    with pytest.raises(ModelFileError, match="network beside them") as caught:
+        models.load(ply, truncation=read == "truncated")
+    assert "render.py" in caught.value.remedy
+
+
+def test_repeated_steps_of_a_killed_run_save_no_network(mini, tmp_path):
+    with running(**of(mini)) as host:
+        model = host.model(16)
+        state = host.models[model]
+        state.steps = state.replayed = 2
+        model.save_deformation(str(tmp_path))
+        assert not list(tmp_path.iterdir())
+        state.steps = 3
+        model.save_deformation(str(tmp_path))
+        assert (tmp_path / "deformation.pth").exists()
+
+
+def test_an_interrupted_stage_2_goes_on_and_keeps_what_it_had_saved(
+    mini, photographs, trained, tmp_path, monkeypatch
+):
+    options = replace(EVERYTHING, stage="finetune", again=False, checkpoint_every=1e-9)
+    results, between = [], []
+    for interrupted in (False, True):
+        out = Path(shutil.copytree(trained, tmp_path / str(interrupted) / "out"))
+        words = command(mini, photographs, out, "--save_iterations", LAST + 3)
+        file = out / "point_cloud" / f"iteration_{LAST + 3}" / "deformation.pth"
+        if interrupted:
+            with monkeypatch.context() as patched:
+                patched.setattr(stepping, "report", at_step(5))
+                with pytest.raises(Interrupted):
+                    run(words, options)
+            between.append(file.read_bytes())
+        results.append(run(words, options).model_after)
+        between.append(file.read_bytes())
+    assert between[1] == between[2]
+    (one, other), (first, second) = map(sidecar.load, results), map(read_ply, results)
+    assert torch.equal(one[0].logits, other[0].logits)
+    assert torch.equal(first.xyz, second.xyz)
+    assert same(*map(network, results))
+
+
+def at_step(step):
+    """Ctrl-C when a step is reported."""
+
+    def report(session, stats):
+        if stats.step == step:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_ctrl_c_leaves_a_ply_and_its_network(mini, tmp_path):
+    with joint(**of(mini, output=tmp_path)) as host:
+        model, camera = host.model(16), host.camera()
+        for iteration in (1, 2):
+            host.step(model, camera, iteration)
+        ply = host.save_interrupted()
+        assert sidecar.lies_beside(ply)
+        assert same(network(ply), model._deformation.state_dict())
+
+
+def test_rates_that_the_host_sets_in_every_iteration_stay_its_own(mini):
+    rates = {}
+    with running(Settings(iterations=20), **of(mini)) as host:
+        model, camera = host.model(16), host.camera()
+
+        def note(optimizer, *_):
+            rates.update({group["name"]: group["lr"] for group in optimizer.param_groups})
+
+        host.step(model, camera, 1)
+        model.optimizer.register_step_pre_hook(note)
+        host.step(model, camera, 9_000)
+        for name, schedule in model.schedules.items():
+            assert rates[name] == schedule(9_000)
+        assert rates["opacity"] < host.arguments.opacity_lr
+
+
+def test_a_batch_is_one_step(mini):
+    with joint(**of(mini)) as host:
+        model, camera = host.model(16), host.camera()
+        for _ in range(3):
+            images = [host.render(camera, model)["render"] for _ in range(2)]
+            torch.stack(images).mean().backward()
+            model.optimizer.step()
+        (state,) = host.models.values()
+        assert state.steps == 3
+
+
+# -- the call --------------------------------------------------------------------------------------
+
+
+class Notes:
+    """Remembers what was rasterized."""
+
+    @hookimpl(tryfirst=True)
+    def fragprune_truncate(self, inputs, store):
+        self.inputs = inputs
+
+
+def test_depth_is_the_sum_of_blended_depths_and_has_no_gradient(mini):
+    notes = Notes()
+    with joint(plugins=[notes], **of(mini, engine="reference")) as host:
+        model, camera = host.model(16), host.camera()
+        host.store(model).open(host.adapter.opacities(model))
+        package = host.render(camera, model)
+        view, splats = notes.inputs.view, notes.inputs.splats
+        depths = splats.means @ view.viewmatrix[:3, 2] + view.viewmatrix[3, 2]
+        assert not torch.equal(splats.means, model.get_xyz)
+        drawn = render(
+            Camera(
+                width=view.width,
+                height=view.height,
+                tan_fov_x=view.tan_fov_x,
+                tan_fov_y=view.tan_fov_y,
+                viewmatrix=view.viewmatrix.double(),
+                projmatrix=view.projmatrix.double(),
+                campos=view.campos.double(),
+                background=torch.zeros(3, dtype=torch.float64),
+            ),
+            Gaussians(
+                means=splats.means.detach().double(),
+                opacities=splats.opacities.detach().double(),
+                scales=splats.scales.detach().double(),
+                rotations=splats.rotations.detach().double(),
+                colors=depths.detach().double()[:, None].repeat(1, 3),
+            ),
+        )
+        depth = package["depth"]
+        torch.testing.assert_close(depth, drawn.image[:1].float(), rtol=1e-4, atol=1e-4)
+        assert not depth.requires_grad
+        assert depth.any()
+
+
+def test_a_camera_that_is_a_dict_draws_the_same_picture(mini):
+    """PanopticSports: its settings are ready, with matrices of one more dimension."""
+    from importlib import import_module
+
+    with joint(**of(mini)) as host:
+        model, camera = host.model(16), host.camera()
+        host.step(model, camera, 1)
+        own = {}
+        draw = import_module("gaussian_renderer").render
+        kind = import_module("diff_gaussian_rasterization").GaussianRasterizer
+
+        def keep(self, raster_settings, original=kind.__init__):
+            original(self, raster_settings)
+            own["settings"] = raster_settings
+
+        kind.__init__ = keep
+        with torch.no_grad():
+            picture = host.render(camera, model)["render"]
+            settings = own["settings"]._replace(
+                viewmatrix=camera.world_view_transform[None],
+                projmatrix=camera.full_proj_transform[None],
+            )
+            given = {"camera": settings, "time": camera.time}
+            pipe, black = host.driver.pipe(), torch.zeros(3)
+            ready = draw(given, model, pipe, black, cam_type="PanopticSports")["render"]
+        assert torch.equal(picture, ready)
+        copied = {"camera": settings._replace(viewmatrix=settings.viewmatrix.clone()), "time": 0.3}
+        assert host.adapter.view(given) == host.adapter.view(copied)
+        assert host.adapter.view(given) != host.adapter.view(given | {"time": 0.4})
+        assert host.adapter.view(SimpleNamespace(uid=5)) == 5

@@ -1,0 +1,595 @@
+"""A miniature 4DGaussians: the demo's host, and a network that moves its Gaussians with time."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from argparse import ArgumentParser
+from importlib import import_module
+from types import SimpleNamespace
+
+import torch
+
+from fragprune_plugins.testing.host import FAINT, Host
+from fragprune_plugins.testing.rewriting import changed, rewrite, without
+
+
+class Added:
+    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
+
+    def __init__(self, sh_degree, args):
+        self.active_sh_degree, self.max_sh_degree = 0, sh_degree
+        self._deformation = deform_network(args)  # noqa: F821 - imported where this is put
+        empty = torch.empty(0)
+        self._xyz, self._features_dc, self._features_rest = empty, empty, empty
+        self._scaling, self._rotation, self._opacity = empty, empty, empty
+        self.max_radii2D, self.xyz_gradient_accum, self.denom = empty, empty, empty
+        self._deformation_table, self.spatial_lr_scale = empty, 0
+        self.optimizer, self.percent_dense = None, 0
+        self.setup_functions()
+
+    def capture(self):
+        return (
+            self.active_sh_degree,
+            self._xyz,
+            self._deformation.state_dict(),
+            self._deformation_table,
+            self._features_dc,
+            self._features_rest,
+            self._scaling,
+            self._rotation,
+            self._opacity,
+            self.max_radii2D,
+            self.xyz_gradient_accum,
+            self.denom,
+            self.optimizer.state_dict(),
+            self.spatial_lr_scale,
+        )
+
+    def restore(self, model_args, training_args):
+        self.active_sh_degree, self._xyz, network, self._deformation_table = model_args[:4]
+        self._features_dc, self._features_rest, self._scaling, self._rotation = model_args[4:8]
+        self._opacity, self.max_radii2D, accumulated, denominator = model_args[8:12]
+        optimizer_state, self.spatial_lr_scale = model_args[12:]
+        self._deformation.load_state_dict(network)
+        self.training_setup(training_args)
+        self.xyz_gradient_accum, self.denom = accumulated, denominator
+        self.optimizer.load_state_dict(optimizer_state)
+
+    def create_from_pcd(self, pcd, spatial_lr_scale, time_line):
+        points = torch.tensor(np.asarray(pcd.points)).float()  # noqa: F821
+        colours = RGB2SH(torch.tensor(np.asarray(pcd.colors)).float())  # noqa: F821
+        self.spatial_lr_scale, n = spatial_lr_scale, len(points)
+        width = torch.sqrt(torch.clamp_min(distCUDA2(points), 1e-7))  # noqa: F821
+        self._adopt(
+            {
+                "xyz": points,
+                "f_dc": colours[:, None, :],
+                "f_rest": torch.zeros(n, (self.max_sh_degree + 1) ** 2 - 1, 3),
+                "opacity": torch.full((n, 1), -2.197),
+                "scaling": width.log()[:, None].repeat(1, 3),
+                "rotation": torch.eye(1, 4).repeat(n, 1),
+            }
+        )
+        self.max_radii2D = torch.zeros(n)
+        self._deformation_table = torch.ones(n, dtype=torch.bool)
+
+    def training_setup(self, training_args):
+        self.percent_dense = training_args.percent_dense
+        self._reset_statistics()
+        extent, network = self.spatial_lr_scale, self._deformation
+        groups = [
+            {
+                "params": [self._xyz],
+                "lr": training_args.position_lr_init * extent,
+                "name": "xyz",
+            },
+            {
+                "params": list(network.get_mlp_parameters()),
+                "lr": training_args.deformation_lr_init * extent,
+                "name": "deformation",
+            },
+            {
+                "params": list(network.get_grid_parameters()),
+                "lr": training_args.grid_lr_init * extent,
+                "name": "grid",
+            },
+            {"params": [self._features_dc], "lr": training_args.feature_lr, "name": "f_dc"},
+            {
+                "params": [self._features_rest],
+                "lr": training_args.feature_lr / 20,
+                "name": "f_rest",
+            },
+            {"params": [self._opacity], "lr": training_args.opacity_lr, "name": "opacity"},
+            {"params": [self._scaling], "lr": training_args.scaling_lr, "name": "scaling"},
+            {"params": [self._rotation], "lr": training_args.rotation_lr, "name": "rotation"},
+        ]
+        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
+        self.schedules = {
+            name: get_expon_lr_func(  # noqa: F821
+                first * extent, last * extent, training_args.position_lr_max_steps
+            )
+            for name, first, last in (
+                ("xyz", training_args.position_lr_init, training_args.position_lr_final),
+                (
+                    "deformation",
+                    training_args.deformation_lr_init,
+                    training_args.deformation_lr_final,
+                ),
+                ("grid", training_args.grid_lr_init, training_args.grid_lr_final),
+            )
+        }
+
+    def update_learning_rate(self, iteration):
+        for group in self.optimizer.param_groups:
+            if group["name"] in self.schedules:
+                group["lr"] = self.schedules[group["name"]](iteration)
+
+    def save_deformation(self, path):
+        torch.save(self._deformation.state_dict(), Path(path) / "deformation.pth")  # noqa: F821
+        torch.save(self._deformation_table, Path(path) / "deformation_table.pth")  # noqa: F821
+        torch.save(self._deformation_accum, Path(path) / "deformation_accum.pth")  # noqa: F821
+
+    def load_model(self, path):
+        names = ("deformation", "deformation_table", "deformation_accum")
+        files = [Path(path) / f"{name}.pth" for name in names]  # noqa: F821
+        network, table, accumulated = (torch.load(file, map_location="cuda") for file in files)
+        self._deformation.load_state_dict(network)
+        self._deformation_table, self._deformation_accum = table, accumulated
+
+    def _prune_optimizer(self, mask):
+        return {
+            group["name"]: self._replace(
+                group, group["params"][0].detach()[mask], lambda moment: moment[mask]
+            )
+            for group in self.optimizer.param_groups
+            if len(group["params"]) == 1
+        }
+
+    def cat_tensors_to_optimizer(self, tensors_dict):
+        grown = {}
+        for group in self.optimizer.param_groups:
+            if len(group["params"]) > 1:
+                continue
+            new = tensors_dict[group["name"]]
+            grown[group["name"]] = self._replace(
+                group,
+                torch.cat((group["params"][0].detach(), new.detach())),
+                lambda moment, new=new: torch.cat((moment, torch.zeros_like(new))),
+            )
+        return grown
+
+    def _reset_statistics(self):
+        n = self.get_xyz.shape[0]
+        self.xyz_gradient_accum, self.denom = torch.zeros((n, 1)), torch.zeros((n, 1))
+        self._deformation_accum = torch.zeros((n, 3))
+
+    def prune_points(self, mask):
+        keep = ~mask
+        self._adopt(self._prune_optimizer(keep))
+        for name in ("xyz_gradient_accum", "denom", "max_radii2D"):
+            setattr(self, name, getattr(self, name)[keep])
+        for name in ("_deformation_table", "_deformation_accum"):
+            setattr(self, name, getattr(self, name)[keep])
+
+    def densification_postfix(
+        self,
+        new_xyz,
+        new_features_dc,
+        new_features_rest,
+        new_opacities,
+        new_scaling,
+        new_rotation,
+        new_deformation_table,
+    ):
+        new = {
+            "xyz": new_xyz,
+            "f_dc": new_features_dc,
+            "f_rest": new_features_rest,
+            "opacity": new_opacities,
+            "scaling": new_scaling,
+            "rotation": new_rotation,
+        }
+        self._adopt(self.cat_tensors_to_optimizer(new))
+        self._deformation_table = torch.cat([self._deformation_table, new_deformation_table])
+        self._reset_statistics()
+        self.max_radii2D = torch.zeros(self.get_xyz.shape[0])
+
+    def _rows(self, chosen, copies=1):
+        names = ("_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation")
+        for tensor in (*(getattr(self, name) for name in names), self._deformation_table):
+            yield tensor[chosen].repeat(copies, *[1] * (tensor.ndim - 1))
+
+    def densify_and_clone(
+        self,
+        grads,
+        grad_threshold,
+        scene_extent,
+        density_threshold=20,
+        displacement_scale=20,
+        model_path=None,
+        iteration=None,
+        stage=None,
+    ):
+        chosen = self._needy(grads, grad_threshold, scene_extent, large=False)
+        self.densification_postfix(*self._rows(chosen))
+
+    def densify_and_split(self, grads, grad_threshold, scene_extent, N=2):
+        chosen = self._needy(grads, grad_threshold, scene_extent, large=True)
+        if not chosen.any():
+            return
+        xyz, dc, rest, opacity, scaling, *others = self._rows(chosen, N)
+        xyz = xyz + torch.normal(torch.zeros_like(xyz), scaling.exp())
+        self.densification_postfix(xyz, dc, rest, opacity, scaling - 0.47, *others)
+        children = torch.zeros(len(xyz), dtype=torch.bool)
+        self.prune_points(torch.cat((chosen, children)))
+
+    def densify(
+        self,
+        max_grad,
+        min_opacity,
+        extent,
+        max_screen_size,
+        density_threshold,
+        displacement_scale,
+        model_path=None,
+        iteration=None,
+        stage=None,
+    ):
+        grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
+        self.densify_and_clone(grads, max_grad, extent)
+        self.densify_and_split(grads, max_grad, extent)
+
+    def prune(self, max_grad, min_opacity, extent, max_screen_size):
+        unwanted = (self.get_opacity < min_opacity).squeeze(-1)
+        if max_screen_size:
+            unwanted |= self.max_radii2D > max_screen_size
+            unwanted |= self.get_scaling.max(dim=1).values > 0.1 * extent
+        self.prune_points(unwanted)
+
+    def add_densification_stats(self, viewspace_point_tensor, update_filter):
+        moved = torch.norm(viewspace_point_tensor[update_filter, :2], dim=-1, keepdim=True)
+        self.xyz_gradient_accum[update_filter] += moved
+        self.denom[update_filter] += 1
+
+    def compute_regulation(self, weight):
+        return weight * self._deformation.grid_planes.diff(dim=0).square().mean()
+
+
+NETWORK = '''"""What a moment does to the Gaussians: features of a grid, a layer for each answer."""
+
+import torch
+from torch import nn
+
+
+class deform_network(nn.Module):
+    def __init__(self, args):
+        super().__init__()
+        self.grid_aabb = nn.Parameter(torch.ones(2, 3), requires_grad=False)
+        self.grid_planes = nn.Parameter(torch.randn(args.resolution, args.net_width))
+        sizes = {"xyz": 3, "scaling": 3, "rotation": 4}
+        self.heads = nn.ModuleDict({k: nn.Linear(args.net_width + 3, n) for k, n in sizes.items()})
+        self.timenet = nn.Linear(1, 2)  # never used
+        self.register_buffer("time_poc", torch.ones(4))
+
+    def get_mlp_parameters(self):
+        return [p for name, p in self.named_parameters() if "grid" not in name]
+
+    def get_grid_parameters(self):
+        return [p for name, p in self.named_parameters() if "grid" in name]
+
+    def forward(self, xyz, scaling, rotation, opacity, shs, time):
+        place = time * (len(self.grid_planes) - 1)
+        below = place.long().clamp(0, len(self.grid_planes) - 2)
+        share = place - below
+        planes = self.grid_planes
+        at = planes[below[:, 0]] * (1 - share) + planes[below[:, 0] + 1] * share
+        hidden = torch.cat([at, xyz], dim=1).sin()
+        moved = {name: 0.1 * head(hidden) for name, head in self.heads.items()}
+        turned = rotation + moved["rotation"]
+        return xyz + moved["xyz"], scaling + moved["scaling"], turned, opacity, shs
+'''
+
+RENDERER = '''"""One view of the model, at its moment in the fine phase."""
+
+import math
+
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+
+
+def render(
+    viewpoint_camera,
+    pc,
+    pipe,
+    bg_color,
+    scaling_modifier=1.0,
+    override_color=None,
+    stage="fine",
+    cam_type=None,
+):
+    screenspace = torch.zeros_like(pc.get_xyz, requires_grad=True) + 0
+    if screenspace.requires_grad:
+        screenspace.retain_grad()
+    if cam_type != "PanopticSports":
+        settings = GaussianRasterizationSettings(
+            image_height=int(viewpoint_camera.image_height),
+            image_width=int(viewpoint_camera.image_width),
+            tanfovx=math.tan(viewpoint_camera.FoVx / 2),
+            tanfovy=math.tan(viewpoint_camera.FoVy / 2),
+            bg=bg_color,
+            scale_modifier=scaling_modifier,
+            viewmatrix=viewpoint_camera.world_view_transform,
+            projmatrix=viewpoint_camera.full_proj_transform,
+            sh_degree=pc.active_sh_degree,
+            campos=viewpoint_camera.camera_center,
+            prefiltered=False,
+            debug=pipe.debug,
+        )
+        time = viewpoint_camera.time
+    else:
+        settings, time = viewpoint_camera["camera"], viewpoint_camera["time"]
+    now = torch.tensor(time).repeat(len(pc.get_xyz), 1)
+    given = (pc.get_xyz, pc._scaling, pc._rotation, pc._opacity, pc.get_features)
+    if "fine" in stage:
+        given = pc._deformation(*given, now)
+    xyz, scaling, rotation, opacity, shs = given
+    rasterizer = GaussianRasterizer(raster_settings=settings)
+    image, radii, depth = rasterizer(
+        means3D=xyz,
+        means2D=screenspace,
+        shs=shs,
+        colors_precomp=None,
+        opacities=pc.opacity_activation(opacity),
+        scales=pc.scaling_activation(scaling),
+        rotations=pc.rotation_activation(rotation),
+        cov3D_precomp=None,
+    )
+    return {
+        "render": image,
+        "viewspace_points": screenspace,
+        "visibility_filter": radii > 0,
+        "radii": radii,
+        "depth": depth,
+    }
+'''
+
+
+class Timed:
+    """A view and its moment."""
+
+    def __init__(self, camera, time):
+        vars(self).update(vars(camera))
+        self.time = time
+
+
+def scene_reconstruction(opt, pipe, gaussians, scene, stage, train_iter, white):
+    """One phase: it counts from 1, and saves under its own names."""
+    iteration = 0
+    gaussians.training_setup(opt)
+    if args.start_checkpoint:  # noqa: F821 - the script's
+        if stage == "coarse" and stage not in args.start_checkpoint:  # noqa: F821
+            return
+        if stage in args.start_checkpoint:  # noqa: F821
+            model_params, iteration = torch.load(args.start_checkpoint)  # noqa: F821
+            gaussians.restore(model_params, opt)
+    cameras = scene.getTrainCameras()
+    views = [Timed(view, number / len(cameras)) for number, view in enumerate(cameras)]
+    background = torch.full((3,), float(white))
+    waiting = []
+    for iteration in range(iteration + 1, train_iter + 1):  # noqa: B020
+        gaussians.update_learning_rate(iteration)
+        if iteration % 1000 == 0:
+            gaussians.oneupSHdegree()
+        images, truths, moved, seen, radii = [], [], [], [], []
+        for _ in range(opt.batch_size):
+            waiting = waiting or copy.deepcopy(views)
+            camera = waiting.pop(random.randrange(len(waiting)))  # noqa: F821
+            package = render(camera, gaussians, pipe, background, stage=stage)  # noqa: F821
+            images.append(package["render"])
+            truths.append(camera.original_image)
+            moved.append(package["viewspace_points"])
+            seen.append(package["visibility_filter"])
+            radii.append(package["radii"])
+        loss = l1_loss(torch.stack(images), torch.stack(truths))  # noqa: F821
+        if stage == "fine":
+            loss = loss + gaussians.compute_regulation(opt.time_smoothness_weight)
+        if iteration == opt.nan_at:
+            loss = loss * float("nan")
+        loss.backward()
+        if torch.isnan(loss).any():
+            print("loss is nan, end training, reexecv program now.")
+            os.execv(sys.executable, [sys.executable, *sys.argv])  # noqa: F821
+        with torch.no_grad():
+            if iteration in args.save_iterations:  # noqa: F821
+                scene.save(iteration, stage)
+            if iteration < opt.densify_until_iter:
+                update = torch.stack(seen).any(0)
+                largest = torch.stack(radii).max(0).values.float()
+                gaussians.max_radii2D[update] = torch.max(gaussians.max_radii2D, largest)[update]
+                gaussians.add_densification_stats(sum(each.grad for each in moved), update)
+                if (
+                    iteration > opt.densify_from_iter
+                    and iteration % opt.densification_interval == 0
+                ):
+                    threshold, extent = opt.densify_grad_threshold, scene.cameras_extent
+                    gaussians.densify(threshold, 0.005, extent, None, 5, 5, "", iteration, stage)
+                    gaussians.prune(threshold, 0.005, extent, None)
+                if iteration % opt.opacity_reset_interval == 0:
+                    gaussians.reset_opacity()
+            if iteration < opt.iterations:
+                gaussians.optimizer.step()
+                gaussians.optimizer.zero_grad(set_to_none=True)
+            if iteration in args.checkpoint_iterations:  # noqa: F821
+                path = f"{scene.model_path}/chkpnt_{stage}_{iteration}.pth"
+                torch.save((gaussians.capture(), iteration), path)
+
+
+def training(dataset, opt, pipe):
+    """Two phases in one process."""
+    dataset.model_path = args.model_path or os.path.join("output", args.expname)  # noqa: F821
+    prepare_output_and_logger(dataset)  # noqa: F821
+    hidden = Namespace(net_width=args.net_width, resolution=args.resolution_t)  # noqa: F821
+    gaussians = GaussianModel(dataset.sh_degree, hidden)  # noqa: F821
+    scene = Scene(dataset, gaussians)  # noqa: F821
+    for stage, last in (("coarse", opt.coarse_iterations), ("fine", opt.iterations)):
+        scene_reconstruction(opt, pipe, gaussians, scene, stage, last, dataset.white_background)
+
+
+class Entry:
+    """Found in a ``Scene`` besides vanilla's methods."""
+
+    def save(self, iteration, stage):
+        name = f"coarse_iteration_{iteration}" if stage == "coarse" else f"iteration_{iteration}"
+        folder = Path(self.model_path) / "point_cloud" / name  # noqa: F821
+        self.gaussians.save_ply(str(folder / "point_cloud.ply"))
+        self.gaussians.save_deformation(str(folder))
+
+
+MERGE = """    args.save_iterations.append(args.iterations)
+    if args.configs:
+        import mmcv
+
+        config = mmcv.Config.fromfile(args.configs)
+        for group in ("OptimizationParams", "ModelHiddenParams", "ModelParams", "PipelineParams"):
+            for key, value in config[group].items() if group in config.keys() else ():
+                if hasattr(args, key):
+                    setattr(args, key, value)
+"""
+OPTIONS = """        self.random_background = False
+        self.coarse_iterations = 6
+        self.batch_size = 2
+        self.deformation_lr_init = 0.002
+        self.deformation_lr_final = 0.0002
+        self.grid_lr_init = 0.01
+        self.grid_lr_final = 0.001
+        self.time_smoothness_weight = 0.01
+        self.nan_at = -1
+"""
+LOADED = "            gaussians.load_ply(self._ply(self.loaded_iter))\n"
+IMPORT = "from scene.deformation import deform_network\n"
+CHANGES = {
+    "scene/gaussian_model.py": [
+        ("from torch import nn\n", "from torch import nn\n" + IMPORT),
+    ],
+    "scene/__init__.py": [
+        (LOADED, LOADED + "            folder = Path(self._ply(self.loaded_iter)).parent\n"
+         "            gaussians.load_model(folder)\n"),
+        ("self.cameras_extent)\n\n", "self.cameras_extent, 0)\n\n"),
+    ],
+    "arguments/__init__.py": [
+        ("        self.random_background = False\n", OPTIONS),
+    ],
+    "render.py": [
+        ("    with torch.no_grad():\n        gaussians = GaussianModel(dataset.sh_degree)\n",
+         "    with torch.no_grad():\n"
+         "        hidden = Namespace(net_width=6, resolution=5)\n"
+         "        gaussians = GaussianModel(dataset.sh_degree, hidden)\n"),
+        ("import ArgumentParser\n", "import ArgumentParser, Namespace\n"),
+        ("    for index, view in enumerate(tqdm(views, desc=f\"Rendering {name}\")):\n",
+         "    for index, view in enumerate(tqdm(views, desc=f\"Rendering {name}\")):\n"
+         "        view.time = index / len(views)\n"),
+    ],
+}  # fmt: skip
+
+
+IDLE = ("timenet", "opacity_deform", "shs_deform")
+"""Parts of the network that its defaults leave unused."""
+
+
+class MovingHost(Host):
+    """Small Gaussians, and a smaller network."""
+
+    routine = ("densify", "prune faint", "reset opacity", "another band")
+    moment = 0.3
+
+    def write(self, root):
+        super().write(root)
+        (root / "scene" / "deformation.py").write_text(NETWORK)
+        (root / "gaussian_renderer" / "__init__.py").write_text(RENDERER)
+        model = root / "scene" / "gaussian_model.py"
+        model.write_text(without(model.read_text(), ["densify_and_prune"]))
+        rewrite(root, CHANGES, Added)
+        scene = root / "scene" / "__init__.py"
+        text = without(scene.read_text(), ["save"])
+        scene.write_text(text + "\n" + "".join(inspect.getsource(Entry.save)))
+        script = root / "train.py"
+        text = without(script.read_text(), ["training", "densify", "training_report"])
+        head, main = text.split('if __name__ == "__main__":\n')
+        begun = main.index("    training(\n")
+        main = changed(
+            main[:begun], [("    args.save_iterations.append(args.iterations)\n", MERGE)]
+        )
+        flags = (
+            '    parser.add_argument("--configs", type=str, default="")\n'
+            '    parser.add_argument("--expname", type=str, default="")\n'
+            '    parser.add_argument("--net_width", type=int, default=6)\n'
+            '    parser.add_argument("--resolution_t", type=int, default=5)\n'
+            "    args = parser.parse_args()\n"
+        )
+        main = changed(main, [("    args = parser.parse_args()\n", flags)])
+        body = "\n\n".join(map(inspect.getsource, (Timed, scene_reconstruction, training)))
+        script.write_text(
+            f'import copy\nimport os\n{head}\n\n{body}\n\nif __name__ == "__main__":\n{main}'
+            "    training(lp.extract(args), op.extract(args), pp.extract(args))\n"
+        )
+
+    # -- driving, which works on a real checkout too ---------------------------------------------
+
+    def new_model(self, degree):
+        arguments = import_module("arguments")
+        hidden = SimpleNamespace(net_width=6, resolution=5)
+        if kind := getattr(arguments, "ModelHiddenParams", None):
+            parser = ArgumentParser()
+            hidden = kind(parser).extract(parser.parse_args([]))
+            hidden.multires, hidden.net_width = [1], 8
+            hidden.kplanes_config = {**hidden.kplanes_config, "resolution": [8, 8, 8, 5]}
+        torch.manual_seed(3)
+        return import_module("scene.gaussian_model").GaussianModel(degree, hidden)
+
+    def camera(self, width, height, *, side=0.0):
+        return Timed(super().camera(width, height, side=side), self.moment)
+
+    def gather(self, model, package):
+        moved = package["viewspace_points"].grad
+        model.add_densification_stats(moved, package["visibility_filter"])
+
+    def parameters(self, model):
+        network = dict(model._deformation.named_parameters())
+        groups = {each["name"]: each["params"] for each in model.optimizer.param_groups}
+        alone = {name: group[0] for name, group in groups.items() if len(group) == 1}
+        return alone | {
+            name: parameter
+            for name, parameter in network.items()
+            if parameter.requires_grad and not any(part in name for part in IDLE)
+        }
+
+    def save(self, model, path):
+        super().save(model, path)
+        if not hasattr(model, "_deformation_accum"):  # training_setup makes it
+            model._deformation_accum = torch.zeros(len(model.get_xyz), 3)
+        model.save_deformation(str(path.parent))
+
+    def load(self, model, path):
+        super().load(model, path)
+        model.load_model(str(path.parent))
+
+    def actions(self):
+        known = super().actions()
+        del known["densify and prune"]
+        return {**known, "densify": densify, "prune faint": prune_faint}
+
+
+def densify(model, arguments, chance):
+    n = len(model.get_xyz)
+    model.xyz_gradient_accum = chance.uniform(n, 1)
+    model.denom = chance.rows(n, 0.8)[:, None].float()
+    model.densify(1 - chance.share, 0.005, 3.0, None, 5, 5)
+
+
+def prune_faint(model, arguments, chance):
+    n = len(model.get_xyz)
+    with torch.no_grad():
+        model._opacity[chance.rows(n, chance.share / 2)] = FAINT
+    model.max_radii2D = 22 * chance.uniform(n)
+    model.prune(1 - chance.share, 0.005, 30.0, 20 if chance.heads else None)
