@@ -42,7 +42,8 @@ def sigterm_interrupts() -> Iterator[None]:
 
     def dropped(report: sys.UnraisableHookArgs) -> None:
         if not isinstance(report.exc_value, Terminate):
-            return unraisable(report)
+            unraisable(report)
+            return
         signal.signal(signal.SIGTERM, interrupt)
         again = threading.Timer(_AFTER_A_FINALIZER, signal.raise_signal, (signal.SIGTERM,))
         again.daemon = True
