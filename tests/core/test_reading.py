@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import errno
 import json
 import os
 import signal
@@ -466,8 +467,30 @@ def test_a_pipe_that_takes_a_files_place_meanwhile_is_not_waited_for(tmp_path, m
     os.mkfifo(pipe)
     before = Path(__file__).stat()
     monkeypatch.setattr(Path, "stat", lambda path, **_: before)  # as it was when it was looked at
-    with pytest.raises(RecordError, match="no regular file"), DOOR.reading(pipe):
+    with pytest.raises(RecordError, match="no regular file") as caught, DOOR.reading(pipe):
         pass
+    assert caught.value.where == str(pipe)
+
+
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied"), "Permission denied"),
+        (ValueError("embedded null byte"), "embedded null byte"),
+    ],
+)
+def test_a_file_that_the_system_does_not_open_is_named_with_the_reason(
+    tmp_path, monkeypatch, error, why
+):
+    def refused(*_):
+        raise error
+
+    (tmp_path / "a").touch()
+    monkeypatch.setattr(os, "open", refused)
+    with pytest.raises(RecordError) as caught, DOOR.reading(tmp_path / "a"):
+        pass
+    assert caught.value.where == str(tmp_path / "a")
+    assert caught.value.found == f"cannot be opened ({why})"
 
 
 @pytest.mark.parametrize("ends", [('{"a":', "}"), ("[", "]")])
