@@ -37,7 +37,7 @@ from fragprune_plugins.injection.starting import _read_checkpoint
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import records, sidecar
 from fragprune_plugins.storage.ply import is_marked, read_ply, write_ply
-from fragprune_plugins.storage.reading import NESTING, Door, parse_json
+from fragprune_plugins.storage.reading import NESTING, Door, lies_in, parse_json
 from fragprune_plugins.types import View
 
 DOOR = Door(RecordError, "broken", "a file", "Write it again.", limit=100)
@@ -499,3 +499,9 @@ def test_objects_nest_as_deep_as_lists(ends):
     parse_json(begin * (NESTING - 1) + "1" + end * (NESTING - 1))
     with pytest.raises(ValueError, match=f"more than {NESTING} levels"):
         parse_json(begin * NESTING + "1" + end * NESTING)
+
+
+def test_a_name_that_no_file_has_lies_nowhere(tmp_path):
+    assert lies_in(tmp_path / "a", tmp_path)
+    assert not lies_in(tmp_path / ".." / "a", tmp_path)
+    assert not lies_in(tmp_path / "a\0b", tmp_path)
