@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import errno
 import json
 import os
 import signal
@@ -36,7 +37,7 @@ from fragprune_plugins.injection.starting import _read_checkpoint
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import records, sidecar
 from fragprune_plugins.storage.ply import is_marked, read_ply, write_ply
-from fragprune_plugins.storage.reading import NESTING, Door, parse_json
+from fragprune_plugins.storage.reading import NESTING, Door, lies_in, parse_json
 from fragprune_plugins.types import View
 
 DOOR = Door(RecordError, "broken", "a file", "Write it again.", limit=100)
@@ -466,8 +467,30 @@ def test_a_pipe_that_takes_a_files_place_meanwhile_is_not_waited_for(tmp_path, m
     os.mkfifo(pipe)
     before = Path(__file__).stat()
     monkeypatch.setattr(Path, "stat", lambda path, **_: before)  # as it was when it was looked at
-    with pytest.raises(RecordError, match="no regular file"), DOOR.reading(pipe):
+    with pytest.raises(RecordError, match="no regular file") as caught, DOOR.reading(pipe):
         pass
+    assert caught.value.where == str(pipe)
+
+
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied"), "Permission denied"),
+        (ValueError("embedded null byte"), "embedded null byte"),
+    ],
+)
+def test_a_file_that_the_system_does_not_open_is_named_with_the_reason(
+    tmp_path, monkeypatch, error, why
+):
+    def refused(*_):
+        raise error
+
+    (tmp_path / "a").touch()
+    monkeypatch.setattr(os, "open", refused)
+    with pytest.raises(RecordError) as caught, DOOR.reading(tmp_path / "a"):
+        pass
+    assert caught.value.where == str(tmp_path / "a")
+    assert caught.value.found == f"cannot be opened ({why})"
 
 
 @pytest.mark.parametrize("ends", [('{"a":', "}"), ("[", "]")])
@@ -476,3 +499,9 @@ def test_objects_nest_as_deep_as_lists(ends):
     parse_json(begin * (NESTING - 1) + "1" + end * (NESTING - 1))
     with pytest.raises(ValueError, match=f"more than {NESTING} levels"):
         parse_json(begin * NESTING + "1" + end * NESTING)
+
+
+def test_a_name_that_no_file_has_lies_nowhere(tmp_path):
+    assert lies_in(tmp_path / "a", tmp_path)
+    assert not lies_in(tmp_path / ".." / "a", tmp_path)
+    assert not lies_in(tmp_path / "a\0b", tmp_path)
