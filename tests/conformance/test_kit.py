@@ -13,6 +13,7 @@ import pytest
 from conformance import broken_adapters as broken
 from miniatures.vanilla_3dgs import HOST
 
+from fragprune_plugins.adapting import MethodAdapter
 from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, invariants
@@ -151,7 +152,9 @@ def test_every_adapter_is_driven():
     tested = Path(__file__).parent.glob("test_*.py")
     driven = re.compile(r'^    adapter = "(.+)"$', re.MULTILINE)
     said = {name for file in tested for name in driven.findall(file.read_text())}
-    assert said == {adapter.name for adapter in load_plugins().adapters}
+    adapters = load_plugins().adapters
+    # A method has its host's whole package under it, whose own tests are in tests/studio.
+    assert said == {each.name for each in adapters if not isinstance(each, MethodAdapter)}
 
 
 class Unsaved(Host):
