@@ -344,6 +344,28 @@ def test_thresholds_go_through_a_file_beside_ones_own_checkpoint(session_on, tmp
             session.load(few, file)
 
 
+def test_thresholds_of_a_file_wait_while_another_model_is_drawn(session_on, tmp_path):
+    """They are not forgotten: to draw the file's Gaussians without them stays an error."""
+    file = tmp_path / "splats.pt"
+    with session_on(Gsplat()) as session:
+        from gsplat import DefaultStrategy
+
+        params, optimizers = new_params(40)
+        DefaultStrategy().check_sanity(params, optimizers)
+        session.store(params).logits = torch.randn(40).requires_grad_(True)
+        torch.save(params.state_dict(), file)
+    with session_on(Gsplat()) as session, torch.no_grad():
+        from gsplat import DefaultStrategy
+
+        known, optimizers = new_params(40, seed=1)
+        DefaultStrategy().check_sanity(known, optimizers)
+        assert session.store(known) is not None
+        saved = torch.load(file)
+        draw(known)
+        with pytest.raises(SessionError, match="no seam attached"):
+            draw(saved)
+
+
 @pytest.mark.parametrize("nested", [True, False])
 @pytest.mark.parametrize("learn", [True, False])
 def test_torch_saves_and_loads_parameters_with_their_thresholds(
