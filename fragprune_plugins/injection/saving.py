@@ -116,8 +116,11 @@ def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdS
         AlignmentError: the model has other means.
     """
     means, known = session.adapter.means(model), session.models.get(model)
-    same = len(means) == len(expected) and all(  # the first row tells most others apart
-        torch.equal(means.detach()[:rows].cpu(), expected[:rows]) for rows in (1, len(means))
+    same = (
+        len(means) == len(expected)
+        and all(  # the first row tells most others apart
+            torch.equal(means.detach()[:rows].cpu(), expected[:rows]) for rows in (1, len(means))
+        )
     )
     if known is not None:
         if same:
