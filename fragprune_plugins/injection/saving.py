@@ -116,12 +116,8 @@ def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdS
         AlignmentError: the model has other means.
     """
     means, known = session.adapter.means(model), session.models.get(model)
-    same = (
-        len(means) == len(expected)
-        and all(  # the first row tells most others apart
-            torch.equal(means.detach()[:rows].cpu(), expected[:rows]) for rows in (1, len(means))
-        )
-    )
+    parts = slice(1), slice(None)  # the first row tells most others apart
+    same = all(torch.equal(means.detach()[part].cpu(), expected[part]) for part in parts)
     if known is not None:
         if same:
             known.store.load_state_dict(store.state_dict())
