@@ -61,8 +61,32 @@ class Ranks:
         """
         import torch.distributed as dist
 
+        if self.several:
+            with self._together():
+                dist.all_reduce(tensor)
+
+    def exchange(self, rows: torch.Tensor, to: list[int], by: list[int]) -> torch.Tensor:
+        """Send rows to each process, and receive rows of each.
+
+        Args:
+            rows: (M, ...) those for the first process first, and so on.
+            to: how many each process gets of this one, by rank.
+            by: how many this one gets of each.
+
+        Returns:
+            What this process gets, that of the first process first.
+
+        Raises:
+            RanksError: another process is gone.
+        """
+        import torch.distributed as dist
+
+        if not self.several:
+            return rows
+        received = rows.new_empty(sum(by), *rows.shape[1:])
         with self._together():
-            dist.all_reduce(tensor)
+            dist.all_to_all_single(received, rows.contiguous(), by, to)
+        return received
 
     def gather(self, value: Any) -> list[Any]:
         """A plain value of each process, by rank.

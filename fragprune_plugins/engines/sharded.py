@@ -1,0 +1,256 @@
+"""Draws Gaussians that are divided among processes: each holds some, and draws a view of its own.
+
+The pattern is that of gsplat's ``distributed`` rasterization and of Grendel-GS. For each view, a
+process picks those of its Gaussians that can reach a pixel there, and sends them to the process
+that draws the view: 60 bytes each, with a colour instead of spherical harmonics. Gradients take the
+same way back. A truncated Gaussian reaches less far, so fewer of them are sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from fragprune_plugins.constants import (
+    ALPHA_MIN,
+    FALLOFF_MIN,
+    NEUTRAL_LOGIT,
+    RIM_REACH,
+    RIM_WIDTH,
+)
+from fragprune_plugins.engines import Engine, slice_at
+from fragprune_plugins.errors import InputError, RanksError
+from fragprune_plugins.learning.area import project
+from fragprune_plugins.types import Moment, RasterInputs, SpacetimeSplats, Splats, View
+
+if TYPE_CHECKING:
+    from fragprune_plugins.learning.ranks import Ranks
+    from fragprune_plugins.types import RasterOutputs
+
+_SENT = ("means", "opacities", "scales", "rotations", "cov3d")
+"""Attributes that are sent as they are; colours and thresholds go with them."""
+
+_WIDER, _BEYOND = 1.001, 1.0
+"""How much farther a Gaussian is taken to reach, for rounding: a factor, and pixels."""
+
+_PER_GAUSSIAN = ("radii", "fragments_per_gaussian")
+
+
+class ShardedEngine:
+    """Rasterizes Gaussians that are divided among processes.
+
+    ``rasterize`` is a collective operation. All processes call it, in the same order, each with its
+    own Gaussians and with the view that it draws itself. The result is that view of the Gaussians
+    of all processes, in their order: on the cpu engine the same, to the bit, as of all of them in
+    one process. A backward pass is collective as well.
+
+    Outputs with a row for each Gaussian have one for each of this process' own, in its own view.
+    Radii are 0 of those that reach none of its pixels.
+
+    Args:
+        engine: draws, and is of the same kind in all processes.
+        ranks: the processes.
+
+    Attributes:
+        sent: Gaussians that this process has sent to others so far.
+    """
+
+    def __init__(self, engine: Engine, ranks: Ranks) -> None:
+        self.engine, self.ranks = engine, ranks
+        self.name, self.sent = engine.name, 0
+
+    def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
+        """Draw this process' view of all Gaussians.
+
+        Args:
+            inputs: the view; and ``Splats`` of this process, without features.
+            thresholds: (N,) of this process' Gaussians, falloff in (0, 1); or None, if in all.
+
+        Raises:
+            InputError: inputs of a kind that is not sent to other processes.
+            RanksError: another process is gone, or called with inputs of another kind.
+        """
+        inputs.check_thresholds(thresholds)
+        splats = _expect_sendable(inputs)
+        known = {name: getattr(splats, name) for name in _SENT} | {"thresholds": thresholds}
+        given = {name: each for name, each in known.items() if each is not None}
+        views = self._views(inputs, given)
+        thresholds = given.get("thresholds")
+        rows = [reaching(each, splats, thresholds) for each in views]
+        chosen = torch.cat(rows)
+        parts = {name: each.index_select(0, chosen) for name, each in given.items()}
+        parts["colors"] = torch.cat(
+            [self._colors(splats, ids, at.view) for ids, at in zip(rows, views, strict=True)]
+        )
+        to, by = self._counts(rows)
+        received = self._exchange(parts, to, by)
+        cut = received.pop("thresholds", None)
+        drawn = Splats(**received)  # type: ignore[arg-type]
+        outputs = self.engine.rasterize(replace(inputs, splats=drawn), cut)
+        own, before = rows[self.ranks.rank], by[: self.ranks.rank]
+        local = {
+            name: each.new_zeros(len(splats)).index_copy(0, own, each[sum(before) :][: len(own)])
+            for name in _PER_GAUSSIAN
+            if (each := getattr(outputs, name)) is not None
+        }
+        return replace(outputs, **local)
+
+    def _views(self, inputs: RasterInputs, given: dict[str, Tensor]) -> list[RasterInputs]:
+        """The views of all processes, by rank, with the rules that they are drawn by.
+
+        If other processes have thresholds, and this one none, neutral ones are put into ``given``.
+        """
+        view, cameras = inputs.view, ("viewmatrix", "projmatrix", "campos")
+        numbers = [view.width, view.height, view.tan_fov_x, view.tan_fov_y]
+        numbers += [inputs.scale_modifier, inputs.dilation, inputs.near]
+        kinds = [  # absent, there, there with a gradient
+            0 if (each := given.get(name)) is None else 1 + each.requires_grad
+            for name in (*_SENT, "thresholds")
+        ]
+        told = view.viewmatrix.new_tensor([*numbers, *kinds], dtype=torch.float64)
+        parts = [getattr(view, name).detach().to(told).reshape(-1) for name in cameras]
+        told = torch.cat([told, *parts])
+        table = told.new_zeros(self.ranks.size, len(told))
+        table[self.ranks.rank] = told
+        self.ranks.sum(table)
+        *heads, matrices, projections, centres = table.split_with_sizes(
+            [len(numbers), len(kinds), 16, 16, 3], 1
+        )
+        known = [[int(each) for each in row] for row in heads[1].tolist()]
+        cut = max(kind[-1] for kind in known)
+        for rank, kind in enumerate(known):
+            if kind[:-1] != kinds[:-1] or kind[-1] not in (0, cut):
+                raise RanksError(
+                    f"process {self.ranks.rank} of {self.ranks.size}",
+                    f"process {rank} draws Gaussians of another kind",
+                    f"the same of {', '.join(_SENT)} in all, with the same needs of gradients",
+                    "Call all with equal arguments but for the Gaussians and the view.",
+                )
+        if cut and "thresholds" not in given:
+            neutral = torch.full((len(inputs.splats),), NEUTRAL_LOGIT, device=inputs.splats.device)
+            given["thresholds"] = neutral.sigmoid().requires_grad_(cut > 1)
+        found = []
+        for rank, row in enumerate(heads[0].tolist()):
+            width, height, tan_x, tan_y, modifier, dilation, near = row
+            seen = replace(
+                view,
+                width=int(width),
+                height=int(height),
+                tan_fov_x=tan_x,
+                tan_fov_y=tan_y,
+                viewmatrix=matrices[rank].to(view.viewmatrix).view(4, 4),
+                projmatrix=projections[rank].to(view.projmatrix).view(4, 4),
+                campos=centres[rank].to(view.campos),
+            )
+            rules = {"scale_modifier": modifier, "dilation": dilation, "near": near}
+            found.append(replace(inputs, view=seen, **rules))
+        return found
+
+    def _colors(self, splats: Splats, ids: Tensor, view: View) -> Tensor:
+        """(M, 3) RGB of chosen Gaussians as a view sees them."""
+        if splats.colors is not None:
+            return splats.colors.index_select(0, ids)
+        assert splats.sh is not None
+        chosen = SpacetimeSplats(
+            means=splats.means.index_select(0, ids),
+            opacities=splats.opacities.detach().index_select(0, ids),
+            cov3d=splats.means.new_zeros(len(ids), 6),  # colours do not depend on it
+            sh=splats.sh.index_select(0, ids),
+            sh_degree=splats.sh_degree,
+        )
+        colors = slice_at(chosen, Moment(0.0, view.campos), engine=self.engine).colors
+        assert colors is not None
+        return colors
+
+    def _counts(self, rows: Sequence[Tensor]) -> tuple[list[int], list[int]]:
+        """How many Gaussians this process sends to each, and gets of each."""
+        to = [len(ids) for ids in rows]
+        self.sent += sum(to) - to[self.ranks.rank]
+        table = rows[0].new_zeros(self.ranks.size, self.ranks.size)
+        table[self.ranks.rank] = table.new_tensor(to)
+        self.ranks.sum(table)
+        return to, table[:, self.ranks.rank].tolist()
+
+    def _exchange(
+        self, parts: Mapping[str, Tensor], to: list[int], by: list[int]
+    ) -> dict[str, Tensor]:
+        """The rows that all processes send to this one. What needs no gradient gets none back."""
+        received: dict[str, Tensor] = {}
+        for moving in (True, False):
+            group = {name: each for name, each in parts.items() if each.requires_grad == moving}
+            if not group:
+                continue
+            widths = [each.shape[1:].numel() for each in group.values()]
+            columns = [
+                each.reshape(-1, width) for each, width in zip(group.values(), widths, strict=True)
+            ]
+            table = torch.cat(columns, dim=1)
+            table = _Exchange.apply(table, self.ranks, to, by)  # type: ignore[no-untyped-call]
+            for (name, each), piece in zip(group.items(), table.split(widths, dim=1), strict=True):
+                received[name] = piece.reshape(-1, *each.shape[1:])
+        return received
+
+
+class _Exchange(torch.autograd.Function):
+    """Rows from all processes to all; gradients go back the same way."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, ranks: Ranks, to: list[int], by: list[int]) -> Tensor:
+        ctx.ranks, ctx.to, ctx.by = ranks, to, by
+        return ranks.exchange(rows, to, by)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return ctx.ranks.exchange(grad, ctx.by, ctx.to), None, None, None
+
+
+@torch.no_grad()
+def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) -> Tensor:
+    """(M,) int64, ascending: Gaussians that may have a fragment in a view, or one at their rim.
+
+    A fragment lies within its Gaussian's cutoff. The ellipse there has a bounding box; those whose
+    box touches no pixel are left out, and those that are too faint everywhere.
+
+    Args:
+        inputs: the view and its rules; its Gaussians are not used.
+        splats: N Gaussians.
+        thresholds: (N,) falloff, or None.
+    """
+    (xx, _, yy), means2d, visible = project(inputs, splats)
+    q = 2 * (splats.opacities / ALPHA_MIN).log()
+    if thresholds is not None:
+        rim = (thresholds - RIM_REACH * RIM_WIDTH).clamp_min(FALLOFF_MIN)
+        q = torch.minimum(q, -2 * torch.minimum(rim, thresholds).log())
+    visible &= q > 1 - _WIDER
+    for axis, variance, side in ((0, xx, inputs.view.width), (1, yy, inputs.view.height)):
+        reach = _WIDER * (q.clamp_min(0) * variance).sqrt() + _BEYOND
+        visible &= (means2d[:, axis] + reach >= 0) & (means2d[:, axis] - reach <= side - 1)
+    return visible.nonzero()[:, 0]
+
+
+def _expect_sendable(inputs: RasterInputs) -> Splats:
+    """The Gaussians, if they and the rules are of a kind that other processes can draw."""
+    splats = inputs.splats
+    given = {
+        "Footprints": not isinstance(splats, Splats),
+        "surfels": isinstance(splats, Splats) and splats.flat,
+        "features": splats.features is not None,
+        "means2d_hook": inputs.means2d_hook is not None,
+        "sample_offsets": inputs.sample_offsets is not None,
+        "scores": inputs.scores,
+    }
+    if any(given.values()):
+        raise InputError(
+            "RasterInputs",
+            f"{', '.join(k for k, v in given.items() if v)}, and Gaussians divided among processes",
+            "3D Gaussians in space, without them",
+            "Draw in one process.",
+        )
+    assert isinstance(splats, Splats)
+    return splats
