@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
-from itertools import accumulate, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,16 @@ from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.engines.cost import Cost, work_of
+from fragprune_plugins.engines.sharded import ShardedEngine
 from fragprune_plugins.errors import AlignmentError, CheckpointError, UsageError
+from fragprune_plugins.finetuning.processes import processes_of
 from fragprune_plugins.finetuning.resuming import Checkpoints, configuration
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, Waiting, between_steps
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.pressure import CALIBRATION_VIEWS, FEWEST
-from fragprune_plugins.learning.ranks import Ranks, fingerprint
+from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2, evenly
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -50,6 +52,7 @@ _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _MOMENTS = ("exp_avg", "exp_avg_sq")
+_OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 _COMPARE = 100  # steps from one comparison of replicas to the next
 _ROUNDS, _SECONDS = 7, 1.5  # at least, of timing frames for a target; a view's least time counts
@@ -129,7 +132,8 @@ def finetune(
             the bit. Whoever saves the result clears them.
         ranks: the processes that learn together (``ranks.joined``), each of which calls this with
             equal arguments and gets the same result; only the first writes checkpoints, draws the
-            bar and tells observers. This one alone when None.
+            bar and tells observers. This one alone when None. With a ``ShardedEngine`` each passes
+            its own Gaussians, and gets those back (``processes.part_of``, ``whole_of``).
 
     Raises:
         EngineError: no such engine here.
@@ -157,6 +161,13 @@ def finetune(
             f"{len(model)}, one per Gaussian",
             "Pass the store of this very model.",
         )
+    if settings.portable and isinstance(engine, ShardedEngine):
+        raise UsageError(
+            "finetune",
+            "portable, and Gaussians divided among processes",
+            "thresholds, or the whole model in each process",
+            "Leave --portable or --shard-gaussians out.",
+        )
     if settings.portable and (rule is not None or not store.neutral):
         raise UsageError(
             "finetune",
@@ -181,6 +192,8 @@ def finetune(
     try:
         run.learn(progress and ranks.first)
     except KeyboardInterrupt as error:
+        if run.processes.sharded and not run.between:
+            raise  # a second signal did not wait for the others, who hold the other parts
         interrupted, terminated = True, isinstance(error, Terminate)
         if run.between:
             run.keep()
@@ -190,7 +203,9 @@ def finetune(
         store=run.stage.store,
         settings=settings,
         curves=run.curves,
-        progress=replace(run.stage.progress(), steps=run.done),
+        progress=replace(
+            run.stage.progress(), steps=run.done, gaussians=run.processes.total(len(model))
+        ),
         train_seconds=run.seconds,
         engine=run.engine.name,
         interrupted=interrupted,
@@ -263,7 +278,7 @@ class _Run:
         ranks: Ranks,
     ) -> None:
         self.dataset, self.settings, self.engine = dataset, settings, engine
-        self.ranks = ranks
+        self.ranks, self.processes = ranks, processes_of(engine, ranks, len(model))
         self.start, self.rule = model, rule
         clock = None
         if settings.target_time is not None and cost is not None:
@@ -276,6 +291,8 @@ class _Run:
         self.curves: list[StepStats] = []
         self.done, self.between = 0, True
         self.ending = True  # a signal may end the run after this step
+        self.due = False  # it is time for a checkpoint, some process says
+        self.new = False  # a view of this step is drawn for the first time, here or elsewhere
         self._started = time.perf_counter()
         self.checkpoints: Checkpoints | None = None
         again = {shot: partial(self._draw, shot) for shot in dataset.train}
@@ -288,6 +305,7 @@ class _Run:
             watch=self._watched,
             parameters=lambda: {name: getattr(self.model, name) for name in self.rates},
             clock=clock,
+            everywhere=self.processes.everywhere,
         )
         rates = {"opacity": settings.opacity_lr}
         if settings.train in ("appearance", "all"):
@@ -371,7 +389,7 @@ class _Run:
             self.engine.name,
             self.stage.schedule,
         )
-        self.asked |= self.others
+        self.asked = self.processes.described(self.asked) | self.others
         del self.asked["nonfinite"]  # a run that such a step stopped may go on and skip it
         if checkpoints is not None:
             self._go_on(checkpoints)
@@ -381,7 +399,8 @@ class _Run:
     def _go_on(self, checkpoints: Checkpoints) -> None:
         """Take over what a checkpoint holds, if there is one; the first process writes the next."""
         self.checkpoints = checkpoints if self.ranks.first else None
-        tensors, values = checkpoints.load(self.asked, self.start.xyz.device)
+        device = "cpu" if self.processes.sharded else self.start.xyz.device
+        tensors, values = checkpoints.load(self.asked, device)
         if not values:
             return
         try:
@@ -404,7 +423,8 @@ class _Run:
 
     def keep(self) -> None:
         """Write a checkpoint, between two steps."""
-        if self.checkpoints is None or not self.optimizer.state:  # no step was taken
+        mine = self.checkpoints is not None or self.processes.sharded
+        if not mine or not self.optimizer.state:  # no step was taken
             return
         self.stage.check()
         tensors, values = self.stage.state_dict()
@@ -414,6 +434,10 @@ class _Run:
             moments = self.optimizer.state[parameter]
             for moment in _MOMENTS:
                 tensors[f"{moment}.{name}"] = moments[moment]
+        for name in sorted(tensors.keys() - _OF_VIEWS):  # in the same order in all processes
+            tensors[name] = self.processes.whole(tensors[name])
+        if self.checkpoints is None:  # the first process writes
+            return
         points = [astuple(point) for point in self.curves]
         tensors["curves"] = torch.tensor(points, dtype=torch.float64).reshape(len(points), -1)
         values |= {
@@ -426,6 +450,8 @@ class _Run:
         self.checkpoints.save(tensors, values)
 
     def _load(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
+        for name in tensors.keys() - _OF_VIEWS - {"curves"}:
+            tensors[name] = self.processes.own(tensors[name])
         self.stage.load_state_dict(tensors, values)
         if len(self.stage.store) != len(self.model):
             raise ValueError(f"{len(self.stage.store)} thresholds of {len(self.model)} Gaussians")
@@ -468,7 +494,7 @@ class _Run:
                 self.between = True
                 if self.ending:
                     waiting()
-                if self.checkpoints is not None and self.checkpoints.due(self.done):
+                if self.due if self.ranks.several else self._due(self.done):
                     self.keep()
                 bar.update()
                 if self.curves and self.done % max(1, total // _POSTFIXES) == 0:
@@ -518,6 +544,7 @@ class _Run:
     def _learn_from(self, shots: Sequence[Shot], waiting: Waiting) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
+        self.new = not all(map(stage.knows, shots))
         for shot in self.ranks.share(shots):
             stage.picture = shot.name
             outputs, pressure = self._draw(shot)
@@ -541,51 +568,44 @@ class _Run:
             self._compare()
 
     def _compare(self) -> None:
-        """Stop unless all replicas are equal to the bit."""
+        """Stop if processes have parted."""
         tensors = {name: getattr(self.model, name) for name in self.rates}
-        tensors["thresholds"] = self.stage.store.logits
-        known = {name: fingerprint(tensor) for name, tensor in tensors.items()}
-        self.ranks.agree(known, f"fine-tuning, after step {self.done}")
+        self.processes.compare(tensors | {"thresholds": self.stage.store.logits}, self.done)
 
     @torch.no_grad()
     def _exchange(self, shots: Sequence[Shot], waiting: Waiting) -> None:
-        """Sum the gradients over all processes; tell each all figures, and whether to end.
-
-        One reduction of one tensor: the gradients, a row of figures for each view, whether each
-        gradient is there, and whether Ctrl-C and SIGTERM wait.
-        """
+        """Take over from all processes gradients and figures; and whether to end, or to keep."""
         leaves = [*(getattr(self.model, name) for name in self.rates), self.stage.store.logits]
-        rows, table = self.stage.figures(), leaves[0].new_zeros(len(shots), 4)
-        if rows:
-            table[self.ranks.rank :: self.ranks.size] = table.new_tensor(rows)
-        there = table.new_tensor([leaf.grad is not None for leaf in leaves])
-        signals = table.new_tensor([waiting.number == number for number in _SIGNALS])
-        gradients = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
-        parts = [*gradients, table, there, signals]
-        flat = torch.cat([part.reshape(-1) for part in parts])
-        self.ranks.sum(flat)
-        ends = accumulate(part.numel() for part in parts)
-        *sums, table, there, signals = (
-            flat[end - part.numel() : end].view_as(part)
-            for end, part in zip(ends, parts, strict=True)
-        )
-        for leaf, total, some in zip(leaves, sums, there.tolist(), strict=True):
-            leaf.grad = total if some else None
+        flags = [*(waiting.number == number for number in _SIGNALS), self._due(self.done + 1)]
+        rows = self.stage.figures()
+        table, (*signals, self.due) = self.processes.exchange(leaves, rows, len(shots), flags)
         if rows:
             self.stage.share(shots, table)
-        came = [number for number, some in zip(_SIGNALS, signals.tolist(), strict=True) if some]
+        came = [number for number, some in zip(_SIGNALS, signals, strict=True) if some]
         self.ending = bool(came)  # one that comes later waits for the next exchange
         if came and not waiting.number:
             signal.raise_signal(came[0])  # it came to another process: all end after this step
+
+    def _due(self, step: int) -> bool:
+        """Whether it is time for a checkpoint after a step."""
+        return self.checkpoints is not None and self.checkpoints.due(step)
 
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
         """Draw a view with its thresholds; also return the pressure."""
         inputs = RasterInputs(shot.view, self.model.splats(), planes=())
         thresholds = self.stage.thresholds(inputs)
-        outputs = self.engine.rasterize(inputs, thresholds)
+
+        outputs, plain = self.engine.rasterize(inputs, thresholds), None
+        if self.new and self.processes.sharded:  # another process may need it, and all draw then
+            plain = self._plain(inputs)
 
         def untruncated() -> RasterOutputs:
-            return outputs if thresholds is None else self.engine.rasterize(inputs, None)
+            return outputs if thresholds is None else plain or self._plain(inputs)
 
         area = area_per_pixel(inputs) if self.settings.portable else None
         return outputs, self.stage.drew(shot, outputs, untruncated, area=area)
+
+    @torch.no_grad()
+    def _plain(self, inputs: RasterInputs) -> RasterOutputs:
+        """Draw without thresholds."""
+        return self.engine.rasterize(inputs, None)

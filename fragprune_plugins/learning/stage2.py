@@ -151,6 +151,8 @@ class Stage2:
         watch: called after every step.
         parameters: gives by name the tensors that the driver trains; they are checked to be finite.
         clock: of frames, for a target time.
+        everywhere: gives, from the rows of these Gaussians, those of the whole population, if this
+            is a part of one.
 
     Raises:
         UsageError: a target time without a clock.
@@ -167,6 +169,7 @@ class Stage2:
         watch: Callable[[StepStats], None] | None = None,
         parameters: Callable[[], Mapping[str, Tensor]] = dict,
         clock: FrameClock | None = None,
+        everywhere: Callable[[Tensor], Tensor] = lambda rows: rows,
     ) -> None:
         if settings.target_time is not None and clock is None:
             raise UsageError(
@@ -183,6 +186,7 @@ class Stage2:
         self.taken = 0  # the last that the driver's optimizer took: hosts take none at their end
         self.plan: StepPlan | None = None
         self._truncate, self._again, self._watch = truncate, views, watch
+        self._everywhere = everywhere
         self.parameters = parameters
         self.picture = ""  # the view's name, for messages; drivers set it before they draw
         self.skipped = 0  # steps whose gradients were not finite
@@ -215,6 +219,10 @@ class Stage2:
         """Whether any view was drawn after thresholds opened."""
         return bool(self._after)
 
+    def knows(self, view: Hashable) -> bool:
+        """Whether a view's fragments before learning are known."""
+        return (view, 0) in self._before
+
     def begin(self, opacities: Callable[[], Tensor]) -> StepPlan:
         """A step begins.
 
@@ -243,6 +251,7 @@ class Stage2:
 
         Its loss is so large beside its fragments that the pressure would end what is left of it.
         """
+        opacities = self._everywhere(opacities)
         share = float((opacities <= RESET).float().mean()) if opacities.numel() else 0.0
         if share < MOSTLY:
             return
@@ -401,7 +410,7 @@ class Stage2:
             return
         every = max(1, self.settings.iterations // CURVE_POINTS)
         if math.isnan(self._median) or self.steps % every == 0:
-            self._median = float(self.store.values.detach().median())
+            self._median = float(self._everywhere(self.store.values.detach()).median())
         stats = StepStats(
             step=self.steps,
             fragments_per_pixel=views.fragments,
