@@ -564,6 +564,26 @@ def one_voice() -> Iterator[None]:
         yield
 
 
+shard_option = click.option(
+    "--shard-gaussians",
+    "shard",
+    is_flag=True,
+    help="Under torchrun: divide MODEL's Gaussians among the processes, for a model that does not "
+    "fit one GPU. Without it each process holds them all.",
+)
+
+
+def require_several() -> None:
+    """Raise UsageError unless this is one of several processes: --shard-gaussians divides."""
+    if not launched().several:
+        raise UsageError(
+            "--shard-gaussians",
+            "one process",
+            "several, among which Gaussians can be divided",
+            "Start with torchrun --nproc_per_node N -m fragprune_plugins, or leave it out.",
+        )
+
+
 def open_engine(engine: str, device: str, threads: int | None) -> tuple[Engine, torch.device]:
     """Open the engine of the options.
 

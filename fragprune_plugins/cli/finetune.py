@@ -25,6 +25,8 @@ from fragprune_plugins.cli.common import (
     open_engine,
     photographs_for,
     require_place,
+    require_several,
+    shard_option,
 )
 from fragprune_plugins.cli.learning import learning_options, resuming_options
 from fragprune_plugins.errors import UsageError
@@ -108,6 +110,7 @@ def _share(
     "learning rates are the square root of N times higher. More than one serves several "
     "processes under torchrun, which draw them side by side.",
 )
+@shard_option
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
 @click.option(
     "--curves", type=OutFile(".png"), help="File for a picture of the learning curves (.png)."
@@ -137,6 +140,7 @@ def command(
     keep: float | Literal["auto"] | None,
     max_drop: float | None,
     seed: int,
+    shard: bool,
     no_truncation: bool,
     curves: Path | None,
     drop: bool,
@@ -179,6 +183,8 @@ def command(
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
     _require_sense(data, itself, cameras, settings, max_drop, keep)
+    if shard:
+        _require_shards(settings, itself, max_drop, keep, drop)
     if launched().first:
         require_place(out, model, thresholds=settings.truncate and not settings.portable)
         click.get_current_context().with_resource(locked(out, wait=0, what="run"))
@@ -187,7 +193,9 @@ def command(
 
     from fragprune_plugins.cli import finetuned
     from fragprune_plugins.datasets.dataset import load_photographs
+    from fragprune_plugins.engines.sharded import ShardedEngine
     from fragprune_plugins.finetuning import Checkpoints, resuming, save
+    from fragprune_plugins.finetuning.processes import part_of
     from fragprune_plugins.measure import Candidate
 
     photographs = None
@@ -198,8 +206,7 @@ def command(
         )
     rasterizer, where = open_engine(engine, device, threads)
     truncation = settings.truncate and not no_truncation
-    whole = models.load(model, truncation=truncation, device=where)
-    start = Candidate(whole.splat, deepcopy(whole.thresholds))  # learning changes the store
+    whole = models.load(model, truncation=truncation, device="cpu" if shard else where)
     if itself:
         dataset = _own_pictures(
             whole, data, cameras, resolution, white_background, seed, rasterizer
@@ -211,6 +218,7 @@ def command(
     checkpoints = Checkpoints(resuming.path_beside(out), every or None, tell=_say)
     asked = resuming.configuration(*whole, dataset, settings, rasterizer.name)
     asked |= {"drop_invisible": drop, "keep": keep, "max_drop": max_drop}
+    asked |= {"sharded": True} if shard else {}
     with sigterm_interrupts():
         with joined(where) as ranks:
             finished = None
@@ -221,23 +229,47 @@ def command(
             if ranks.gather(finished is not None)[0]:
                 checkpoints.clear()
                 return finished
+            count = len(whole.splat)
+            if shard:
+                whole, rasterizer = part_of(whole, ranks, where), ShardedEngine(rasterizer, ranks)
+            # learning changes the store
+            start = Candidate(whole.splat, deepcopy(whole.thresholds), gaussians=count)
             kept = _keep(whole, keep, dataset.to(where), rasterizer)
             result, found = _learn(
                 kept, dataset, settings, max_drop, rasterizer, checkpoints, ranks
             )
+            saved = _whole(result, ranks) if shard else result
+            if ranks.first:
+                save(out, saved)
+            over = finetuned.Finetuned(
+                model,
+                out,
+                start,
+                result,
+                keep,
+                len(whole.splat) - len(kept.splat),
+                found,
+                None,
+                seed,
+                saved.thresholds is not None,
+                ranks.size if shard else 1,
+            )
+            if shard:
+                over = replace(over, truncated=ranks.gather(over.truncated)[0])
+            measured = None
+            if shard and not result.terminated:  # all draw, so all measure
+                measured = over.measured(dataset, rasterizer)
         if not ranks.first:
             return None
-        save(out, result)
     if result.terminated:  # after SIGTERM there is no time for measurements
         return finetuned.terminated(model, out, result, found)
-    dropped = None
     if drop:
-        result, dropped = _drop_invisible(out, result, dataset, rasterizer)
+        saved, dropped = _drop_invisible(out, result, dataset, rasterizer)
+        over = replace(over, result=saved, dropped=dropped)
     if curves is not None:
-        finetuned.draw_curves(curves, [asdict(point) for point in result.curves], result.thresholds)
-    report = finetuned.Finetuned(
-        model, out, start, result, keep, len(whole.splat) - len(kept.splat), found, dropped, seed
-    ).report(dataset, rasterizer, photographs, asked)
+        finetuned.draw_curves(curves, [asdict(point) for point in result.curves], saved.thresholds)
+    figures = measured or over.measured(dataset, rasterizer)
+    report = over.report(figures, dataset, photographs, asked)
     if not result.interrupted:
         checkpoints.clear()  # not before: a kill while measuring goes on from it too
     return report
@@ -304,6 +336,14 @@ def _learn(
     return result, None
 
 
+def _whole(result: FinetuneResult, ranks: Ranks) -> FinetuneResult:
+    """The result with all Gaussians, in the first process; as it is in others."""
+    from fragprune_plugins.finetuning.processes import whole_of
+
+    splat, store = whole_of(result.model, result.store, ranks)
+    return replace(result, model=splat, store=store) if ranks.first else result
+
+
 def _drop_invisible(
     out: Path, result: FinetuneResult, dataset: Dataset, engine: Engine
 ) -> tuple[FinetuneResult, dict[str, int]]:
@@ -362,6 +402,35 @@ def _require_sense(
             "--self with --keep auto",
             "photographs, whose error says what can be spared",
             "Pass a share, such as --keep 0.9.",
+        )
+
+
+def _require_shards(
+    settings: Settings,
+    itself: bool,
+    max_drop: float | None,
+    keep: float | Literal["auto"] | None,
+    drop: bool,
+) -> None:
+    """Check that Gaussians which are divided among processes can learn what is asked for.
+
+    Raises:
+        UsageError: there is one process, or an option needs the whole model.
+    """
+    require_several()
+    asked = {
+        "--self": itself,
+        "--portable": settings.portable,
+        "--max-drop": max_drop is not None,
+        "--keep": keep is not None,
+        "--drop-invisible": drop,
+    }
+    if found := [name for name, given in asked.items() if given]:
+        raise UsageError(
+            "options",
+            f"--shard-gaussians with {', '.join(found)}",
+            "options that each process can follow with a part of the Gaussians",
+            "Leave one of them out.",
         )
 
 

@@ -40,6 +40,8 @@ class Finetuned:
         found: what a search for the strongest truncation found; None without one.
         dropped: counts of Gaussians that went at the end; None where that was not asked.
         seed: of the order of views.
+        truncated: the result has thresholds, here or in another process.
+        shards: processes that hold a part of the Gaussians each; 1 where each holds them all.
     """
 
     model: Path
@@ -51,31 +53,42 @@ class Finetuned:
     found: Bounded | None
     dropped: dict[str, int] | None
     seed: int
+    truncated: bool
+    shards: int = 1
 
-    def report(
-        self,
-        dataset: Dataset,
-        engine: Engine,
-        photographs: Photographs | None,
-        asked: dict[str, Any],
-    ) -> Report:
-        """Measure on held-out views, leave a record, and say what came of it.
+    def measured(self, dataset: Dataset, engine: Engine) -> list[dict[str, Any]]:
+        """Figures on held-out views: before, after, without thresholds, and of the control.
 
-        Args:
-            dataset: whose held-out views it is measured on.
-            engine: draws them.
-            photographs: where they lie, for the record; None where there are none.
-            asked: the configuration, by which the same command is known again.
+        The last two only where there are any.
         """
         from fragprune_plugins.measure import Candidate, measure
 
-        result, settings = self.result, self.result.settings
-        candidates = [self.start, Candidate(result.model, result.store)]
-        if result.thresholds is not None:
-            candidates.append(Candidate(result.model))
+        result = self.result
+        whole = result.progress.gaussians if self.shards > 1 else None
+        candidates = [self.start, Candidate(result.model, result.store, gaussians=whole)]
+        if self.truncated:
+            candidates.append(Candidate(result.model, gaussians=whole))
         if self.found is not None:
             candidates.append(Candidate(self.found.control.model))
-        before, after, *without = measure(candidates, dataset.test, engine=engine)
+        return measure(candidates, dataset.test, engine=engine)
+
+    def report(
+        self,
+        figures: Sequence[dict[str, Any]],
+        dataset: Dataset,
+        photographs: Photographs | None,
+        asked: dict[str, Any],
+    ) -> Report:
+        """Leave a record, and say what came of it.
+
+        Args:
+            figures: as ``measured``.
+            dataset: whose held-out views it was measured on.
+            photographs: where they lie, for the record; None where there are none.
+            asked: the configuration, by which the same command is known again.
+        """
+        result, settings = self.result, self.result.settings
+        before, after, *without = figures
         control = without.pop() if self.found is not None else None
         done = result.progress
         data = {
@@ -101,6 +114,7 @@ class Finetuned:
             "device": after["device"],
             "adapter": None,
             "seed": self.seed,
+            "shards": self.shards,
             "settings": settings.as_dict(),
             "max_drop": None if self.found is None else self.found.as_dict(),
         }
@@ -138,6 +152,11 @@ class Finetuned:
             f"{result.engine} engine, {data['iterations']} iterations{pressure} in "
             f"{result.train_seconds:.0f} s.",
         ]
+        if self.shards > 1:
+            lines.append(
+                f"{self.shards} processes held a part of the Gaussians each: a frame's time "
+                "includes what they send each other."
+            )
         if self.found is not None:
             lines.append(_describe_bound(data["max_drop"], held_out))
         if result.interrupted:

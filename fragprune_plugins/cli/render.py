@@ -18,12 +18,16 @@ from fragprune_plugins.cli.common import (
     engine_options,
     image_options,
     load_shots,
+    one_voice,
     open_engine,
     photographs_for,
+    require_several,
+    shard_option,
     truncation_option,
     views_option,
 )
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.ranks import Ranks, joined
 from fragprune_plugins.storage import models
 
 
@@ -38,6 +42,11 @@ def _direction(
     if not 0 < x * x + y * y + z * z < float("inf"):
         raise click.BadParameter(f"{value!r} has no direction.")
     return x, y, z
+
+
+def _map_of(picture: Path) -> Path:
+    """Where a picture's map of fragments lies."""
+    return picture.with_name(picture.stem + "_fragments.png")
 
 
 @click.command("render", cls=Command)
@@ -82,7 +91,9 @@ def _direction(
 @views_option
 @image_options
 @truncation_option
+@shard_option
 @engine_options
+@one_voice()
 def command(
     model: Path,
     cameras: Path | None,
@@ -98,10 +109,11 @@ def command(
     resolution: int,
     white_background: bool,
     no_truncation: bool,
+    shard: bool,
     engine: str,
     device: str,
     threads: int | None,
-) -> Report:
+) -> Report | None:
     """Render MODEL from many cameras, with one PNG for each camera, or as a film.
 
     The thresholds beside MODEL apply, if there are any; --no-truncation ignores them. A film needs
@@ -118,6 +130,11 @@ def command(
     film = out.suffix.lower() == ".mp4"
     if film and heatmap:
         raise UsageError("options", "--heatmap with a film", "a folder for --out", "Name one.")
+    if shard:
+        require_several()
+    if shard and film:
+        found = "--shard-gaussians with a film"
+        raise UsageError("options", found, "a folder for --out", "Name one.")
     if sum((cameras is not None, data is not None, orbit)) > 1:
         raise UsageError(
             "options",
@@ -136,20 +153,25 @@ def command(
                 "Pass --cameras FILE, --data FOLDER or --orbit.",
             )
 
+    from contextlib import nullcontext
+
     import torch
+    from torch import Tensor
     from tqdm import tqdm
 
     from fragprune_plugins.datasets.cameras import divided, load_cameras
+    from fragprune_plugins.engines.sharded import ShardedEngine
+    from fragprune_plugins.finetuning.processes import part_of
     from fragprune_plugins.measure import filming
     from fragprune_plugins.measure.pictures import save_heatmap, save_image, stems
     from fragprune_plugins.measure.wording import nothing_drawn
     from fragprune_plugins.plugins.hooks import thresholds_for
     from fragprune_plugins.storage.atomic import writable_folder
-    from fragprune_plugins.types import RasterInputs, RasterOutputs, View
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
 
     rasterizer, where = open_engine(engine, device, threads)
     writable_folder(out.parent if film else out)
-    splat, store = models.load(model, truncation=not no_truncation, device=where)
+    whole = models.load(model, truncation=not no_truncation, device="cpu" if shard else where)
     frames = max(1, round(seconds * fps))
     if data is not None:
         scene = photographs_for(model, data, images, resolution, white_background)
@@ -157,37 +179,51 @@ def command(
     elif cameras is not None:
         named = load_cameras(cameras, white_background=white_background)
     else:
-        named = divided(filming.orbit(splat, frames, up), resolution)
+        named = divided(filming.orbit(whole.splat, frames, up), resolution)
         background = torch.full((3,), float(white_background))
         named = [(name, replace(view, background=background)) for name, view in named]
     if film and not orbit:
         named = filming.along(named, frames)
-    splats = splat.splats()
-    files, fragments, maps = [], [], []
+    files = [out / f"{stem}.png" for stem in stems([name for name, _ in named])]
+    with joined(where) if shard else nullcontext(Ranks()) as ranks:
+        splat, store = part_of(whole, ranks, where) if shard else whole
+        if shard:
+            rasterizer = ShardedEngine(rasterizer, ranks)
+        splats = splat.splats()
+        drawn: dict[int, float] = {}
+        maps: dict[int, Tensor] = {}
 
-    def draw(view: View) -> RasterOutputs:
-        inputs = RasterInputs(view.to(where), splats, counts=heatmap, planes=())
-        with torch.no_grad():
-            outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, store))
-        fragments.append(float(outputs.fragments_per_pixel))
-        return outputs
+        def draw(index: int) -> RasterOutputs:
+            inputs = RasterInputs(named[index][1].to(where), splats, counts=heatmap, planes=())
+            with torch.no_grad():
+                outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, store))
+            drawn[index] = float(outputs.fragments_per_pixel)
+            return outputs
 
-    if film:
-        bar = tqdm([view for _, view in named], desc="filming", unit="frame", leave=None)
-        filming.write_mp4(out, (draw(view).image for view in bar), fps)
-        files.append(out)
-        named = []
-    for stem, (_, view) in zip(stems([name for name, _ in named]), named, strict=True):
-        outputs = draw(view)
-        file = out / f"{stem}.png"
-        save_image(file, outputs.image)
-        files.append(file)
-        if outputs.fragments is not None:
-            maps.append((file.with_name(file.stem + "_fragments.png"), outputs.fragments.cpu()))
-    limit = max((float(counts.max()) for _, counts in maps), default=0.0)
-    for file, counts in maps:
-        save_heatmap(file, counts, limit)
-        files.append(file)
+        last, turns = len(named) - 1, -(-len(named) // ranks.size)
+        if film:
+            bar = tqdm(range(len(named)), desc="filming", unit="frame", leave=None)
+            filming.write_mp4(out, (draw(index).image for index in bar), fps)
+            files, turns = [out], 0
+        for index in ranks.share(range(turns * ranks.size)):
+            outputs = draw(min(index, last))  # shards draw together, as often as each other
+            if index > last:
+                continue
+            save_image(files[index], outputs.image)
+            if outputs.fragments is not None:
+                maps[index] = outputs.fragments.cpu()
+        limit = max(
+            ranks.gather(max((float(counts.max()) for counts in maps.values()), default=0.0))
+        )
+        for index, counts in maps.items():
+            save_heatmap(_map_of(files[index]), counts, limit)
+        everybody = ranks.gather(drawn)
+    if not ranks.first:
+        return None
+    if heatmap:
+        files = [*files, *map(_map_of, files)]
+    known = {index: figure for each in everybody for index, figure in each.items()}
+    fragments = list(known.values())
     mean = sum(fragments) / len(fragments)
     warnings = nothing_drawn(fragments)
     wrote = f"{out}, {len(fragments)} frames" if film else f"{len(files)} pictures to {out}"
@@ -196,16 +232,16 @@ def command(
             "model": str(model),
             "files": [str(file) for file in files],
             "fragments_per_pixel": mean,
-            "gaussians": len(splat),
-            "truncated": store is not None,
+            "gaussians": len(whole.splat),
+            "truncated": whole.thresholds is not None,
             "engine": rasterizer.name,
-            "device": str(splat.xyz.device),
+            "device": str(where),
             "warnings": warnings,
         },
         "\n".join(
             [
                 f"Wrote {wrote} ({mean:.1f} fragments per pixel, "
-                f"{'truncated' if store is not None else 'not truncated'}).",
+                f"{'not ' * (whole.thresholds is None)}truncated).",
                 *(f"Warning: {each}" for each in warnings),
             ]
         ),

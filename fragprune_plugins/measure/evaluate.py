@@ -35,11 +35,13 @@ class Candidate:
         thresholds: a store, for which plugins are asked at every view; (N,) thresholds to use as
             they are; or None for no truncation.
         drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
+        gaussians: of the whole splat, where the model is this process' part of it.
     """
 
     model: SplatFile
     thresholds: Tensor | ThresholdStore | None = None
     drawing: Mapping[str, Any] = field(default_factory=dict)
+    gaussians: int | None = None
 
     __repr__ = one_line
 
@@ -130,7 +132,7 @@ def measure(
                 "evaluated_per_pixel": evaluated,
                 "entries_per_pixel": entries,
                 "area_per_pixel": area,
-                "gaussians": len(splats),
+                "gaussians": candidate.gaussians or len(splats),
             }
         )
 

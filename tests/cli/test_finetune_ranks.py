@@ -21,6 +21,7 @@ from fragprune_plugins.datasets.dataset import Photograph
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.finetuning import loop
 from fragprune_plugins.storage import sidecar
+from fragprune_plugins.storage.ply import read_ply
 
 
 @pytest.fixture
@@ -163,6 +164,90 @@ def test_what_goes_before_and_around_learning_is_the_same_in_both(scene, tmp_pat
     first, second = command(2, *words(scene, two, *more, "--json"))
     assert (first.left[0], second.left) == (0, (0, "", ""))
     assert pair(one) == pair(two)
+
+
+def test_shards_report_and_write_what_one_process_does(scene, tmp_path):
+    """Last bits differ, for gradients are summed in another order."""
+    one, two, log = tmp_path / "one.ply", tmp_path / "two.ply", tmp_path / "log.csv"
+    words_ = words(scene, one, "--views-per-step", 2, "--train", "opacity")
+    whole = run_json(*words_)
+    more = ("--train", "opacity", "--shard-gaussians", "--json", "--log", f"csv:{log}")
+    curves = tmp_path / "curves.png"
+    first, second = command(2, *words(scene, two, *more, "--curves", curves))
+    code, out, err = first.left
+    assert (code, second.left) == (0, (0, "", "")), err
+    report = json.loads(out)
+    assert (whole["shards"], report["shards"]) == (1, 2)
+    for when in ("before", "after", "untruncated"):
+        for name in ("psnr", "ssim", "fragments_per_pixel", "area_per_pixel", "gaussians"):
+            assert report[when][name] == pytest.approx(whole[when][name], rel=1e-4), name
+    assert report["speedup"] == pytest.approx(whole["speedup"], rel=1e-4)
+    model, store = read_ply(two), sidecar.load(two)[0]
+    assert torch.equal(model.f_dc, read_ply(one).f_dc)
+    assert torch.allclose(model.opacity, read_ply(one).opacity, atol=1e-5)
+    assert torch.allclose(store.logits, sidecar.load(one)[0].logits, atol=1e-4)
+    assert curves.is_file()
+    with open(log) as file:
+        assert len(list(csv.DictReader(file))) == 20
+    again, other = command(2, *words(scene, two, *more[:3]))
+    assert "nothing was done" in again.left[1]
+    assert other.left == (0, "", "")
+    text = command(2, *words(scene, two, *more[:3], "--again"))[0].left[1]
+    assert "2 processes held a part of the Gaussians each" in text
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_shards_save_what_they_learned_when_a_signal_comes_to_one(scene, tmp_path, number):
+    whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
+    shards = ("--shard-gaussians",)
+    command(2, *words(scene, whole, *shards))
+    ended = command(
+        2,
+        *words(scene, out, *shards),
+        prepare=lambda rank: at_step(6, lambda: signal.raise_signal(number)) if rank == 1 else None,
+    )
+    (first, text, _), second = (each.left for each in ended)
+    assert (first, second) == (128 + number, (0, "", ""))
+    assert "7 of 20 iterations" in text
+    assert len(read_ply(out)) == len(read_ply(whole))
+    first, second = command(2, *words(scene, out, *shards, "--json"))
+    assert json.loads(first.left[1])["resumed_at"] == 7
+    assert pair(out) == pair(whole)
+
+
+def test_a_kill_of_a_shard_ends_all_with_one_error_and_leaves_what_was_saved(scene, tmp_path):
+    out = tmp_path / "out.ply"
+    run_json(*words(scene, out, "--iters", 3))
+    before = pair(out)
+    ended = command(
+        3,
+        *words(scene, out, "--shard-gaussians", "--again"),
+        prepare=lambda rank: (
+            at_step(7, lambda: os.kill(os.getpid(), signal.SIGKILL)) if rank == 2 else None
+        ),
+    )
+    assert ended[2].code == -signal.SIGKILL
+    left = [each.left for each in ended[:2]]
+    assert [code for code, _, _ in left] == [1, 1]
+    assert "".join(out + err for _, out, err in left).count("[ranks]") == 1
+    assert pair(out) == before
+
+
+@pytest.mark.parametrize(
+    "more",
+    [("--portable",), ("--max-drop", 0.1), ("--keep", 0.9), ("--drop-invisible",), ("--self",)],
+)
+def test_what_a_part_of_the_gaussians_cannot_do_is_refused(scene, tmp_path, more):
+    ended = command(2, *words(scene, tmp_path / "out.ply", "--shard-gaussians", *more))
+    assert [each.left[0] for each in ended] == [2, 2]
+    said = "".join(out + err for _, out, err in (each.left for each in ended))
+    assert said.count(f"--shard-gaussians with {more[0]}") == 1
+
+
+def test_one_process_has_nobody_to_share_gaussians_with(scene, tmp_path):
+    result = run(*words(scene, tmp_path / "out.ply", "--shard-gaussians"))
+    assert result.exit_code == 2
+    assert "torchrun" in result.stderr
 
 
 def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from cli.commands import run, run_json
 from finetune import tiny
+from finetune.several import command
 from PIL import Image
 
 from fragprune_plugins.storage.ply import write_ply
@@ -35,6 +36,34 @@ def test_held_out_views_with_maps(scene, tmp_path):
     assert plain["truncated"] is False
     assert report["truncated"] is True
     assert plain["fragments_per_pixel"] > report["fragments_per_pixel"]
+
+
+@pytest.mark.parametrize(("size", "views"), [(2, "test"), (2, "all"), (3, "test")])
+def test_gaussians_divided_among_processes_give_the_same_pictures(
+    scene, tmp_path, size, views, single_thread
+):
+    data, path = scene
+    words = ("render", path, "--data", data, "--views", views, "--heatmap", "--out")
+    one, many = tmp_path / "one", tmp_path / "many"
+    whole = run_json(*words, one)
+    first, *others = command(size, *words, many, "--shard-gaussians", "--json")
+    assert [each.left for each in others] == [(0, "", "")] * (size - 1)
+    report = json.loads(first.left[1])
+    files = {file.name: file.read_bytes() for file in one.iterdir()}
+    assert {file.name: file.read_bytes() for file in many.iterdir()} == files
+    assert sorted(report["files"]) == sorted(str(many / name) for name in files)
+    for name in ("fragments_per_pixel", "gaussians", "truncated", "warnings"):
+        assert report[name] == pytest.approx(whole[name]), name
+
+
+def test_a_film_is_not_drawn_by_several_processes(scene, tmp_path, single_thread):
+    data, path = scene
+    film = tmp_path / "film.mp4"
+    ended = command(2, "render", path, "--data", data, "--out", film, "--shard-gaussians")
+    assert [each.left[0] for each in ended] == [2, 2]
+    alone = run("render", path, "--data", data, "--out", tmp_path / "p", "--shard-gaussians")
+    assert alone.exit_code == 2
+    assert "torchrun" in alone.stderr
 
 
 def test_cameras_file_and_views(scene, tmp_path):
