@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -174,6 +175,10 @@ def joined(device: torch.device) -> Iterator[Ranks]:
             "a torch with it",
             "Install the torch of pytorch.org, or start one process.",
         )
+    # Its functions have the group as a default, of the time of their import: imported later, as by
+    # an optimizer, they would keep the group and its threads alive until Python is gone, and a
+    # thread that then frees a tensor aborts the process.
+    importlib.import_module("torch.distributed.nn.functional")
     if device.type == "cuda":
         torch.cuda.set_device(device)
     try:

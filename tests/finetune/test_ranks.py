@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -225,6 +228,38 @@ def test_a_launcher_is_known_by_the_environment(monkeypatch, size, rank, expecte
     monkeypatch.setenv("WORLD_SIZE", size)
     monkeypatch.setenv("RANK", rank)
     assert launched() == expected
+
+
+LAST_THREADS = """
+import os, sys, torch
+from fragprune_plugins.learning.ranks import joined
+with joined(torch.device("cpu")) as ranks:
+    tensor = torch.ones(3, requires_grad=True)
+    tensor.sum().backward()
+    torch.optim.Adam([tensor]).step()  # imports what the group was kept alive by
+    ranks.gather(1)
+print("threads:", len(os.listdir("/proc/self/task")))
+"""
+
+
+def test_no_thread_of_the_group_outlives_it(tmp_path):
+    """One that freed a tensor while Python ended aborted the process: to torchrun, a failure.
+
+    Fresh processes: what the group was kept alive by is imported here already.
+    """
+    script = tmp_path / "script.py"
+    script.write_text(LAST_THREADS)
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    line = [*launcher, "--nproc_per_node", "2", str(script)]
+    done = subprocess.run(
+        line,
+        capture_output=True,
+        text=True,
+        timeout=200,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["threads:", "1"] * 2
 
 
 def test_one_of_all_processes_speaks_whoever_asks_first():
