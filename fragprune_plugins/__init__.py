@@ -22,13 +22,16 @@ if TYPE_CHECKING:
     from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.engines import slice_at
     from fragprune_plugins.engines.cost import Cost
+    from fragprune_plugins.engines.sharded import ShardedEngine
     from fragprune_plugins.finetuning import FinetuneResult, finetune, own_pictures
+    from fragprune_plugins.finetuning.processes import part_of, whole_of
     from fragprune_plugins.injection.api import activate, deactivate, paused
+    from fragprune_plugins.learning.ranks import joined
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.measure.scores import keep_best, keep_needed
     from fragprune_plugins.measure.viewing import overview, render_view
-    from fragprune_plugins.plugins.hooks import rasterize
+    from fragprune_plugins.plugins.hooks import engine_for, rasterize
     from fragprune_plugins.storage.models import Model, load, save
     from fragprune_plugins.storage.ply import SplatFile
     from fragprune_plugins.types import (
@@ -54,6 +57,7 @@ _HOME = {
     "RasterOutputs": "types",
     "Schedule": "learning.schedule",
     "Settings": "learning.schedule",
+    "ShardedEngine": "engines.sharded",
     "Sliced": "types",
     "SpacetimeSplats": "types",
     "SplatFile": "storage.ply",
@@ -63,7 +67,9 @@ _HOME = {
     "View": "types",
     "activate": "injection.api",
     "deactivate": "injection.api",
+    "engine_for": "plugins.hooks",
     "finetune": "finetuning",
+    "joined": "learning.ranks",
     "keep_best": "measure.scores",
     "keep_needed": "measure.scores",
     "load": "storage.models",
@@ -71,12 +77,14 @@ _HOME = {
     "load_dataset": "datasets.dataset",
     "overview": "measure.viewing",
     "own_pictures": "finetuning",
+    "part_of": "finetuning.processes",
     "prices_of": "bench.calibration",
     "paused": "injection.api",
     "rasterize": "plugins.hooks",
     "render_view": "measure.viewing",
     "save": "storage.models",
     "slice_at": "engines",
+    "whole_of": "finetuning.processes",
 }
 
 __all__ = [
@@ -89,6 +97,7 @@ __all__ = [
     "RasterOutputs",
     "Schedule",
     "Settings",
+    "ShardedEngine",
     "Sliced",
     "SpacetimeSplats",
     "SplatFile",
@@ -99,7 +108,9 @@ __all__ = [
     "__version__",
     "activate",
     "deactivate",
+    "engine_for",
     "finetune",
+    "joined",
     "keep_best",
     "keep_needed",
     "load",
@@ -107,12 +118,14 @@ __all__ = [
     "load_dataset",
     "overview",
     "own_pictures",
+    "part_of",
     "paused",
     "prices_of",
     "rasterize",
     "render_view",
     "save",
     "slice_at",
+    "whole_of",
 ]
 
 

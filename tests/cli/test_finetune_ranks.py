@@ -295,7 +295,8 @@ def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(scene, tmp_path, si
 
 
 @pytest.mark.gpu
-def test_two_gpus_learn_what_one_does_with_two_views_a_step(scene, tmp_path):
+@pytest.mark.parametrize("more", [(), ("--shard-gaussians",)])
+def test_two_gpus_learn_what_one_does_with_two_views_a_step(scene, tmp_path, more):
     """Replicas are compared at the end; sums on a GPU have no fixed order, so figures are near."""
     if torch.cuda.device_count() < 2:
         pytest.skip("needs two GPUs")
@@ -303,7 +304,7 @@ def test_two_gpus_learn_what_one_does_with_two_views_a_step(scene, tmp_path):
     whole = run_json(*words(scene, one, "--views-per-step", 2, "--device", "cuda:0"))
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     launcher += ["--nproc_per_node", "2", "-m", "fragprune_plugins"]
-    line = [*launcher, *map(str, words(scene, two, "--device", "cuda", "--json"))]
+    line = [*launcher, *map(str, words(scene, two, "--device", "cuda", "--json", *more))]
     done = subprocess.run(line, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
