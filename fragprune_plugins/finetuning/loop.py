@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import random
 import signal
-import statistics
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
@@ -20,20 +17,18 @@ from torch import Tensor
 
 from fragprune_plugins.datasets.dataset import Dataset, Shot
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.engines.clock import timed
 from fragprune_plugins.engines.cost import Cost, work_of
-from fragprune_plugins.engines.sharded import ShardedEngine
 from fragprune_plugins.errors import AlignmentError, CheckpointError, UsageError
-from fragprune_plugins.finetuning.processes import processes_of
+from fragprune_plugins.finetuning.processes import expect_divisible, processes_of
 from fragprune_plugins.finetuning.resuming import Checkpoints, configuration
+from fragprune_plugins.finetuning.timing import require_reach, times_faster
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, Waiting, between_steps
 from fragprune_plugins.learning.losses import photometric_loss
-from fragprune_plugins.learning.pressure import CALIBRATION_VIEWS, FEWEST
 from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2, evenly
+from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
@@ -55,7 +50,6 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 _OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 _COMPARE = 100  # steps from one comparison of replicas to the next
-_ROUNDS, _SECONDS = 7, 1.5  # at least, of timing frames for a target; a view's least time counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +146,7 @@ def finetune(
         settings = replace(
             settings, pressure=0.0, target_speedup=None, target_time=None, truncate=True
         )
+    engine = engine_for(engine, device) if isinstance(engine, str) else engine
     dataset = dataset.to(device)
     store = ThresholdStore(len(model), device) if store is None else store  # empty ones are false
     if len(store) != len(model):
@@ -161,13 +156,6 @@ def finetune(
             f"{len(model)}, one per Gaussian",
             "Pass the store of this very model.",
         )
-    if settings.portable and isinstance(engine, ShardedEngine):
-        raise UsageError(
-            "finetune",
-            "portable, and Gaussians divided among processes",
-            "thresholds, or the whole model in each process",
-            "Leave --portable or --shard-gaussians out.",
-        )
     if settings.portable and (rule is not None or not store.neutral):
         raise UsageError(
             "finetune",
@@ -175,7 +163,7 @@ def finetune(
             "a model without any: it is for viewers that know none",
             "Pass --no-truncation to ignore thresholds stored with the model.",
         )
-    _expect_divisible(settings, ranks)
+    expect_divisible(settings, engine, ranks)
     run = _Run(
         model,
         dataset,
@@ -184,7 +172,7 @@ def finetune(
         schedule or schedule_for(settings),
         rule,
         cost,
-        engine_for(engine, device) if isinstance(engine, str) else engine,
+        engine,
         ranks,
     )
     run.start_keeping(checkpoints)
@@ -242,26 +230,6 @@ def save(path: Path, result: FinetuneResult) -> Path | None:
     return models.save(path, model, settings=result.settings.as_dict())
 
 
-def _expect_divisible(settings: Settings, ranks: Ranks) -> None:
-    """Check that several processes can share these settings' work."""
-    if not ranks.several:
-        return
-    if settings.target_time is not None:
-        raise UsageError(
-            "target time",
-            f"{ranks.size} processes, which would disturb each other's measurements",
-            "one process",
-            "Use --target-speedup, or start one process.",
-        )
-    if settings.views_per_step % ranks.size:
-        raise UsageError(
-            "views per step",
-            f"{settings.views_per_step} for {ranks.size} processes",
-            f"a multiple of {ranks.size}",
-            "Change --views-per-step.",
-        )
-
-
 class _Run:
     """One fine-tuning under way: drives stage 2 over the photographs of a data set."""
 
@@ -282,8 +250,13 @@ class _Run:
         self.start, self.rule = model, rule
         clock = None
         if settings.target_time is not None and cost is not None:
-            self._require_reach(settings.target_time, cost)
-            clock = FrameClock(lambda outputs: cost.ms(work_of(outputs)), self._faster)
+            require_reach(settings.target_time, cost, model, dataset.train, engine)
+            clock = FrameClock(
+                lambda outputs: cost.ms(work_of(outputs)),
+                lambda shots: times_faster(
+                    model, self.result_model(), self.stage.thresholds, shots, engine
+                ),
+            )
         self.others: dict[str, Any] = {
             "rule": None if rule is None else getattr(rule, "name", repr(rule)),
             "prices": dict(cost.prices) if clock and cost else None,  # times were predicted by them
@@ -326,47 +299,6 @@ class _Run:
         """The model as learned, free of gradients."""
         return replace(
             self.model, **{name: getattr(self.model, name).detach() for name in self.rates}
-        )
-
-    @torch.no_grad()
-    def _require_reach(self, target: float, cost: Cost) -> None:
-        """Refuse a target time that thresholds cannot reach: pixels and Gaussians stay."""
-        splats, total = self.start.splats(), Counter[str]()
-        for shot in evenly(self.dataset.train, CALIBRATION_VIEWS):
-            inputs = RasterInputs(shot.view, splats, planes=())
-            total.update(work_of(self.engine.rasterize(inputs, None)))
-        limit = cost.limit(total, FEWEST)
-        if target >= limit:
-            size = f"{self.dataset.train[0].view.width}x{self.dataset.train[0].view.height}"
-            raise UsageError(
-                "target time",
-                f"{target:g}x as fast",
-                f"less than {limit:.2f}x: pixels and Gaussians take the rest of a frame at {size}",
-                "Lower --target-time, or remove Gaussians first.",
-            )
-
-    @torch.no_grad()
-    def _faster(self, shots: Sequence[Shot]) -> float:
-        """Frame time of the model as it came in, untruncated, over that of the present one.
-
-        The median over views of the ratio of their least times: a view that another program
-        disturbed in all rounds moves it little.
-        """
-        # the free ones: an engine keeps states for a leaf that requires gradients, which takes time
-        before, now = self.start.splats(), self.result_model().splats()
-        least = {True: [math.inf] * len(shots), False: [math.inf] * len(shots)}
-        started, turn = time.perf_counter(), 0
-        while turn < _ROUNDS or time.perf_counter() - started < _SECONDS:
-            turn += 1
-            for index, shot in enumerate(shots):
-                for old in (True, False) if turn % 2 else (False, True):
-                    inputs = RasterInputs(shot.view, before if old else now, planes=())
-                    cut = None if old else self.stage.thresholds(inputs)
-                    frame = partial(self.engine.rasterize, inputs, cut)
-                    spent = timed(frame, self.start.xyz.device)[1]
-                    least[old][index] = min(least[old][index], spent)
-        return statistics.median(
-            was / now for was, now in zip(least[True], least[False], strict=True)
         )
 
     @property

@@ -16,7 +16,9 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.sharded import ShardedEngine
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.ranks import Ranks, fingerprint
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage.models import Model
 from fragprune_plugins.storage.ply import SplatFile
@@ -174,6 +176,37 @@ class Shards(Replicas):
 def processes_of(engine: Engine, ranks: Ranks, count: int) -> Replicas:
     """What processes are to each other that draw with an engine and hold ``count`` Gaussians."""
     return Shards(ranks, count) if isinstance(engine, ShardedEngine) else Replicas(ranks)
+
+
+def expect_divisible(settings: Settings, engine: Engine, ranks: Ranks) -> None:
+    """Check that several processes can share the work of settings.
+
+    Raises:
+        UsageError: they cannot.
+    """
+    if settings.portable and isinstance(engine, ShardedEngine):
+        raise UsageError(
+            "finetune",
+            "portable, and Gaussians divided among processes",
+            "thresholds, or the whole model in each process",
+            "Leave --portable or --shard-gaussians out.",
+        )
+    if not ranks.several:
+        return
+    if settings.target_time is not None:
+        raise UsageError(
+            "target time",
+            f"{ranks.size} processes, which would disturb each other's measurements",
+            "one process",
+            "Use --target-speedup, or start one process.",
+        )
+    if settings.views_per_step % ranks.size:
+        raise UsageError(
+            "views per step",
+            f"{settings.views_per_step} for {ranks.size} processes",
+            f"a multiple of {ranks.size}",
+            "Change --views-per-step.",
+        )
 
 
 def part_of(model: Model, ranks: Ranks, device: torch.device | str) -> Model:

@@ -21,7 +21,7 @@ from PIL import Image
 from fragprune_plugins.bench import calibration
 from fragprune_plugins.cli.finetuned import describe_untruncated
 from fragprune_plugins.engines.cost import UNITS, Cost, work_of
-from fragprune_plugins.finetuning import loop
+from fragprune_plugins.finetuning import loop, timing
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.storage import sidecar
 from fragprune_plugins.storage.ply import read_ply, write_ply
@@ -229,9 +229,9 @@ def test_a_target_time_measures_prices_once_and_says_what_was_reached(scene, tmp
         outputs = work()
         return outputs, cost.ms(work_of(outputs))
 
-    for module in (calibration, loop):
+    for module in (calibration, timing):
         monkeypatch.setattr(module, "timed", timed)
-    monkeypatch.setattr(loop, "_SECONDS", 0.0)
+    monkeypatch.setattr(timing, "_SECONDS", 0.0)
     monkeypatch.setattr(calibration, "frames", lambda device: few_frames())
     monkeypatch.setenv("FRAGPRUNE_CACHE", str(tmp_path / "cache"))
     data, path, _ = scene

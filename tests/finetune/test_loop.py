@@ -11,7 +11,7 @@ import torch
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cost import UNITS, Cost, work_of
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
-from fragprune_plugins.finetuning import finetune, loop, save
+from fragprune_plugins.finetuning import finetune, loop, save, timing
 from fragprune_plugins.finetuning.loop import mean_fragments
 from fragprune_plugins.learning.pressure import calibrate, calibrate_measured
 from fragprune_plugins.learning.schedule import Settings
@@ -240,8 +240,8 @@ def test_a_target_time_is_met_where_frames_take_what_is_measured(
         outputs = work()
         return outputs, real.ms(work_of(outputs))
 
-    monkeypatch.setattr(loop, "timed", timed)
-    monkeypatch.setattr(loop, "_SECONDS", 0.0)
+    monkeypatch.setattr(timing, "timed", timed)
+    monkeypatch.setattr(timing, "_SECONDS", 0.0)
     settings = Settings(iterations=60, target_time=target)
     result = finetune(model, dataset, settings, cost=COST, engine="cpu")
     assert result.progress.target_reached

@@ -13,7 +13,7 @@ from finetune import tiny
 from fragprune_plugins.engines.cost import UNITS, Cost, work_of
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
 from fragprune_plugins.experiments.rules import falloff_threshold
-from fragprune_plugins.finetuning import Checkpoints, finetune, load_dataset, loop, resuming
+from fragprune_plugins.finetuning import Checkpoints, finetune, load_dataset, loop, resuming, timing
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import checkpoints as files
@@ -111,8 +111,8 @@ def test_a_target_time_that_was_cut_off_keeps_what_was_timed(
         outputs = work()
         return outputs, real.ms(work_of(outputs))
 
-    monkeypatch.setattr(loop, "timed", timed)
-    monkeypatch.setattr(loop, "_SECONDS", 0.0)
+    monkeypatch.setattr(timing, "timed", timed)
+    monkeypatch.setattr(timing, "_SECONDS", 0.0)
     settings, path = Settings(iterations=STEPS, target_time=1.2), tmp_path / "unfinished"
     whole = run(model, dataset, settings, cost=PRICES)
     for cut in (5, 8):
