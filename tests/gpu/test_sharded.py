@@ -1,0 +1,58 @@
+"""The kernels, emulated, under Gaussians that are divided among processes."""
+
+from __future__ import annotations
+
+import torch
+from finetune import tiny
+from finetune.several import learn
+
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.engines.sharded import ShardedEngine
+from fragprune_plugins.finetuning.processes import part_of
+from fragprune_plugins.learning.ranks import Ranks
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.storage.models import Model
+from fragprune_plugins.types import RasterInputs
+
+LEARNED = ("xyz", "f_rest", "opacity", "scaling")
+
+
+def drawn(engine, model, indices):
+    """Pictures from some cameras, and the gradients by all of them together."""
+    for name in LEARNED:
+        getattr(model.splat, name).requires_grad_()
+    pictures = []
+    for index in indices:
+        inputs = RasterInputs(tiny.cameras()[index].view(), model.splat.splats())
+        outputs = engine.rasterize(inputs, model.thresholds.values)
+        (outputs.image.square().sum() + outputs.fragments_per_pixel).backward()
+        pictures.append(outputs.image.detach())
+    leaves = [getattr(model.splat, name) for name in LEARNED] + [model.thresholds.logits]
+    return pictures, [leaf.grad for leaf in leaves]
+
+
+def scene(count):
+    splat = tiny.random_model(count, degree=3)
+    return Model(splat, ThresholdStore.from_falloff(torch.linspace(0.02, 0.4, count)))
+
+
+def test_the_kernels_draw_shards_as_they_draw_the_whole(device, single_thread):
+    engine = CudaEngine(device, deterministic=True)
+    for count in (40, 1):  # of one, the first process has none
+        pictures, gradients = drawn(engine, scene(count), (0, 1))
+
+        def work(ranks, count=count):
+            part = part_of(scene(count), ranks, "cpu")
+            return drawn(ShardedEngine(engine, ranks), part, [ranks.rank])
+
+        parts = learn(2, work)
+        for (found,), expected in zip((part[0] for part in parts), pictures, strict=True):
+            assert torch.allclose(found, expected, atol=1e-6)  # colours: compiled in two places
+        for expected, *found in zip(gradients, *(part[1] for part in parts), strict=True):
+            scale = float(expected.abs().max())
+            assert torch.allclose(torch.cat(found), expected, atol=2e-6 * scale, rtol=1e-5)
+
+
+def test_one_process_is_all_processes(engine):
+    alone, _ = drawn(ShardedEngine(engine, Ranks()), scene(20), [0])
+    assert torch.allclose(alone[0], drawn(engine, scene(20), [0])[0][0], atol=1e-6)
