@@ -241,21 +241,20 @@ def command(
             saved = _whole(result, ranks) if shard else result
             if ranks.first:
                 save(out, saved)
+            truncated = saved.thresholds is not None
             over = finetuned.Finetuned(
-                model,
-                out,
-                start,
-                result,
-                keep,
-                len(whole.splat) - len(kept.splat),
-                found,
-                None,
-                seed,
-                saved.thresholds is not None,
-                ranks.size if shard else 1,
+                model=model,
+                out=out,
+                start=start,
+                result=result,
+                keep=keep,
+                removed=len(whole.splat) - len(kept.splat),
+                found=found,
+                dropped=None,
+                seed=seed,
+                truncated=ranks.gather(truncated)[0] if shard else truncated,
+                shards=ranks.size if shard else 1,
             )
-            if shard:
-                over = replace(over, truncated=ranks.gather(over.truncated)[0])
             measured = None
             if shard and not result.terminated:  # all draw, so all measure
                 measured = over.measured(dataset, rasterizer)
