@@ -82,6 +82,35 @@ def test_the_hosts_maps_are_those_of_the_oracle_in_its_order(mini):
     assert drawn["rend_dist"].max() > 0
 
 
+REGULARISERS = {
+    "normals": lambda drawn: 1 - (drawn["rend_normal"] * drawn["surf_normal"]).sum(dim=0),
+    "distortion": lambda drawn: drawn["rend_dist"],
+    "median depth": lambda drawn: drawn["surf_depth"],
+}
+
+
+@pytest.mark.parametrize("term", REGULARISERS)
+def test_each_of_the_hosts_regularisers_alone_has_the_oracles_gradients(mini, term):
+    """Alone, because a picture's gradients hide theirs; with pixels of no surfel in the view."""
+    found = []
+    for engine in ("reference", "cpu"):
+        with joint(**of(mini, engine=engine)) as host:
+            model, camera = host.model(COUNT), host.camera(40, 28, side=1.5)
+            host.step(model, camera, 1)
+            host.store(model).open(host.adapter.opacities(model))
+            model.optimizer.zero_grad()
+            drawn = host.render(camera, model)
+            assert 0 < (drawn["rend_alpha"] == 0).sum() < 1000
+            REGULARISERS[term](drawn).mean().backward()
+            leaves = {name: each.grad for name, each in host.driver.parameters(model).items()}
+            found.append(leaves | {"thresholds": host.store(model).logits.grad})
+    assert found[0]["xyz"].any()
+    assert found[0]["thresholds"].any()
+    for name, expected in found[0].items():
+        scale = expected.abs().max().item()
+        torch.testing.assert_close(found[1][name], expected, rtol=0, atol=1e-3 * scale)
+
+
 def test_matrices_in_place_of_scales_are_refused(mini):
     with joint(**of(mini)) as host:
         model, camera = host.model(COUNT), host.camera()

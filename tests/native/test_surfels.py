@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from native.test_against_oracle import check_gradients, check_images, draw_pair
+from native.test_against_oracle import (
+    GRADIENT_TOLERANCE,
+    check_gradients,
+    check_images,
+    draw_pair,
+)
 from native.test_dialects import check_scores
 from native.test_inputs import draw
 
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs
+from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.testing import scenes
+from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 DIALECTS = {
     "near": {"near": 2.5},
@@ -34,6 +42,63 @@ def test_dialects_equal_the_oracle(engine: CpuEngine, kind: str) -> None:
     check_gradients(engine, scene, thresholds, same)
     if scene.scores:
         check_scores(truth, ours, same)
+
+
+MAPS: dict[str, Callable[[RasterOutputs], torch.Tensor]] = {
+    "alpha": lambda drawn: drawn.alpha,
+    "depth": lambda drawn: drawn.surface[:1],
+    "normal": lambda drawn: drawn.surface[1:4],
+    "median depth": lambda drawn: drawn.surface[4:5],
+    "distortion": lambda drawn: drawn.surface[5:],
+}
+"""What regularisers read. In a sum of all, the distortion is lost: it is a thousand times less."""
+
+
+def sheet(seed: int) -> RasterInputs:
+    """Surfels on one plane before the camera, or 1 % of its depth away: what regularisers make."""
+    scene = scenes.random_scene(seed, 60, flat=True)
+    view = scenes.one_splat(width=40, height=28).view  # the world is the camera's
+    generator = torch.Generator().manual_seed(seed)
+    at = torch.rand(60, 2, generator=generator) * torch.tensor([40.0, 28.0])
+    depths = 3 + 0.03 * torch.randn(60, generator=generator)
+    turns = torch.nn.functional.normalize(
+        torch.tensor([[1.0, 0, 0, 0]]) + 0.03 * torch.randn(60, 4, generator=generator)
+    )
+    splats = replace(scene.splats, means=scenes.unproject(view, at, depths), rotations=turns)
+    return replace(scene, view=view, splats=splats)
+
+
+def slopes(
+    drawn: RasterOutputs, leaves: dict, plane: Callable[[RasterOutputs], torch.Tensor], same: object
+) -> dict[str, torch.Tensor]:
+    """Derivatives of a sum over one plane, its pixels weighted at random, by leaf name."""
+    weight = torch.randn(plane(drawn).shape, generator=torch.Generator().manual_seed(7)) * same
+    (plane(drawn) * weight.to(drawn.image)).sum().backward()
+    return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+@pytest.mark.parametrize("truncated", [False, True], ids=["whole", "truncated"])
+@pytest.mark.parametrize("plane", MAPS)
+@pytest.mark.parametrize("made", [lambda: scenes.random_scene(2, flat=True), lambda: sheet(3)])
+def test_each_map_alone_and_its_gradients_equal_the_oracle(
+    engine: CpuEngine, made: Callable[[], RasterInputs], plane: str, truncated: bool
+) -> None:
+    scene, drawn = made(), MAPS[plane]
+    tau = scenes.random_thresholds(2, 60) if truncated else None
+    truth, ours, same = draw_pair(engine, scene, tau)
+    same &= (truth.surface[4] - ours.surface[4]).abs() < 1e-3  # half of the light, to rounding
+    assert (~same).sum() <= 2
+    error = (drawn(truth) - drawn(ours))[:, same].abs().max()
+    assert error < GRADIENT_TOLERANCE * drawn(truth)[:, same].abs().max()
+    found = []
+    for each, dtype in ((ReferenceEngine(), torch.float64), (engine, torch.float32)):
+        cast, leaves = scenes.leaves(scenes.cast(scene, dtype))
+        if tau is not None:
+            leaves["thresholds"] = tau.detach().to(dtype).requires_grad_()
+        found.append(slopes(each.rasterize(cast, leaves.get("thresholds")), leaves, drawn, same))
+    for name, expected in found[0].items():
+        away = (found[1][name] - expected).abs().max()
+        assert away <= GRADIENT_TOLERANCE * expected.abs().max(), name
 
 
 @settings(max_examples=25)

@@ -258,12 +258,9 @@ inline SurfelMeeting meet_surfel(const Surfel& s, Lanes px, Lanes py, float near
 
 inline Lanes surfel_falloff(Lanes q) { return exp2(q * broadcast<Lanes>(-0.5f * kLog2E)); }
 
-// The distortion's depth: 0 at the near plane, 1 at kSurfelFar.
-inline Lanes surfel_m(Lanes depth, float near) {
-  const Lanes one = broadcast<Lanes>(1.f);
-  const float scale = kSurfelFar / (kSurfelFar - near);
-  return broadcast<Lanes>(scale) * (one - broadcast<Lanes>(near) / depth);
-}
+// The distortion's depth m, 0 at the near plane and 1 at kSurfelFar, is a constant less
+// surfel_slope / depth. Only differences count, squared; they would be lost beside the constant.
+inline float surfel_slope(float near) { return kSurfelFar * near / (kSurfelFar - near); }
 
 // Where a tile's pixel lies among them all, in block order.
 inline int place_of(int x, int y) {

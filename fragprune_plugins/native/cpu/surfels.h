@@ -20,7 +20,7 @@ constexpr int32_t kNever = INT32_MAX;
 // What the forward pass leaves of a tile, by place.
 struct SurfelPixels {
   float light[kPixels];        // final transmittance
-  float first[kPixels], second[kPixels];  // sums of w m, w m^2
+  float first[kPixels], second[kPixels];  // sums of w d, w d^2; see surfel_slope
   int32_t stop[kPixels];       // fragments at this place of the list or later are not alive
   int32_t median[kPixels];     // place of the median depth's fragment; -1
 };
@@ -142,7 +142,7 @@ inline SurfelSpent draw_surfel_tile(SurfelScene& scene, size_t t, const fragprun
       if (out.invdepth) add(3, all(s.inv_z));
       if (surface) {
         const Lanes depth = select(drawn, m.depth, all(1.f));
-        const Lanes d = surfel_m(depth, in.near), used = all(1.f) - light;
+        const Lanes d = all(surfel_slope(in.near)) / depth, used = all(1.f) - light;
         const Lanes first = load(kept.first + at), second = load(kept.second + at);
         add(4, depth);
         add(5, all(s.normal.x)), add(6, all(s.normal.y)), add(7, all(s.normal.z));
@@ -256,7 +256,6 @@ inline void undraw_surfel_tile(const SurfelScene& scene, size_t t, const fragpru
     }
   const auto all = [](float x) { return broadcast<Lanes>(x); };
   const float per_fragment = by.fragments_per_pixel / static_cast<float>(plane);
-  const float slope = kSurfelFar * in.near / (kSurfelFar - in.near);  // of m, times depth^2
   const int32_t length = static_cast<int32_t>(scene.first[t + 1] - scene.first[t]);
   for (int32_t place = std::min(last, length) - 1; place >= 0; place--) {
     const Surfel& s = scene.surfels[scene.list[scene.first[t] + static_cast<uint32_t>(place)]];
@@ -281,13 +280,12 @@ inline void undraw_surfel_tile(const SurfelScene& scene, size_t t, const fragpru
       Lanes by_depth = all(0.f);
       const Lanes weight = alpha * before;
       if (by.surface) {
-        const Lanes d = surfel_m(depth, in.near), used = one - load(kept.light + at);
+        const Lanes d = all(surfel_slope(in.near)) / depth, used = one - load(kept.light + at);
         const Lanes first = load(kept.first + at), distortion = loss(9);
         shade = shade + loss(4) * depth + loss(5) * all(s.normal.x) + loss(6) * all(s.normal.y) +
                 loss(7) * all(s.normal.z) +
                 distortion * fma(d, fma(d, used, -2.f * first), load(kept.second + at));
-        by_depth = weight * (loss(4) + 2.f * distortion * fma(d, used, -first) * all(slope) /
-                                           (depth * depth));
+        by_depth = weight * (loss(4) - 2.f * distortion * fma(d, used, -first) * d / depth);
         const IntLanes median = load(kept.median + at);
         const Mask other = gt(median, broadcast_int(place));  // behind
         const Mask here = both(gt(median, broadcast_int(place - 1)), drawn);
