@@ -14,8 +14,10 @@ import threading
 from copy import deepcopy
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from plyfile import PlyData
 
 import fragprune_plugins
@@ -387,9 +389,17 @@ def test_from_a_command_for_splatfacto_to_a_model_that_fragprune_reads(scene, tm
     assert "fewer fragments" in said
     (config,) = tmp_path.glob("*/fragprune-splatfacto/*/config.yml")
     command("ns-export", "gaussian-splat", "--load-config", config, "--output-dir", tmp_path)
-    command("ns-eval", "--load-config", config, "--output-path", tmp_path / "eval.json")
+    into = ["--output-path", tmp_path / "eval.json", "--render-output-path", tmp_path / "eval"]
+    command("ns-eval", "--load-config", config, *into)
     psnr = json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"]
     assert 5 < psnr < 50
+    how = ["--split", "test", "--rendered-output-names", "rgb", "--image-format", "png"]
+    command("ns-render", "dataset", "--load-config", config, "--output-path", tmp_path, *how)
+    drawn = [np.asarray(Image.open(file)) for file in sorted((tmp_path / "test").rglob("*.png"))]
+    seen = [np.asarray(Image.open(file)) for file in sorted((tmp_path / "eval").glob("*.png"))]
+    assert len(drawn) == len(seen) > 0
+    for ours, both in zip(drawn, seen, strict=True):  # ns-eval's: the photograph, and the picture
+        assert np.array_equal(ours, both[:, -ours.shape[1] :])
     assert "learned thresholds" in command(
         "fragprune", "profile", tmp_path / "splat.ply", "--data", scene
     )
