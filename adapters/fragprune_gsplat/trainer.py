@@ -207,6 +207,12 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         images = "images" if factor == "1" else f"images_{factor}"
         return Photographs(Path(flags["data-dir"][0]), images=images)
 
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
+        """The factor on opacity that ``--antialiased`` asks for; the last of several flags wins."""
+        names = [word.replace("_", "-") for word in arguments]
+        asked = [name for name in names if name in ("--antialiased", "--no-antialiased")]
+        return {"compensation": "antialiasing"} if asked[-1:] == ["--antialiased"] else {}
+
     def model_file(self, output: Path, iteration: int) -> Path:
         """The PLY of an iteration with ``--save_ply``, else its checkpoint."""
         ply = output / "ply" / f"point_cloud_{iteration - 1}.ply"

@@ -143,6 +143,20 @@ def test_what_the_script_reads_is_known_where_it_leaves_the_world_as_it_is():
         adapter.photographs(repo, [*words, "--test_every", "4"])
 
 
+@pytest.mark.parametrize(
+    ("words", "factor"),
+    [
+        ([], None),
+        (["--packed", "--antialiased"], "antialiasing"),
+        (["--antialiased", "--no-antialiased"], None),
+        (["--no_antialiased", "--antialiased"], "antialiasing"),
+    ],
+)
+def test_its_models_are_measured_as_the_script_draws_them(words, factor):
+    adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
+    assert adapter.drawing(repo, ["default", *words]).get("compensation") == factor
+
+
 def test_it_cannot_resume_and_says_how_to_learn(train):
     with pytest.raises(UsageError, match="from-iter"):
         train(stage="finetune")
