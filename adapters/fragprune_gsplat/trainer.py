@@ -43,6 +43,7 @@ ONLY = {
     "with-ut": ("False",),
     "with-eval3d": ("False",),
     "strategy.absgrad": ("False",),
+    "app-opt": ("False",),  # colours of a network's, infinite where a point is black or white
 }
 """Flags with values that stage 2 cannot follow; these values it can."""
 DEFINES = ("create_splats_with_optimizers", "Runner.train", "main")

@@ -115,6 +115,7 @@ def test_joint_learning_begins_where_refinement_ends(train, tmp_path):
         (["--camera_model=fisheye"], "camera-model"),
         (["--with_ut", "--packed"], "with-ut"),
         (["--strategy.absgrad"], "absgrad"),
+        (["--app_opt"], "app-opt"),
     ],
 )
 def test_flags_that_stage_two_cannot_follow_are_refused(words, named):
