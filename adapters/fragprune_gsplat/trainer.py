@@ -46,6 +46,8 @@ ONLY = {
     "app-opt": ("False",),  # colours of a network's, infinite where a point is black or white
 }
 """Flags with values that stage 2 cannot follow; these values it can."""
+NEAR = 0.01
+"""The near plane of ``rasterization``."""
 DEFINES = ("create_splats_with_optimizers", "Runner.train", "main")
 
 
@@ -209,10 +211,25 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         return Photographs(Path(flags["data-dir"][0]), images=images)
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """The factor on opacity that ``--antialiased`` asks for; the last of several flags wins."""
-        names = [word.replace("_", "-") for word in arguments]
+        """Near plane, gsplat's cap on alpha, and the factor that ``--antialiased`` asks for.
+
+        Raises:
+            NotComparedError: a far plane hides something.
+        """
+        flags, names = given(arguments), [word.replace("_", "-") for word in arguments]
+        if "far-plane" in flags:
+            raise NotComparedError(
+                "gsplat's simple_trainer",
+                "a far plane, which our readers do not have",
+                "pictures as the script draws them",
+                "Compare its own figures of held-out views, stats/val_step*.json in --result_dir.",
+            )
+        near = flags.get("near-plane", [self._fields().get("near_plane", NEAR)])[0]
+        rules: dict[str, Any] = {"near": float(near), "alpha_max": self.dialect(repo).alpha_max}
         asked = [name for name in names if name in ("--antialiased", "--no-antialiased")]
-        return {"compensation": "antialiasing"} if asked[-1:] == ["--antialiased"] else {}
+        if asked[-1:] == ["--antialiased"]:  # the last of several flags wins
+            rules["compensation"] = "antialiasing"
+        return rules
 
     def model_file(self, output: Path, iteration: int) -> Path:
         """The PLY of an iteration with ``--save_ply``, else its checkpoint."""

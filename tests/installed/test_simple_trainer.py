@@ -155,7 +155,12 @@ def test_what_the_script_reads_is_known_where_it_leaves_the_world_as_it_is():
 )
 def test_its_models_are_measured_as_the_script_draws_them(words, factor):
     adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
-    assert adapter.drawing(repo, ["default", *words]).get("compensation") == factor
+    drawn = adapter.drawing(repo, ["default", *words])
+    assert (drawn["near"], drawn.get("compensation")) == (0.01, factor)
+    assert drawn["alpha_max"] == adapter.dialect(repo).alpha_max != 0.99  # of 1.4 and 1.5
+    assert adapter.drawing(repo, ["default", "--near_plane", "0.3"])["near"] == 0.3
+    with pytest.raises(NotComparedError, match="far plane"):
+        adapter.drawing(repo, ["default", "--far-plane=9"])
 
 
 def test_it_cannot_resume_and_says_how_to_learn(train):
