@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import AlignmentError, SessionError
+from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.adapter import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.resuming import draw_nothing
@@ -58,8 +58,11 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
         adopt(session, model, *session.unpacked)
     state, view = session.models.get(model), session.adapter.view(call.first)
     begins = session.adapter.steps_by_rendering and session.learn and torch.is_grad_enabled()
-    if begins and state is not None and not state.begun and session.adapter.begins_step(call):
-        begin_step(session, model, state)
+    if begins and state is not None and not state.begun:
+        if session.adapter.begins_step(call):
+            begin_step(session, model, state)
+        else:
+            expect_to_train(session, call, model)
     again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
     measured = session.settings.target_speedup is not None  # a kept view keeps its model alive
     if state is not None and learns(state) and torch.is_grad_enabled():
@@ -69,6 +72,22 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     if state is not None and state.stage is not None:
         state.stage.picture = str(getattr(call.first, "image_name", ""))
     return again()
+
+
+def expect_to_train(session: SessionState, call: SeamCall, model: Any) -> None:
+    """Refuse to learn in a phase of the host's training that comes before stage 2.
+
+    Raises:
+        UsageError: the model is already frozen in it.
+    """
+    if session.standing_still(model):
+        raise UsageError(
+            f"{session.adapter.name}: {call.seam}",
+            "an earlier phase of the training than the one in which stage 2 learns",
+            "a trained model, because stage 2 freezes it",
+            "Name a trained model to start from, or an iteration above 0 after which stage 2 "
+            "begins: --from-iter, or activate(from_iter=...).",
+        )
 
 
 def expect_adopted(session: SessionState, call: SeamCall) -> None:

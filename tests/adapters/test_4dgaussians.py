@@ -118,6 +118,17 @@ def test_one_run_learns_after_an_iteration_of_the_fine_phase_alone(mini, photogr
     assert late[12]["fragprune"]["steps"] == LAST - 9 - 1
 
 
+@pytest.mark.parametrize("options", [OPTIONS, EVERYTHING], ids=["opacity", "all"])
+def test_a_stage_2_that_would_freeze_the_coarse_phase_is_refused(
+    mini, photographs, tmp_path, options
+):
+    words = command(mini, photographs, tmp_path / "out")
+    with pytest.raises(UsageError, match="an earlier phase") as caught:
+        run(words, replace(options, stage="finetune", from_iter=0))
+    assert "--from-iter" in caught.value.remedy
+    assert not list((tmp_path / "out").rglob("point_cloud.ply"))
+
+
 def test_joint_learning_counts_fine_iterations_and_follows_rows(mini, photographs, tmp_path):
     options = replace(OPTIONS, stage="joint", from_iter=3)
     summary = run(command(mini, photographs, tmp_path / "out"), options)
