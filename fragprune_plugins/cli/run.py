@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from fragprune_plugins.cli.common import (
     JSON,
@@ -142,6 +143,8 @@ def command(
 
     bound_threads(threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
+    flags = {"again": "--again", "every": "--checkpoint-every"}
+    source = ctx.get_parameter_source
     options = RunOptions(
         adapter=adapter,
         stage=stage,
@@ -152,6 +155,7 @@ def command(
         device=device,
         again=again,
         checkpoint_every=every,
+        resuming=tuple(f for n, f in flags.items() if source(n) is not ParameterSource.DEFAULT),
     )
     # A host prints to stdout; with --json, stdout gets only our object.
     to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None
@@ -282,9 +286,11 @@ def _describe(
             models = f"{summary.model_before or 'OTHER'} {summary.model_after}"
             lines.append(f"Compare: fragprune compare {models}")
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
+    control = not summary.settings["truncate"]
+    learned = "of the control" if control else _WHERE.get(summary.stage, "of stage 2")
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
-        f"{summary.iterations} iterations {_WHERE.get(summary.stage, 'of stage 2')}{pressure}, "
+        f"{summary.iterations} iterations {learned}{pressure}, "
         f"{summary.train_seconds:.0f} s in all. "
         f"Model: {summary.model_after or _saved(summary)}."
     )

@@ -71,6 +71,8 @@ class RunOptions:
         again: False leaves a finished stage 2 alone: if "finetune" finds the result of the same
             start, settings and host, it runs nothing. An unfinished one goes on.
         checkpoint_every: seconds after which an unfinished stage 2 is kept again; 0 keeps none.
+        resuming: options of the two above that a user wrote. A host that keeps its own checkpoints
+            refuses them.
     """
 
     adapter: str | None = None
@@ -82,6 +84,7 @@ class RunOptions:
     device: str = "auto"
     again: bool = True
     checkpoint_every: float = 300.0
+    resuming: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -251,6 +254,13 @@ def _run_method(
     script, arguments, module = command
     started, ear, plugins = time.perf_counter(), _Ear(), installed()
     ranks.expect_one()
+    if options.resuming:
+        raise UsageError(
+            " and ".join(options.resuming),
+            f"{adapter.info.title}, which keeps and resumes its own checkpoints",
+            "the host's own options for them",
+            "Drop it. Stage 2 begins anew unless the host's command names a checkpoint.",
+        )
     device = process.host_device(options.device, options.engine)
     words = adapter.rewritten(
         arguments,

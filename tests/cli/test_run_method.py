@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cli import commands
 
 from fragprune_plugins.adapting import Finding, HostInfo, MethodAdapter, hookimpl
 from fragprune_plugins.errors import HostFailed, UsageError
@@ -13,6 +14,8 @@ from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 
 PACKAGE = "a_studio_of_the_tests"
+RUN = ("run", "--device", "cpu", "--iters", 3)
+THEIRS = ("--", "python", "-m", f"{PACKAGE}.train", "theirs")
 TRAIN = """
 import sys
 from fragprune_plugins.learning.events import StepStats, Summary
@@ -25,7 +28,8 @@ if "stops" not in rest:
     for step in range(int(iterations)):
         stats = StepStats(step + 1, 9.0, 1e-3, 0.1)
         installed().tell(hookspecs.fragprune_step, stats=stats)
-    summary = Summary("studio", "cpu", int(iterations), 7, 9.0, 3.0, None, {})
+    settings = {"truncate": "control" not in rest}
+    summary = Summary("studio", "cpu", int(iterations), 7, 9.0, 3.0, None, settings)
     installed().tell(hookspecs.fragprune_finished, summary=summary)
 """
 
@@ -44,7 +48,13 @@ class Studio(MethodAdapter):
     def rewritten(self, arguments, settings, *, stage, from_iter, engine, device):
         if stage == "joint":
             raise UsageError("--stage", stage, "auto", "Drop it.")
-        return [f"{arguments[0]}-with-stage-two", str(settings.iterations), *arguments[1:]]
+        control = () if settings.truncate else ("control",)
+        return [
+            f"{arguments[0]}-with-stage-two",
+            str(settings.iterations),
+            *control,
+            *arguments[1:],
+        ]
 
     def dialect(self, repo):
         raise NotImplementedError
@@ -74,7 +84,7 @@ def _studio(tmp_path, monkeypatch, plug):
 
 def ran(*words, **options):
     options = RunOptions(device="cpu", settings=Settings(iterations=3), **options)
-    return run(["python", "-m", f"{PACKAGE}.train", "theirs", *words], options)
+    return run([*THEIRS[1:], *words], options)
 
 
 def test_the_method_runs_in_place_of_the_named_one_and_its_summary_is_the_runs():
@@ -89,6 +99,19 @@ def test_the_method_runs_in_place_of_the_named_one_and_its_summary_is_the_runs()
 def test_a_method_that_ends_before_stage_two_did_not_do_what_was_asked():
     with pytest.raises(HostFailed, match="before the end of stage 2"):
         ran("stops")
+
+
+def test_a_control_is_called_one():
+    done = commands.run(*RUN, "--control", *THEIRS)
+    assert "3 iterations of the control" in done.stdout
+
+
+@pytest.mark.parametrize("option", [["--again"], ["--checkpoint-every", "300"]])
+def test_options_of_our_checkpoints_are_refused_because_it_has_its_own(option):
+    done = commands.run(*RUN, *option, *THEIRS)
+    assert done.exit_code == 2
+    assert option[0] in done.stderr
+    assert "its own checkpoints" in done.stderr
 
 
 def test_what_the_method_cannot_do_is_refused_before_the_host_runs():
