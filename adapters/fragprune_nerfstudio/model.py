@@ -7,10 +7,11 @@ the thresholds. It starts a session of fragprune, which does the rest: this modu
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from copy import copy
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -26,8 +27,15 @@ import fragprune_plugins
 from fragprune_nerfstudio import METHOD
 from fragprune_plugins import Settings
 from fragprune_plugins.adapting import AlignmentError, SessionError, UsageError
+from fragprune_plugins.errors import Interrupted, Terminated
 from fragprune_plugins.injection.process import checkpoint_values
 from fragprune_plugins.injection.session import Session, active_session
+from fragprune_plugins.learning.interruption import (
+    EXIT_CODE,
+    Terminate,
+    between_steps,
+    sigterm_interrupts,
+)
 
 PLAIN = 0.25
 """gsplat's threshold of plain gradients over that of absolute ones, 0.0002 over 0.0008."""
@@ -80,6 +88,8 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
     begin: int | None = None  # iteration at which stage 2 begins, once it is known
     saved: dict[str, Any] | None = None  # of the checkpoint
     checkpoints: Path | None = None  # their folder
+    done: int | None = None  # the last iteration that was made
+    finished = False
 
     def populate_modules(self) -> None:
         """As splatfacto; on the CPU without CUDA, and offline without LPIPS."""
@@ -120,8 +130,52 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
                 "fragprune: on a CPU densification follows plain gradients, not absolute ones, "
                 f"above {self.config.densify_grad_thresh:g}"
             )
-        callbacks: list[Any] = super().get_training_callbacks(training_callback_attributes)
-        return [*callbacks, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self.tell)]
+        self.holding = ExitStack()
+        trainer.train = partial(self.train_until_interrupted, trainer, trainer.train)
+        own: list[Any] = super().get_training_callbacks(training_callback_attributes)
+        at = TrainingCallbackLocation
+        return [
+            TrainingCallback([at.BEFORE_TRAIN_ITERATION], self.hold),
+            *own,
+            TrainingCallback([at.AFTER_TRAIN_ITERATION], self.let_go),
+            TrainingCallback([at.AFTER_TRAIN], self.tell),
+        ]
+
+    def hold(self, step: int) -> None:
+        """From here on Ctrl-C and SIGTERM wait, so that a checkpoint is of whole iterations."""
+        self.holding.enter_context(between_steps())
+
+    def let_go(self, step: int) -> None:
+        """The iteration is over: a signal that waits acts here."""
+        self.done = step
+        self.holding.close()
+
+    def train_until_interrupted(self, trainer: Any, train: Callable[[], None]) -> None:
+        """Train; Ctrl-C and SIGTERM save a checkpoint and end with exit code 130 or 143.
+
+        nerfstudio itself saves nothing then, and its exit code is 0.
+        """
+        try:
+            with sigterm_interrupts(), self.holding:
+                train()
+        except KeyboardInterrupt as error:
+            if self.finished or self.done is None:  # so nerfstudio's viewer is closed
+                raise
+            with between_steps():
+                trainer.save_checkpoint(self.done)
+            by_signal = isinstance(error, Terminate)
+            stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
+            path = trainer.checkpoint_dir / f"step-{self.done:09d}.ckpt"
+            left = trainer._start_step + trainer.config.max_num_iterations - self.done - 1
+            told = stated(
+                f"ns-train {METHOD}",
+                f"{found}; iteration {self.done} is saved",
+                "a training that reaches its end",
+                f"To go on, add to the same ns-train {METHOD} command: "
+                f"--load-checkpoint {path} --max-num-iterations {left}",
+            )
+            CONSOLE.print(str(told), markup=False, soft_wrap=True)
+            raise SystemExit(EXIT_CODE if by_signal else 130) from told
 
     def beginning(self, trainer: Any) -> int:
         """The iteration at which stage 2 begins: that of the checkpoint, if it has begun there.
@@ -205,6 +259,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
 
     def tell(self, step: int) -> None:
         """Say what was gained, at the end of a training."""
+        self.finished = True
         session = active_session()
         if session is None or session.store(self) is None:
             return

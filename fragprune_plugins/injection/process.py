@@ -99,6 +99,7 @@ def run_main(script: Path, module: str = "") -> None:
 
     Raises:
         HostFailed: the script ended with another exit code.
+        FragpruneError: it did so because of this error of ours.
     """
     try:
         if module:
@@ -106,6 +107,8 @@ def run_main(script: Path, module: str = "") -> None:
         else:
             runpy.run_path(str(script), run_name="__main__")
     except SystemExit as error:
+        if isinstance(error.__cause__, FragpruneError):
+            raise error.__cause__ from None
         if error.code not in (None, 0):
             raise HostFailed(
                 script.name,

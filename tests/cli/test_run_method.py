@@ -18,11 +18,15 @@ RUN = ("run", "--device", "cpu", "--iters", 3)
 THEIRS = ("--", "python", "-m", f"{PACKAGE}.train", "theirs")
 TRAIN = """
 import sys
+from fragprune_plugins import errors
 from fragprune_plugins.learning.events import StepStats, Summary
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.loading import installed
 
 method, iterations, *rest = sys.argv[1:]
+for stated in (errors.Interrupted, errors.Terminated):
+    if stated.__name__ in rest:
+        raise SystemExit(99) from stated("studio", "a signal", "none", "Go on.")
 assert method == "theirs-with-stage-two", method
 if "stops" not in rest:
     for step in range(int(iterations)):
@@ -112,6 +116,13 @@ def test_options_of_our_checkpoints_are_refused_because_it_has_its_own(option):
     assert done.exit_code == 2
     assert option[0] in done.stderr
     assert "its own checkpoints" in done.stderr
+
+
+@pytest.mark.parametrize(("how", "code"), [("Interrupted", 130), ("Terminated", 143)])
+def test_a_method_that_was_interrupted_says_so(how, code):
+    done = commands.run(*RUN, *THEIRS, how)
+    assert done.exit_code == code
+    assert "Go on." in done.stderr
 
 
 def test_what_the_method_cannot_do_is_refused_before_the_host_runs():

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -24,6 +25,7 @@ import fragprune_plugins
 from fragprune_nerfstudio import METHOD
 from fragprune_plugins.errors import AlignmentError, SidecarError, UsageError
 from fragprune_plugins.injection.session import active_session
+from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.storage import models, sidecar
 
 pytestmark = [pytest.mark.nerfstudio, pytest.mark.filterwarnings("ignore")]
@@ -277,6 +279,84 @@ def test_a_training_in_which_nothing_can_be_learned_is_refused(
         trained(config)
 
 
+# -- interrupting
+
+
+class Signals:
+    """Sends this process a signal when a step of stage 2 is reported."""
+
+    def __init__(self, number, step):
+        self.number, self.step = number, step
+
+    @hookimpl
+    def fragprune_step(self, stats):
+        if stats.step == self.step:
+            signal.raise_signal(self.number)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_stage_two_leaves_a_checkpoint_to_go_on_from(
+    methods, scene, tmp_path, number, code, plug, ctrl_c, capsys
+):
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    plug(Signals(number, 7))
+    with pytest.raises(SystemExit) as caught:
+        trained(configured(methods, scene, tmp_path / "one"))
+    assert caught.value.code == code
+    assert {each: signal.getsignal(each) for each in before} == before
+    (checkpoint,) = (tmp_path / "one").rglob("*.ckpt")
+    said = capsys.readouterr().out
+    assert f"--load-checkpoint {checkpoint} " in said
+    left = int(re.search(r"--max-num-iterations (\d+)", said)[1])
+    done = torch.load(checkpoint, map_location="cpu")["step"] + 1
+    assert done + left == TRAINING + STAGE2
+    assert TRAINING < done < TRAINING + STAGE2
+    fragprune_plugins.deactivate()
+
+    config = configured(methods, scene, tmp_path / "two")
+    config.load_checkpoint, config.max_num_iterations = checkpoint, left
+    model = trained(config).pipeline.model
+    assert model.begin == TRAINING
+    assert active_session().models[model].stage.steps == STAGE2
+
+
+def test_ctrl_c_in_the_training_before_stage_two_saves_it_too(
+    methods, scene, tmp_path, monkeypatch, ctrl_c
+):
+    from nerfstudio.models.splatfacto import SplatfactoModel
+
+    original = SplatfactoModel.step_post_backward
+
+    def interrupting(self, step):
+        original(self, step)
+        if step == 11:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(SplatfactoModel, "step_post_backward", interrupting)
+    config = configured(methods, scene, tmp_path)
+    with pytest.raises(SystemExit) as caught:
+        trained(config)
+    assert caught.value.code == 130
+    (checkpoint,) = tmp_path.rglob("*.ckpt")
+    assert torch.load(checkpoint, map_location="cpu")["step"] == 11
+
+
+def test_ctrl_c_after_the_training_closes_the_viewer_as_ever(
+    methods, scene, tmp_path, monkeypatch, ctrl_c
+):
+    from nerfstudio.engine.trainer import Trainer
+
+    config = configured(methods, scene, tmp_path)
+    config.viewer.quit_on_train_completion = False
+
+    def interrupting(self):
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "_train_complete_viewer", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        trained(config)
+
+
 # -- exporting
 
 
@@ -408,3 +488,35 @@ def test_from_a_command_for_splatfacto_to_a_model_that_fragprune_reads(scene, tm
     refused = command("python", *script, "--output-dir", other, fails=True)
     assert "Run: ns-export gaussian-splat" in refused
     assert not list(other.glob("*.ply"))
+
+
+KILLED = """
+import signal, sys
+from fragprune_plugins.cli import cli
+from fragprune_plugins.injection import stepping
+
+report = stepping.report
+
+def interrupting(session, stats):
+    report(session, stats)
+    if stats.step == 4:
+        signal.raise_signal(signal.SIGINT)
+
+stepping.report = interrupting
+signal.signal(signal.SIGINT, signal.default_int_handler)
+cli(sys.argv[1:])
+"""
+
+
+@pytest.mark.timeout(600)
+def test_an_interrupted_run_ends_with_130_and_names_the_checkpoint(scene, tmp_path):
+    words = ["run", "--device", "cpu", "--iters", 10, "--", "ns-train", "splatfacto"]
+    words += ["--output-dir", tmp_path, "--vis", "tensorboard", "--max-num-iterations", 20]
+    words += ["--pipeline.model.num-downscales", 0, "colmap", "--data", scene]
+    words += ["--colmap-path", "sparse/0"]
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, *map(str, words)], capture_output=True, text=True
+    )
+    assert done.returncode == 130, done.stderr[-3000:]
+    (checkpoint,) = tmp_path.rglob("*.ckpt")
+    assert f"--load-checkpoint {checkpoint}" in done.stderr
