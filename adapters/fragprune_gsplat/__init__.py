@@ -130,7 +130,8 @@ class Gsplat(HostAdapter):
         limits=(
             "Refused by name: other cameras, distortion, the unscented transform, distributed, "
             "batches, channels other than three, tiles other than 16 pixels.",
-            "absgrad is refused while positions train; so are several GPUs in one training.",
+            "absgrad is refused before stage 2 on a CPU, and where thresholds learn inside the "
+            "training; several GPUs in one training are refused.",
             "Its own examples/simple_trainer.py cannot resume: both stages are one run.",
         ),
     )

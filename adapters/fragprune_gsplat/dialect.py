@@ -176,14 +176,15 @@ class GsplatDialect(Dialect):
                     "Draw this without thresholds: with fragprune_plugins.paused(): ...",
                 )
         degree, colors = given["sh_degree"], given["colors"]
+        trains = torch.is_grad_enabled() and given["means"].requires_grad and not call.still
         checks = (
             ("means", given["means"].ndim == 2, "(N, 3), no batches in front"),
             ("colors", colors is None or colors.shape[-1] == 3, "three channels"),
             ("sh_degree", degree is None or degree <= MAX_DEGREE, f"at most {MAX_DEGREE}"),
             (
                 "absgrad",
-                not (given["absgrad"] and torch.is_grad_enabled() and given["means"].requires_grad),
-                "False where positions train: our engines sum it over both axes",
+                not (given["absgrad"] and trains),
+                "False until stage 2: our engines sum it over both axes",
             ),
         )
         for name, holds, expected in checks:

@@ -151,14 +151,17 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
             one_run=True,
         )
 
-    def refuse(self, repo: HostRepo, arguments: list[str]) -> None:
+    def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
         """Refuse flags that stage 2 cannot follow.
+
+        Absolute gradients are gsplat's own to compute, on a GPU and where no thresholds learn.
 
         Raises:
             UsageError: names the flag.
         """
+        theirs = {"strategy.absgrad"} if device != "cpu" and stage != "joint" else set()
         for name, values in given(arguments).items():
-            known = ONLY.get(name)
+            known = None if name in theirs else ONLY.get(name)
             if known and (values or ["True"])[0] not in known:
                 raise UsageError(
                     f"simple_trainer --{name}",

@@ -57,12 +57,14 @@ class HostCall:
         arguments: of the call, by name.
         entry: the function called, "module:attribute" as seams spell it.
         engine: draws the call; dialects may compute with it first (``slice_at``).
+        still: stage 2 has begun, in which no strategy of the host reads gradients.
     """
 
     settings: Any
     arguments: Mapping[str, Any]
     entry: str = ""
     engine: str | Engine = "auto"
+    still: bool = False
 
     @classmethod
     def of(cls, call: SeamCall) -> HostCall:
@@ -461,8 +463,14 @@ class ScriptAdapter(HostAdapter):
         """The command that can resume a training script's result; by default the same command."""
         return script, arguments
 
-    def refuse(self, repo: HostRepo, arguments: list[str]) -> None:
+    def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
         """Refuse, before stage 1, arguments of a training that stage 2 cannot follow.
+
+        Args:
+            repo: the host.
+            arguments: of its command.
+            stage: "auto", "finetune" or "joint".
+            device: "cpu", "cuda" or "cuda:N".
 
         Raises:
             UsageError: names the argument.

@@ -201,7 +201,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
             log.warning("%s has no thresholds beside it: drawn without", host.flags.resume)
     if trains and options.stage != "off":
         ranks.expect_one()  # refuse before stage 1
-        adapter.refuse(repo, arguments)
+        adapter.refuse(repo, arguments, stage=options.stage, device=device)
     dialect = adapter.dialect(repo)
     answered = {*dialect.names(), *(dialect.spares() if device == "cpu" else ())}
     data = Path(host.flags.source) if trains and host.flags.source else None

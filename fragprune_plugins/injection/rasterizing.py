@@ -194,8 +194,9 @@ def directly() -> AbstractContextManager[None]:
 
 def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Engine]:
     """Translate the host's call into ``RasterInputs``, and choose the engine for its device."""
-    engine = session.engine(call[session.dialect.means].device)
-    return session.dialect.unpack(replace(call, engine=engine)), engine
+    engine, rendering = session.engine(call[session.dialect.means].device), session.rendering.get()
+    still = rendering is not None and session.standing_still(rendering[0])
+    return session.dialect.unpack(replace(call, engine=engine, still=still)), engine
 
 
 def rasterize(

@@ -210,6 +210,27 @@ def test_what_we_do_not_draw_is_refused_by_name(session_on, options):
             draw(params, **options)
 
 
+def test_absolute_gradients_are_refused_until_nothing_reads_them(session_on):
+    """A strategy reads them where it adds Gaussians, which it does no more in stage 2."""
+    with session_on(Gsplat(), settings=Settings(iterations=4), from_step=1):
+        from gsplat import DefaultStrategy
+
+        params, optimizers = new_params(40)
+        strategy = DefaultStrategy(absgrad=True)
+        strategy.check_sanity(params, optimizers)
+        strategy_state = strategy.initialize_state()
+        with pytest.raises(InputError, match="absgrad"):
+            draw(params, absgrad=True)
+        draw(params)[0].mean().backward()
+        for step in range(2):
+            colors, _, info = draw(params, absgrad=True)
+            strategy.step_pre_backward(params, optimizers, strategy_state, step, info)
+            colors.mean().backward()
+            strategy.step_post_backward(params, optimizers, strategy_state, step, info)
+            optimizers["opacities"].step()
+        assert torch.isfinite(params["opacities"]).all()
+
+
 def test_a_plain_dict_is_refused_and_there_is_no_command_to_run():
     with pytest.raises(SessionError, match="ParameterDict"):
         Gsplat().model_of(SimpleNamespace(instance=None, arguments={"params": {}}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -123,9 +124,19 @@ def test_joint_learning_begins_where_refinement_ends(train, tmp_path):
 )
 def test_flags_that_stage_two_cannot_follow_are_refused(words, named):
     adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
-    adapter.refuse(repo, ["default", "--camera-model", "pinhole", "--steps_scaler=1"])
+    how = {"stage": "auto", "device": "cpu"}
+    adapter.refuse(repo, ["default", "--camera-model", "pinhole", "--steps_scaler=1"], **how)
     with pytest.raises(UsageError, match=named):
-        adapter.refuse(repo, ["default", *words])
+        adapter.refuse(repo, ["default", *words], **how)
+
+
+@pytest.mark.parametrize("device", ["cuda", "cuda:1", "cpu"])
+@pytest.mark.parametrize("stage", ["auto", "finetune", "joint"])
+def test_absolute_gradients_are_for_strategies_that_run_on_a_gpu_before_stage_two(stage, device):
+    adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
+    fine = device != "cpu" and stage != "joint"
+    with contextlib.nullcontext() if fine else pytest.raises(UsageError, match="absgrad"):
+        adapter.refuse(repo, ["default", "--strategy.absgrad"], stage=stage, device=device)
 
 
 def test_they_are_refused_before_the_training(train, tmp_path):
