@@ -7,7 +7,6 @@ run, which is as much longer. The script uses the installed gsplat; its folder n
 from __future__ import annotations
 
 import ast
-import logging
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,12 +26,9 @@ from fragprune_plugins.adapting import (
     Role,
     ScriptAdapter,
     Seam,
-    SeamCall,
     UsageError,
     stand_ins,
 )
-
-log = logging.getLogger("fragprune")
 
 LISTS = {"eval_steps", "save_steps", "ply_steps"}
 """Flags that list steps at which the script evaluates and saves."""
@@ -83,23 +79,6 @@ def given(arguments: list[str]) -> dict[str, list[str]]:
     return found
 
 
-class Unmeasured(torch.nn.Module):
-    """A metric whose weights cannot be had here."""
-
-    def forward(self, *_: Any) -> torch.Tensor:
-        """NaN."""
-        return torch.tensor(float("nan"))
-
-
-def perceptual(call: SeamCall) -> Any:
-    """LPIPS; NaN where its network cannot be loaded, so that the run goes on."""
-    try:
-        return call.run()
-    except (OSError, ModuleNotFoundError) as error:
-        log.warning("LPIPS cannot be loaded (%s); it is NaN", str(error).splitlines()[0])
-        return Unmeasured()
-
-
 class TrainerDialect(GsplatDialect):
     """The dialect with a stand-in for the loss's kernel."""
 
@@ -122,11 +101,10 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
     seams = (
         *Gsplat.seams,
         Seam(
-            Role.ANSWER,
+            Role.METRIC,
             "torchmetrics.image.lpip",
             "LearnedPerceptualImagePatchSimilarity",
             external=True,
-            how=perceptual,
         ),
     )
 

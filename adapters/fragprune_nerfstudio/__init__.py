@@ -117,6 +117,12 @@ class Nerfstudio(MethodAdapter):
         ),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(
+            Role.METRIC,
+            "torchmetrics.image.lpip",
+            "LearnedPerceptualImagePatchSimilarity",
+            external=True,
+        ),
+        Seam(
             Role.PACK,
             f"{PACKAGE}.scripts.exporter",
             "ExportGaussianSplat.write_ply",

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import torch
 from gsplat.strategy.base import Strategy
@@ -70,14 +69,6 @@ class Still(Strategy):  # type: ignore[misc]
     absgrad = False
 
 
-class NoMetric(torch.nn.Module):
-    """Stands for a metric whose weights cannot be downloaded."""
-
-    def forward(self, *pictures: torch.Tensor) -> torch.Tensor:
-        """NaN."""
-        return torch.tensor(torch.nan)
-
-
 class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
     """splatfacto; from one iteration on its thresholds learn, and its Gaussians are frozen.
 
@@ -92,7 +83,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
     finished = False
 
     def populate_modules(self) -> None:
-        """As splatfacto; on the CPU without CUDA, and offline without LPIPS."""
+        """As splatfacto; on the CPU without CUDA."""
         expect_no_script()
         session = active_session()
         if session is None:  # it draws, with the thresholds of a checkpoint, and learns nothing
@@ -108,7 +99,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
             self.config = copy(self.config)
             self.config.use_absgrad = False
             self.config.densify_grad_thresh *= PLAIN
-        with _on_cpu(cpu), _without_downloads():
+        with _on_cpu(cpu):
             super().populate_modules()
 
     def get_outputs(self, camera: Any) -> Any:
@@ -337,23 +328,4 @@ def _on_cpu(cpu: bool) -> Iterator[None]:
     with ExitStack() as stack:
         if cpu:
             stack.enter_context(_NoCuda())
-        yield
-
-
-@contextmanager
-def _without_downloads() -> Iterator[None]:
-    """Inside, LPIPS is NaN where its weights cannot be downloaded."""
-    from torchmetrics.image import lpip
-
-    original = lpip.LearnedPerceptualImagePatchSimilarity
-
-    def made(*args: Any, **kwargs: Any) -> torch.nn.Module:
-        try:
-            metric: torch.nn.Module = original(*args, **kwargs)
-        except OSError as error:
-            CONSOLE.log(f"fragprune: LPIPS is NaN, its weights cannot be had ({error})")
-            return NoMetric()
-        return metric
-
-    with mock.patch.object(lpip, "LearnedPerceptualImagePatchSimilarity", made):
         yield

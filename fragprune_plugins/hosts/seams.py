@@ -37,7 +37,7 @@ class Role(Enum):
     VIEW = "remember which model is being rendered"
     RASTERIZE = "draw with thresholds"
     LOSS = "note the host's loss when it goes backward"
-    METRIC = "evaluate a picture; NaN if the weights cannot be downloaded"
+    METRIC = "evaluate a picture; NaN if the weights cannot be loaded"
     ANSWER = (
         "answer a call that the host's own function cannot answer on this machine",
         "instead: the result",

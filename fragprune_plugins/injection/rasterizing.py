@@ -232,15 +232,27 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
     return call.run()
 
 
+class Unmeasured(torch.nn.Module):
+    """In place of a metric whose weights cannot be loaded."""
+
+    def forward(self, *_: Any) -> Tensor:
+        """NaN."""
+        return torch.tensor(math.nan)
+
+
 def on_metric(session: SessionState, call: SeamCall) -> Any:
-    """Return NaN for a metric whose weights cannot be loaded, so that the run goes on."""
+    """Let a metric be NaN if its weights cannot be loaded, so that the run goes on.
+
+    The seam is a function, or a class whose objects measure.
+    """
     if call.seam not in session.absent:
         try:
             return call.run()
-        except OSError as error:  # the download failed
-            log.warning("%s: cannot load its weights (%s); returning NaN", call.seam, error)
+        except (OSError, ModuleNotFoundError) as error:  # the download failed, or no torchvision
+            why = str(error).split("\n")[0]
+            log.warning("%s: cannot load its weights (%s); it is NaN", call.seam, why)
             session.absent.add(call.seam)
-    return torch.tensor(math.nan)
+    return Unmeasured() if isinstance(call.function, type) else Unmeasured()()
 
 
 def on_answer(session: SessionState, call: SeamCall) -> Any:

@@ -10,9 +10,10 @@ import torch
 from miniatures.vanilla_3dgs import joint, running
 
 from fragprune_plugins.errors import RanksError, SessionError
-from fragprune_plugins.hosts.seams import Role
+from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection import session as module
+from fragprune_plugins.injection.rasterizing import on_metric
 from fragprune_plugins.injection.session import active_session
 from fragprune_plugins.learning.schedule import Settings
 
@@ -247,3 +248,23 @@ def test_a_call_goes_to_the_handler_of_its_role_with_its_model(stepped, monkeypa
         session._enter(seams[Role.KEEP], host_function, model, (), {"mask": 3}) == "the host's, 3"
     )
     assert given == []
+
+
+@pytest.mark.parametrize("error", [OSError(), ModuleNotFoundError("no torchvision\nat all")])
+def test_a_metric_without_its_weights_is_nan_be_it_a_function_or_a_class(error, caplog):
+    class Metric:
+        def __init__(self):
+            raise error
+
+    def metric():
+        raise error
+
+    for each in (Metric, metric):
+        session = SimpleNamespace(absent=set())
+        seam = Seam(Role.METRIC, "a_module", each.__name__)
+        answers = [on_metric(session, SeamCall(seam, each, None, (), {})) for _ in range(2)]
+        for answer in answers:
+            number = answer.to("cpu")(torch.zeros(3), torch.zeros(3)) if each is Metric else answer
+            assert number.isnan()
+    assert len(caplog.messages) == 2
+    assert all("it is NaN" in said and "\n" not in said for said in caplog.messages)
