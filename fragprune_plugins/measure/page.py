@@ -1,12 +1,14 @@
 """The frame of every HTML page: one style, and the parts that pages are made of.
 
-A page needs no network: its style and its few lines of script are inside. It has a dark layout and
-one for phones. All text is escaped here; ``src`` values are given as they are to be written.
+A page needs no network: its style and its few lines of script are inside, and its policy lets no
+other script run and no other machine be asked. It has a dark layout and one for phones. All text is
+escaped here; ``src`` values are given as they are to be written.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +32,11 @@ def compose(*, title: str, quote: str, parts: Sequence[str]) -> str:
         parts: of the page, HTML, in their order.
     """
     return _PAGE.substitute(
-        title=html.escape(title), quote=html.escape(quote), body="\n".join(filter(None, parts))
+        allowed=allowed(_SCRIPT),
+        script=_SCRIPT,
+        title=html.escape(title),
+        quote=html.escape(quote),
+        body="\n".join(filter(None, parts)),
     )
 
 
@@ -158,6 +164,11 @@ def zoom(size: Size) -> int:
     return max(1, min(room // side for room, side in zip(_ROOM, size, strict=True)))
 
 
+def allowed(text: str) -> str:
+    """How a Content-Security-Policy allows one script or style that stands within a page."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
 def _sized(size: Size) -> str:
     """Attributes of a figure: its width and shape, and whether single pixels are to be seen."""
     width, height = size
@@ -168,12 +179,17 @@ def _sized(size: Size) -> str:
 _SPLIT = Template("""<figure$sized><div class="pair">
 <img src="$after" alt="$caption: $right"><img class="top" src="$before" alt="$caption: $left">
 <b></b><span class="left">$left</span><span class="right">$right</span>
-<input type="range" min="0" max="100" step="any" value="50" aria-label="$left or $right"
- oninput="this.closest('section').style.setProperty('--cut', this.value + '%')">
+<input type="range" min="0" max="100" step="any" value="50" aria-label="$left or $right">
 </div><figcaption>$caption</figcaption></figure>""")
 
+_SCRIPT = """addEventListener("input", ({ target }) =>
+  target.closest("section").style.setProperty("--cut", target.value + "%"))"""
+
 _PAGE = Template("""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>$title</title>
+<html lang="en"><head><meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src $allowed;
+ style-src 'unsafe-inline'; img-src 'self' file: data:; base-uri 'none'; form-action 'none'">
+<title>$title</title>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
 <style>
@@ -237,5 +253,6 @@ figcaption { color: var(--soft); font-size: .87rem; margin-top: .35rem }
 <h1>$title</h1>
 <p class="quote">$quote</p>
 $body
+<script>$script</script>
 </body></html>
 """)

@@ -16,6 +16,7 @@ import torch
 from fragprune_plugins.datasets.dataset import Shot
 from fragprune_plugins.datasets.generated import bounds
 from fragprune_plugins.errors import OutputError
+from fragprune_plugins.measure.page import allowed
 from fragprune_plugins.measure.pictures import picture
 from fragprune_plugins.storage.atomic import replacing, writable_folder
 from fragprune_plugins.storage.models import Model
@@ -167,14 +168,19 @@ def single_page(site: Site) -> bytes:
         f'<script type="text/plain" data-name="{name}">{base64.b64encode(each).decode()}</script>\n'
         for name, each in data.items()
     )
+    style = site["style.css"].decode()
     page = site["index.html"].decode()
-    page = page.replace(
-        '<link rel="stylesheet" href="style.css">', f"<style>\n{site['style.css'].decode()}</style>"
-    )
-    page = page.replace(
-        '<script type="module" src="main.js"></script>',
-        f'{held}<script type="module">\n{code}</script>',
-    )
+    for before, after in (
+        ("script-src 'self'", f"script-src {allowed(code)}"),
+        ("style-src 'self'", f"style-src {allowed(style)}"),
+        ("connect-src 'self'; img-src 'self' data:", "img-src data:"),
+        ('<link rel="stylesheet" href="style.css">', f"<style>{style}</style>"),
+        (
+            '<script type="module" src="main.js"></script>',
+            f'{held}<script type="module">{code}</script>',
+        ),
+    ):
+        page = page.replace(before, after, 1)
     return page.encode()
 
 

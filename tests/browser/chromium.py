@@ -99,7 +99,8 @@ class Tab:
     """One open page.
 
     Attributes:
-        page: playwright's page.
+        page: playwright's page. Its ``wait_for_function`` needs a function, "() => ready": a page's
+            policy allows no other string.
         errors: what went wrong in it: exceptions, console errors, requests that failed.
         strangers: addresses beyond the page's own origin that it asked for; none was answered.
     """

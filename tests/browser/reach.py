@@ -104,10 +104,10 @@ def cold(browser: Any, count: int, rounds: int) -> dict[str, Any]:
     with serving(Model(make_scene(count)), view) as where:
         for _ in range(rounds):
             with opened(browser, where) as tab:
-                tab.page.wait_for_function("window.viewer?.firstFrame", timeout=120_000)
+                tab.page.wait_for_function("() => window.viewer?.firstFrame", timeout=120_000)
                 first.append(tab.run("() => viewer.firstFrame"))
         with opened(browser, where) as tab:
-            tab.page.wait_for_function("window.viewer?.counted", timeout=300_000)
+            tab.page.wait_for_function("() => window.viewer?.counted", timeout=300_000)
             frames = tab.run(
                 """async () => {
                     const times = [], began = performance.now();

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from browser.chromium import opened, served
+from browser.test_viewer import INTRUDE
 
 from fragprune_plugins.measure import page
 from fragprune_plugins.measure.pictures import save_image, save_map
@@ -60,6 +61,15 @@ def test_a_divider_moves_all_pictures_of_its_view(browser, address):
         tab.page.keyboard.press("End")
         assert split_at(tab.picture(".pair >> nth=0")) == pytest.approx(1.0, abs=0.02)
         assert tab.errors == tab.strangers == []
+
+
+def test_what_somebody_put_into_the_page_neither_runs_nor_asks_anybody(browser, address):
+    with opened(browser, address) as tab:
+        refused, intruded = tab.run(INTRUDE)
+        assert not intruded
+        assert tab.strangers == []
+        expected = ["connect-src", "frame-src", "img-src", "script-src-attr", "script-src-elem"]
+        assert refused == expected  # its own style is inline, so any may be
 
 
 @pytest.mark.parametrize("width", [320, 390, 800, 1280])

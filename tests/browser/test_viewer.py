@@ -13,7 +13,7 @@ from fragprune_plugins.datasets.dataset import load_dataset
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage.models import Model
 from fragprune_plugins.types import View
-from fragprune_plugins.viewer.site import Layer, Shown, make_site, single_page
+from fragprune_plugins.viewer.site import Layer, Shown, make_site, save_site, single_page
 from reference_renderer import Camera, Gaussians, Options
 from reference_renderer.project import project
 
@@ -176,7 +176,7 @@ def test_hands_and_keys(browser, tmp_path):
     write_page(tmp_path / "page", [Model(splat, store)], shown[0].view, tuple(shown))
     with viewing(browser, tmp_path / "page", width=800, height=600) as tab:
         page = tab.page
-        page.wait_for_function("viewer.counted")
+        page.wait_for_function("() => viewer.counted")
         cells = page.locator("#figures tbody td").all_inner_texts()
         assert float(cells[0]) < float(cells[1])
         assert cells[2].endswith("×")
@@ -195,7 +195,7 @@ def test_hands_and_keys(browser, tmp_path):
 
         page.locator("#cameras select").select_option("1")
         page.locator("#photo").click()
-        page.wait_for_function("document.querySelector('#photograph img').naturalWidth > 0")
+        page.wait_for_function("() => document.querySelector('#photograph img').naturalWidth > 0")
 
         before = tab.run("() => viewer.camera")
         page.mouse.move(600, 300)
@@ -221,7 +221,7 @@ def test_hands_and_keys(browser, tmp_path):
         assert page.locator("#help").is_visible()
         page.keyboard.press("Escape")
         page.keyboard.press("t")
-        page.wait_for_function("viewer.counted")
+        page.wait_for_function("() => viewer.counted")
         assert tab.errors == tab.strangers == []
 
 
@@ -229,7 +229,7 @@ def test_slow_frames_stay_small_while_the_camera_turns(browser, tmp_path):
     """A hand waits for the frame it sees. The wait is no rest, which is drawn in full size."""
     write_page(tmp_path, [a_model()], a_view())
     with viewing(browser, tmp_path) as tab:
-        tab.page.wait_for_function("viewer.counted")
+        tab.page.wait_for_function("() => viewer.counted")
         sizes = tab.run(
             """async () => {
                 const { gl } = viewer.drawing, until = new Map(), sizes = [];
@@ -267,17 +267,50 @@ def test_one_page_from_disk(browser, tmp_path):
     layers = [Layer("it", 0, False)]
     (tmp_path / "page.html").write_bytes(single_page(make_site("one", [model], layers, (), view)))
     with opened(browser, (tmp_path / "page.html").as_uri()) as tab:
-        tab.page.wait_for_function("window.viewer && viewer.counted")
+        tab.page.wait_for_function("() => window.viewer && viewer.counted")
         hold(tab, view)
         assert decibels(frame(tab, view).image, engine_frame(model, view, truncated=False)) > 56
         assert tab.errors == tab.strangers == []
+
+
+INTRUDE = """async () => {
+    const refused = [];
+    document.addEventListener("securitypolicyviolation", event =>
+        refused.push(event.effectiveDirective));
+    const added = document.createElement("div");
+    added.innerHTML = "<img src='data:,' onerror='window.intruded = true'>"
+        + "<img src='http://127.0.0.1:9/'><style>* { color: red }</style>"
+        + "<iframe src='http://127.0.0.1:9/'></iframe>";
+    document.body.append(added);
+    const script = document.createElement("script");
+    script.textContent = "window.intruded = true";
+    document.body.append(script);
+    await fetch("http://127.0.0.1:9/").catch(() => {});
+    await new Promise(done => setTimeout(done, 300));
+    return [refused.sort(), window.intruded ?? false];
+}"""
+
+
+@pytest.mark.parametrize("single", [True, False])
+def test_what_somebody_put_into_the_page_neither_runs_nor_asks_anybody(browser, tmp_path, single):
+    model, view = a_model(), a_view()
+    site = make_site("one", [model], [Layer("it", 0, False)], (), view)
+    save_site(tmp_path, {"index.html": single_page(site)} if single else site)
+    with served(tmp_path) as address, opened(browser, address) as tab:
+        tab.page.wait_for_function("() => window.viewer && viewer.counted")
+        assert tab.errors == []
+        refused, intruded = tab.run(INTRUDE)
+        assert not intruded
+        assert tab.strangers == []
+        expected = ["connect-src", "frame-src", "img-src", "script-src-attr", "script-src-elem"]
+        assert refused == [*expected, "style-src-elem"]
 
 
 def test_a_phone_has_picture_and_panel_and_no_scroll(browser, tmp_path):
     write_page(tmp_path, [a_model()], a_view())
     phone = {"width": 390, "height": 844, "has_touch": True, "is_mobile": True}
     with viewing(browser, tmp_path, **phone) as tab:
-        tab.page.wait_for_function("viewer.counted")
+        tab.page.wait_for_function("() => viewer.counted")
         assert tab.run("() => document.documentElement.scrollWidth") == 390
         boxes = tab.run(
             """() => [...document.querySelectorAll("#panel, #panel button, #panel label")]
@@ -298,5 +331,5 @@ def test_a_model_that_is_cut_off_is_stated(browser, tmp_path):
     (tmp_path / "model-0.splats").write_bytes(held[:-64])
     with served(tmp_path) as address, opened(browser, address) as tab:
         said = tab.page.locator("#loading span")
-        tab.page.wait_for_function("document.querySelector('#loading progress').hidden")
+        tab.page.wait_for_function("() => document.querySelector('#loading progress').hidden")
         assert "cut off" in said.inner_text()

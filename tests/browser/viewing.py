@@ -47,7 +47,7 @@ def write_page(folder: Path, models: list[Model], view: View, cameras: tuple = (
 def viewing(browser: Any, folder: Path, options: str = "", **context: Any) -> Iterator[Tab]:
     """The page of a folder, with its models loaded."""
     with served(folder) as address, opened(browser, f"{address}?{options}", **context) as tab:
-        ready = "window.viewer && viewer.layers.length === viewer.scene.layers.length"
+        ready = "() => window.viewer && viewer.layers.length === viewer.scene.layers.length"
         tab.page.wait_for_function(ready, timeout=120_000)
         yield tab
 

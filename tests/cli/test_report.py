@@ -49,7 +49,7 @@ def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
     assert page.count('src="data:image/png;base64,') == report["pictures"]
     assert report["pictures"] == 7 * len(report["views"]) + 1
     assert page.count("src=") == report["pictures"]
-    assert "http" not in page
+    assert "://" not in page
 
 
 def test_as_text_the_result_comes_first(folder):

@@ -49,6 +49,7 @@ def ask(port, path, method="GET", host=None):
 def test_its_files(port, path, name, kind):
     status, headers, held = ask(port, path)
     assert (status, held, headers["Content-Type"]) == (200, SITE[name], kind)
+    assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"  # the page has the rest
     status, headers, held = ask(port, path, "HEAD")
     assert (status, held, headers["Content-Length"]) == (200, b"", str(len(SITE[name])))
 
