@@ -79,7 +79,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
     begin: int | None = None  # iteration at which stage 2 begins, once it is known
     saved: dict[str, Any] | None = None  # of the checkpoint
     checkpoints: Path | None = None  # their folder
-    done: int | None = None  # the last iteration that was made
+    done: int | None = None  # the last iteration; None within the next one
     finished = False
 
     def populate_modules(self) -> None:
@@ -135,6 +135,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
     def hold(self, step: int) -> None:
         """From here on Ctrl-C and SIGTERM wait, so that a checkpoint is of whole iterations."""
         self.holding.enter_context(between_steps())
+        self.done = None
 
     def let_go(self, step: int) -> None:
         """The iteration is over: a signal that waits acts here."""
@@ -150,21 +151,25 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
             with sigterm_interrupts(), self.holding:
                 train()
         except KeyboardInterrupt as error:
-            if self.finished or self.done is None:  # so nerfstudio's viewer is closed
+            if self.finished:  # so nerfstudio's viewer is closed
                 raise
-            with between_steps():
-                trainer.save_checkpoint(self.done)
             by_signal = isinstance(error, Terminate)
             stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
-            path = trainer.checkpoint_dir / f"step-{self.done:09d}.ckpt"
-            left = trainer._start_step + trainer.config.max_num_iterations - self.done - 1
-            told = stated(
-                f"ns-train {METHOD}",
-                f"{found}; iteration {self.done} is saved",
-                "a training that reaches its end",
-                f"To go on, add to the same ns-train {METHOD} command: "
-                f"--load-checkpoint {path} --max-num-iterations {left}",
-            )
+            if self.done is None:  # before the first iteration, or the second signal in one
+                saved = "nothing is saved"
+                again = f"Run it again, or go on from a checkpoint in {trainer.checkpoint_dir}."
+            else:
+                with between_steps():
+                    trainer.save_checkpoint(self.done)
+                saved = f"iteration {self.done} is saved"
+                path = trainer.checkpoint_dir / f"step-{self.done:09d}.ckpt"
+                left = trainer._start_step + trainer.config.max_num_iterations - self.done - 1
+                again = (
+                    f"To go on, add to the same ns-train {METHOD} command: "
+                    f"--load-checkpoint {path} --max-num-iterations {left}"
+                )
+            expected = "a training that reaches its end"
+            told = stated(f"ns-train {METHOD}", f"{found}; {saved}", expected, again)
             CONSOLE.print(str(told), markup=False, soft_wrap=True)
             raise SystemExit(EXIT_CODE if by_signal else 130) from told
 

@@ -283,15 +283,16 @@ def test_a_training_in_which_nothing_can_be_learned_is_refused(
 
 
 class Signals:
-    """Sends this process a signal when a step of stage 2 is reported."""
+    """Sends this process signals when a step of stage 2 is reported."""
 
-    def __init__(self, number, step):
-        self.number, self.step = number, step
+    def __init__(self, number, step, times=1):
+        self.number, self.step, self.times = number, step, times
 
     @hookimpl
     def fragprune_step(self, stats):
         if stats.step == self.step:
-            signal.raise_signal(self.number)
+            for _ in range(self.times):
+                signal.raise_signal(self.number)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -318,6 +319,17 @@ def test_an_interrupted_stage_two_leaves_a_checkpoint_to_go_on_from(
     model = trained(config).pipeline.model
     assert model.begin == TRAINING
     assert active_session().models[model].stage.steps == STAGE2
+
+
+def test_a_second_ctrl_c_waits_for_no_iteration_and_saves_no_half_of_one(
+    methods, scene, tmp_path, plug, ctrl_c, capsys
+):
+    plug(Signals(signal.SIGINT, 7, times=2))
+    with pytest.raises(SystemExit) as caught:
+        trained(configured(methods, scene, tmp_path))
+    assert caught.value.code == 130
+    assert "nothing is saved" in capsys.readouterr().out
+    assert not list(tmp_path.rglob("*.ckpt"))
 
 
 def test_ctrl_c_in_the_training_before_stage_two_saves_it_too(
