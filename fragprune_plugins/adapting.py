@@ -26,9 +26,11 @@ from fragprune_plugins.errors import (
     AlignmentError,
     EngineError,
     InputError,
+    Interrupted,
     ModelFileError,
     NotComparedError,
     SessionError,
+    Terminated,
     UsageError,
 )
 from fragprune_plugins.hosts import graphdeco
@@ -89,6 +91,7 @@ __all__ = [
     "HostInfo",
     "HostRepo",
     "InputError",
+    "Interrupted",
     "MethodAdapter",
     "ModelFileError",
     "Moment",
@@ -107,6 +110,7 @@ __all__ = [
     "SpacetimeSplats",
     "SplatFile",
     "Splats",
+    "Terminated",
     "UsageError",
     "View",
     "graphdeco",

@@ -25,8 +25,13 @@ from torch.overrides import TorchFunctionMode
 import fragprune_plugins
 from fragprune_nerfstudio import METHOD
 from fragprune_plugins import Settings
-from fragprune_plugins.adapting import AlignmentError, SessionError, UsageError
-from fragprune_plugins.errors import Interrupted, Terminated
+from fragprune_plugins.adapting import (
+    AlignmentError,
+    Interrupted,
+    SessionError,
+    Terminated,
+    UsageError,
+)
 from fragprune_plugins.injection.process import checkpoint_values
 from fragprune_plugins.injection.session import Session, active_session
 from fragprune_plugins.learning.interruption import (

@@ -135,13 +135,15 @@ def test_import_rules_hold():
 KNOWN = {
     "reference_renderer": set(),
     "fragprune_plugins": {"reference_renderer"},
-    "fragprune_nerfstudio": {  # its host draws with gsplat, and it activates a session itself
+    # its host draws with gsplat; it activates a session itself, and ends it at Ctrl-C
+    "fragprune_nerfstudio": {
         "fragprune_gsplat",
         "fragprune_gsplat.dialect",
         "fragprune_plugins",
         "fragprune_plugins.adapting",
         "fragprune_plugins.injection.process",
         "fragprune_plugins.injection.session",
+        "fragprune_plugins.learning.interruption",
     },
 }
 
