@@ -10,7 +10,12 @@ import click
 
 from fragprune_plugins.cli.common import Number, together
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE, PORTABLE_ELASTICITY
+from fragprune_plugins.learning.pressure import (
+    ELASTICITY,
+    LEAST_PRESSURE,
+    MOST_PRESSURE,
+    PORTABLE_ELASTICITY,
+)
 from fragprune_plugins.learning.schedule import (
     FINETUNE_ITERATIONS,
     QUICK_ITERATIONS,
@@ -39,7 +44,7 @@ _OPTIONS = (
         type=float,
         help="Weight of drawn fragments per pixel in the loss; default: "
         f"{2 * ELASTICITY:g} of the loss per fragment ({ELASTICITY:g} unless all parameters "
-        f"learn), and at least {LEAST_PRESSURE:g}.",
+        f"learn), from {LEAST_PRESSURE:g} to {MOST_PRESSURE:g}.",
     ),
     click.option(
         "--target-speedup",

@@ -1,10 +1,12 @@
 """Fragment pressure: the weight lambda of drawn fragments per pixel in the loss.
 
 A fixed lambda transfers between well trained scenes, but not between losses: where a loss is
-several times larger, or shared by few fragments, it hardly cuts. The default therefore follows the
-loss per fragment, from 1e-4 up. To hit a target, a slow controller corrects lambda in the log
-domain; thresholds are a slow plant, so it starts from the known curve, waits before it trusts an
-error, and never integrates past its limits.
+larger, or shared by few fragments, it cuts less. The default therefore follows the loss per
+fragment, between two ends. Without the upper one a loss that nothing lowers, such as noise in the
+photographs, would drive lambda up: the fewer fragments are left, the larger their share of it. To
+hit a target, a slow controller corrects lambda in the log domain; thresholds are a slow plant, so
+it starts from the known curve, waits before it trusts an error, and never integrates past its
+limits.
 """
 
 from __future__ import annotations
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
 
 LEAST_PRESSURE = 1e-4
 """Least lambda by default, for models whose loss per fragment is very small (overfitted ones)."""
+
+MOST_PRESSURE = 4e-4
+"""Largest lambda by default; docs/results.md has what it changes, where the loss is large."""
 
 OWN_PRESSURE = 1.5e-4
 """The default for a model that learns from its own pictures; its loss is next to nothing at first.
@@ -112,21 +117,23 @@ class FixedPressure:
 
 @dataclass
 class ElasticPressure:
-    """A share of the loss per fragment: lambda = max(least, elasticity x loss / fragments).
+    """A share of the loss per fragment, elasticity x loss / fragments, from least to most.
 
-    Following it descends on ln(loss) + elasticity ln(fragments): the same pressure for a loss of
-    any scale, of pictures of any size, over any number of fragments.
+    Following it descends on ln(loss) + elasticity ln(fragments). Between the ends that is the same
+    pressure for a loss of any scale, of pictures of any size, over any number of fragments.
 
     Attributes:
         value: lambda.
         elasticity: per cents of the loss that a per cent of the fragments is worth.
         least: lambda's lower end, and its value until a loss is known.
+        most: its upper end.
         memory: steps over which loss and fragments are averaged, about a pass of the views.
     """
 
     value: float = LEAST_PRESSURE
     elasticity: float = ELASTICITY
     least: float = LEAST_PRESSURE
+    most: float = MOST_PRESSURE
     memory: int = 100
     _steps: int = 0
     _loss: float = 0.0
@@ -140,7 +147,8 @@ class ElasticPressure:
         weight = 1 / min(self._steps, self.memory)
         self._loss += weight * (step.loss - self._loss)
         self._fragments += weight * (step.fragments - self._fragments)
-        self.value = max(self.least, self.elasticity * self._loss / max(self._fragments, 1.0))
+        share = self.elasticity * self._loss / max(self._fragments, 1.0)
+        self.value = min(max(self.least, share), self.most)
 
 
 @dataclass

@@ -59,7 +59,7 @@ class Settings:
         train: what moves beside the thresholds: "opacity" (the paper's), "appearance" (opacity and
             SH) or "all", which truncates in the last 2,000 iterations only.
         pressure: lambda, weight of drawn fragments per pixel in the loss; None for one that
-            follows the loss per fragment.
+            follows the loss per fragment, between two ends.
         target_speedup: fragments of the untruncated model as it came in over fragments drawn now,
             on the training views that calibration measures, to steer for; overrides pressure.
         target_time: frame time of the untruncated model as it came in over frame time now, on the
@@ -166,7 +166,7 @@ class Settings:
         if self.itself:
             return FixedPressure(OWN_AREA_PRESSURE if self.portable else OWN_PRESSURE)
         if self.portable:
-            return ElasticPressure(value=0.0, elasticity=PORTABLE_ELASTICITY, least=0.0)
+            return ElasticPressure(value=0.0, elasticity=PORTABLE_ELASTICITY, least=0.0, most=1.0)
         return ElasticPressure(
             elasticity=_RECIPES[self.train].elasticity if elasticity is None else elasticity
         )

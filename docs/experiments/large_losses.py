@@ -1,0 +1,140 @@
+"""What the upper end of the default pressure changes where the loss is large.
+
+python large_losses.py scene DATA OUT [--noise 0.1] [--exposure 0.25] [--every 3] [--moments 24]
+python large_losses.py compare MODEL.ply DATA [--seed 0] [--white-background] [--pressure 1e-4]
+
+The first copies a Blender scene and changes its training pictures; held-out ones stay. The second
+trains the control, without and with the upper end, and each fixed pressure, 1,000 iterations each.
+Frames are the least of nine, in turns, of this thread's own time, which load disturbs less.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from fragprune_plugins.datasets.dataset import Dataset
+from fragprune_plugins.finetuning import finetune, load_dataset
+from fragprune_plugins.learning.pressure import ElasticPressure, Pressure
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.measure import Candidate, measure
+from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
+from fragprune_plugins.storage import models
+
+
+def scene(args: Namespace) -> None:
+    """Write a copy of a Blender scene whose training pictures are changed, seeded."""
+    stream = np.random.default_rng(args.seed)
+    args.out.mkdir()
+    shutil.copy(args.data / "points3d.ply", args.out)
+    for split in ("train", "test"):
+        written = json.loads((args.data / f"transforms_{split}.json").read_text())
+        frames = [f for f in written["frames"] if round(23 * f.get("time", 0)) % args.moments == 0]
+        train = split == "train"
+        written["frames"] = frames = frames[:: args.every] if train else frames
+        gains = np.exp(stream.normal(0, args.exposure, len(frames)) if args.exposure else [0.0])
+        gains = np.resize(gains / np.exp(np.log(gains).mean()), len(frames))
+        for frame, gain in zip(frames, gains, strict=True):
+            name = frame["file_path"].removeprefix("./") + ".png"
+            pixels = np.asarray(Image.open(args.data / name)).astype(float)
+            if train:
+                pixels[..., :3] *= gain
+                if args.noise:
+                    pixels[..., :3] += stream.normal(0, 255 * args.noise, pixels[..., :3].shape)
+            (args.out / name).parent.mkdir(exist_ok=True)
+            Image.fromarray(pixels.clip(0, 255).round().astype(np.uint8)).save(args.out / name)
+        for each in (split,) if train else ("test", "val"):
+            (args.out / f"transforms_{each}.json").write_text(json.dumps(written))
+
+
+class Unbounded(Schedule):
+    """The default schedule under the default pressure without its upper end."""
+
+    def make_pressure(self) -> Pressure:
+        """The pressure of a run."""
+        default = self.settings.make_pressure()
+        assert isinstance(default, ElasticPressure)
+        return replace(default, most=1.0)
+
+
+def compare(args: Namespace) -> None:
+    """Train the arms, and print them as a table in Markdown."""
+    torch.set_num_threads(1)
+    splat, _ = models.load(args.model, truncation=False)
+    dataset: Dataset = load_dataset(args.data, white_background=args.white_background)
+    usual = Settings(iterations=1000, seed=args.seed)
+    arms: dict[str, tuple[Settings, Schedule | None]] = {
+        "control": (replace(usual, truncate=False), None),
+        "no upper end": (usual, Unbounded(usual)),
+        "default": (usual, None),
+    }
+    arms |= {f"λ {p:g}": (replace(usual, pressure=p), None) for p in args.pressure}
+    drawn, ended = [Candidate(splat)], [("as it came", 0.0, 0.0)]
+    for label, (settings, schedule) in arms.items():
+        result = finetune(splat, dataset, settings, schedule=schedule, progress=True)
+        last = result.curves[-len(dataset.train) :]
+        loss = sum(step.loss for step in last) / len(last)
+        ended.append((label, loss, result.curves[-1].pressure))
+        drawn.append(Candidate(result.model, result.store))
+    rows = measure(drawn, dataset.test, engine="cpu", repeats=1)
+    print("| arm | loss | λ | fragments | PSNR, dB | SSIM | frame, ms | frame at 4x, ms |")
+    print("|---|---|---|---|---|---|---|---|")
+    times = zip(frames(drawn, dataset, 1), frames(drawn, dataset, 4), strict=True)
+    for (label, loss, pressure), row, (small, large) in zip(ended, rows, times, strict=True):
+        print(
+            f"| {label} | {loss:.4f} | {pressure:.1e} | {row['fragments_per_pixel']:.1f} | "
+            f"{row['psnr']:.2f} | {row['ssim']:.4f} | {small:.2f} | {large:.2f} |"
+        )
+
+
+@torch.no_grad()
+def frames(drawn: list[Candidate], dataset: Dataset, enlarge: int) -> list[float]:
+    """Least milliseconds of a frame of each candidate, mean over four held-out views."""
+    engine = engine_for("cpu", torch.device("cpu"))
+    splats = [each.model.splats() for each in drawn]
+    views = [
+        replace(shot.view, width=enlarge * shot.view.width, height=enlarge * shot.view.height)
+        for shot in dataset.test[:4]
+    ]
+    least = np.full((len(drawn), len(views)), np.inf)
+    for turn in range(9):
+        for at, view in enumerate(views):
+            for index in range(len(drawn))[:: -1 if turn % 2 else 1]:
+                inputs = drawn[index].inputs(view, splats[index])
+                thresholds = thresholds_for(inputs, drawn[index].thresholds)
+                started = time.process_time()
+                engine.rasterize(inputs, thresholds)
+                spent = 1e3 * (time.process_time() - started)
+                least[index, at] = min(least[index, at], spent)
+    return [float(row.mean()) for row in least]
+
+
+if __name__ == "__main__":
+    parser = ArgumentParser(description=__doc__)
+    commands = parser.add_subparsers(required=True)
+    change = commands.add_parser("scene", help="copy a scene and change its training pictures")
+    change.add_argument("data", type=Path, help="with transforms_train.json")
+    change.add_argument("out", type=Path)
+    change.add_argument("--noise", type=float, default=0.0, help="standard deviation; white is 1")
+    change.add_argument("--exposure", type=float, default=0.0, help="of ln(gain) between pictures")
+    change.add_argument("--every", type=int, default=1, help="keep one training picture in so many")
+    change.add_argument("--moments", type=int, default=1, help="keep one moment of 24 in so many")
+    change.add_argument("--seed", type=int, default=0)
+    change.set_defaults(run=scene)
+    arms = commands.add_parser("compare", help="train and measure the arms")
+    arms.add_argument("model", type=Path)
+    arms.add_argument("data", type=Path)
+    arms.add_argument("--seed", type=int, default=0)
+    arms.add_argument("--white-background", action="store_true")
+    arms.add_argument("--pressure", type=float, nargs="*", default=[])
+    arms.set_defaults(run=compare)
+    args = parser.parse_args()
+    args.run(args)
