@@ -77,21 +77,21 @@ def compare(args: Namespace) -> None:
         "default": (usual, None),
     }
     arms |= {f"λ {p:g}": (replace(usual, pressure=p), None) for p in args.pressure}
-    drawn, ended = [Candidate(splat)], [("as it came", 0.0, 0.0)]
+    drawn, ended = [Candidate(splat)], ["as it came | - | -"]
     for label, (settings, schedule) in arms.items():
         result = finetune(splat, dataset, settings, schedule=schedule, progress=True)
         last = result.curves[-len(dataset.train) :]
         loss = sum(step.loss for step in last) / len(last)
-        ended.append((label, loss, result.curves[-1].pressure))
+        ended.append(f"{label} | {loss:.4f} | {result.curves[-1].pressure:.1e}")
         drawn.append(Candidate(result.model, result.store))
     rows = measure(drawn, dataset.test, engine="cpu", repeats=1)
     print("| arm | loss | λ | fragments | PSNR, dB | SSIM | frame, ms | frame at 4x, ms |")
     print("|---|---|---|---|---|---|---|---|")
     times = zip(frames(drawn, dataset, 1), frames(drawn, dataset, 4), strict=True)
-    for (label, loss, pressure), row, (small, large) in zip(ended, rows, times, strict=True):
+    for label, row, (small, large) in zip(ended, rows, times, strict=True):
         print(
-            f"| {label} | {loss:.4f} | {pressure:.1e} | {row['fragments_per_pixel']:.1f} | "
-            f"{row['psnr']:.2f} | {row['ssim']:.4f} | {small:.2f} | {large:.2f} |"
+            f"| {label} | {row['fragments_per_pixel']:.1f} | {row['psnr']:.2f} | "
+            f"{row['ssim']:.4f} | {small:.2f} | {large:.2f} |"
         )
 
 
