@@ -19,13 +19,13 @@ from torch.autograd.function import once_differentiable
 from fragprune_plugins.constants import (
     ALPHA_MIN,
     FALLOFF_MIN,
+    FRUSTUM_MARGIN,
     NEUTRAL_LOGIT,
     RIM_REACH,
     RIM_WIDTH,
 )
 from fragprune_plugins.engines import Engine, slice_at
 from fragprune_plugins.errors import InputError, RanksError
-from fragprune_plugins.learning.area import project
 from fragprune_plugins.types import Moment, RasterInputs, SpacetimeSplats, Splats, View
 
 if TYPE_CHECKING:
@@ -214,24 +214,48 @@ class _Exchange(torch.autograd.Function):
 def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) -> Tensor:
     """(M,) int64, ascending: Gaussians that may have a fragment in a view, or one at their rim.
 
-    A fragment lies within its Gaussian's cutoff. The ellipse there has a bounding box; those whose
-    box touches no pixel are left out, and those that are too faint everywhere.
+    A fragment lies within its Gaussian's cutoff. A sphere around the cutoff is projected; those
+    whose image touches no pixel are left out, and those that are too faint everywhere.
 
     Args:
         inputs: the view and its rules; its Gaussians are not used.
         splats: N Gaussians.
         thresholds: (N,) falloff, or None.
     """
-    (xx, _, yy), means2d, visible = project(inputs, splats)
+    view, means = inputs.view, splats.means
+    rotation = view.viewmatrix[:3, :3]
+    x, y, depth = (means @ rotation + view.viewmatrix[3, :3]).unbind(1)
+    clip = means @ view.projmatrix[:3] + view.projmatrix[3]
     q = 2 * (splats.opacities / ALPHA_MIN).log()
     if thresholds is not None:
         rim = (thresholds - RIM_REACH * RIM_WIDTH).clamp_min(FALLOFF_MIN)
         q = torch.minimum(q, -2 * torch.minimum(rim, thresholds).log())
-    visible &= q > 1 - _WIDER
-    for axis, variance, side in ((0, xx, inputs.view.width), (1, yy, inputs.view.height)):
-        reach = _WIDER * (q.clamp_min(0) * variance).sqrt() + _BEYOND
-        visible &= (means2d[:, axis] + reach >= 0) & (means2d[:, axis] - reach <= side - 1)
-    return visible.nonzero()[:, 0]
+    kept = (depth > inputs.near) & (q > 1 - _WIDER)
+    q, largest = q.clamp_min(0), _largest_variance(inputs, splats)
+    forward = rotation[:, 2]
+    for axis, place, side, tan in (
+        (0, x, view.width, view.tan_fov_x),
+        (1, y, view.height, view.tan_fov_y),
+    ):
+        limit, across = FRUSTUM_MARGIN * tan, rotation[:, axis]
+        slope = (place / depth).clamp(-limit, limit)
+        steep = across @ across + slope * (slope * (forward @ forward) - 2 * (across @ forward))
+        variance = largest * steep * (side / (2 * tan) / depth).square() + inputs.dilation
+        reach = _WIDER * (q * variance).sqrt() + _BEYOND
+        centre = ((clip[:, axis] / (clip[:, 3] + 1e-7) + 1) * side - 1) / 2
+        kept &= (centre + reach >= 0) & (centre - reach <= side - 1)
+    return kept.nonzero()[:, 0]
+
+
+def _largest_variance(inputs: RasterInputs, splats: Splats) -> Tensor:
+    """(N,) at least each Gaussian's variance along any direction, world units squared."""
+    if splats.cov3d is not None:
+        return splats.cov3d[:, [0, 3, 5]].sum(1)
+    assert splats.scales is not None
+    assert splats.rotations is not None
+    norm = splats.rotations.square().sum(1)  # 1, unless a host does not normalise them
+    longer = norm + (1 - norm).abs()
+    return (inputs.scale_modifier * splats.scales.amax(1) * longer).square()
 
 
 def _expect_sendable(inputs: RasterInputs) -> Splats:

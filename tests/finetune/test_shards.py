@@ -178,6 +178,18 @@ def test_what_is_not_sent_is_refused(change):
         ShardedEngine(create_engine("cpu"), Ranks()).rasterize(change(inputs), None)
 
 
+def covariances(splats):
+    """(N, 6) upper triangles."""
+    w, x, y, z = splats.rotations.unbind(1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+    ]
+    axes = torch.stack(rows, 1) * splats.scales[:, None]
+    return (axes @ axes.mT)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+
+
 @given(seed=st.integers(0, 10**6), spread=st.floats(0.1, 40), size=st.floats(-6, 3))
 def test_every_gaussian_with_a_fragment_is_sent_and_one_far_outside_is_not(seed, spread, size):
     """The engine's own counts are the oracle."""
@@ -185,15 +197,21 @@ def test_every_gaussian_with_a_fragment_is_sent_and_one_far_outside_is_not(seed,
     opacity = torch.linspace(-9, 9, COUNT)[:, None]  # from under 1/255 to nearly 1
     model = replace(model, xyz=spread * model.xyz, scaling=model.scaling + size, opacity=opacity)
     cut = torch.rand(COUNT, generator=torch.Generator().manual_seed(seed)).clamp(1e-6, 1 - 1e-6)
-    inputs = RasterInputs(tiny.cameras()[seed % 9].view(), model.splats(), counts=True)
+    splats = model.splats()
+    if seed % 3 == 1:  # any length, as a host may give them
+        splats = replace(splats, rotations=model.rotation)
+    if seed % 3 == 2:
+        splats = replace(splats, scales=None, rotations=None, cov3d=covariances(splats))
+    inputs = RasterInputs(tiny.cameras()[seed % 9].view(), splats, counts=True)
     for thresholds in (None, cut):
         sent = set(reaching(inputs, inputs.splats, thresholds).tolist())
         drawn = create_engine("cpu").rasterize(inputs, thresholds).fragments_per_gaussian
         assert set(drawn.nonzero()[:, 0].tolist()) <= sent
         assert not sent & set((inputs.splats.opacities < 0.99 / 255).nonzero()[:, 0].tolist())
-    behind = replace(inputs.splats, means=inputs.splats.means * 0 + torch.tensor([0, 0, -1e3]))
-    front = tiny.cameras()[0].view()
-    assert len(reaching(replace(inputs, view=front), behind, None)) == 0
+    front = replace(inputs, view=tiny.cameras()[0].view())
+    means = torch.zeros(COUNT, 3)
+    for away in ([0, 0, -1e6], [1e6, 0, 0], [0, -1e6, 0]):  # behind, beside, above
+        assert len(reaching(front, replace(splats, means=means + torch.tensor(away)), None)) == 0
 
 
 def test_the_rim_of_a_threshold_is_sent_too():
