@@ -197,7 +197,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         from fragprune_plugins.storage import sidecar
 
         trains = False  # it only evaluates
-        if not sidecar.lies_beside(Path(host.flags.resume)):
+        if not sidecar.find(Path(host.flags.resume)):
             log.warning("%s has no thresholds beside it: drawn without", host.flags.resume)
     if trains and options.stage != "off":
         ranks.expect_one()  # refuse before stage 1

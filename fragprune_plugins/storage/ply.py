@@ -29,7 +29,7 @@ from fragprune_plugins.types import Splats
 THRESHOLD_COLUMN = "trunc_threshold"
 
 MARK = "fragprune thresholds lie beside this file (.fragprune.safetensors)"
-"""A comment in each PLY of ours, and each archive of torch, that is half of a pair."""
+"""A comment in the header of each PLY of ours that is half of a pair."""
 
 _XYZ = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")

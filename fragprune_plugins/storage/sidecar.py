@@ -1,9 +1,8 @@
 """The sidecar: a safetensors file beside the host's own that carries a threshold store.
 
 ``point_cloud.ply`` gets ``point_cloud.fragprune.safetensors``. Its metadata names the model file's
-digest and row count, so a pair that does not match is refused. The host's PLY stays as the host
-wrote it. A PLY that fragprune writes has a mark in its header, and an archive of ``torch.save`` one
-behind its last byte, where no reader looks: so a missing sidecar is noticed.
+digest and row count, so a pair that does not match is refused. The host's file stays as the host
+wrote it. A PLY that fragprune writes has a mark in its header, so a missing sidecar is noticed.
 
 ``replace_pair`` renames twice, and the renaming of the model is what counts. Before it, a sidecar
 whose model is not there yet lies under an address that the model's digest gives; after it, the
@@ -16,7 +15,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,7 +33,7 @@ from fragprune_plugins.storage.atomic import (
     rename,
     replacing,
 )
-from fragprune_plugins.storage.ply import MARK, is_marked
+from fragprune_plugins.storage.ply import is_marked
 from fragprune_plugins.storage.reading import Door, parse_json
 
 SUFFIX = ".fragprune.safetensors"
@@ -73,7 +71,7 @@ def lies_beside(model: Path) -> bool:
         SidecarError: it has none, but was saved with one.
     """
     path = find(model)
-    if path is None and (is_marked(model) or _is_marked_archive(Path(model))):
+    if path is None and is_marked(model):
         raise SidecarError(
             str(path_beside(model)),
             f"no such file, though {Path(model).name} was saved with thresholds beside it",
@@ -155,8 +153,6 @@ def replace_pair(
     _tidy(path)
     try:
         if store is not None:
-            if not store.neutral:
-                _mark_archive(whole)
             sha = digest(whole)
             info = SidecarInfo(len(store), sha, adapter, host_commit, settings or {})
             new = whole.with_name(beside.name)
@@ -170,29 +166,6 @@ def replace_pair(
                 each.unlink()
     finally:
         _tidy(path)
-
-
-def _mark_archive(model: Path) -> None:
-    """Say in an archive's comment that thresholds lie beside it; other files stay as they are."""
-    if _is_archive(model):
-        with zipfile.ZipFile(model, "a") as archive:
-            archive.comment = MARK.encode()
-
-
-def _is_marked_archive(model: Path) -> bool:
-    if not _is_archive(model):
-        return False
-    with open(model, "rb") as file:
-        file.seek(max(0, model.stat().st_size - len(MARK)))
-        return file.read() == MARK.encode()
-
-
-def _is_archive(model: Path) -> bool:
-    """Whether a file begins as those of ``torch.save``."""
-    if not model.is_file():
-        return False
-    with open(model, "rb") as file:
-        return file.read(4) == b"PK\x03\x04"
 
 
 def _tidy(model: Path) -> None:

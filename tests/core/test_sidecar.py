@@ -9,7 +9,6 @@ from safetensors.torch import save_file
 from fragprune_plugins.errors import DivergedError, OutputError, SidecarError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.atomic import staging
 from fragprune_plugins.storage.ply import MARK
 
 
@@ -57,33 +56,6 @@ def test_only_a_marked_model_must_have_a_sidecar(tmp_path, model, trained):
             sidecar.lies_beside(model)
     sidecar.save(model, trained)
     assert sidecar.lies_beside(model)
-
-
-@pytest.mark.parametrize("options", [{}, {"mmap": True}, {"weights_only": False}])
-def test_the_mark_of_an_archive_of_torch_changes_nothing_that_torch_reads(
-    tmp_path, trained, options
-):
-    plain, path = tmp_path / "plain.pt", tmp_path / "splats.pt"
-    for each in (plain, path):
-        torch.save({"means": torch.arange(300.0), "step": 7}, each)
-    with staging(path) as folder:
-        whole = plain.replace(folder / path.name)
-        sidecar.replace_pair(path, whole, trained)
-    assert sidecar.lies_beside(path)
-    read = torch.load(path, **options)
-    assert torch.equal(read["means"], torch.arange(300.0))
-    assert read["step"] == 7
-    sidecar.path_beside(path).unlink()
-    with pytest.raises(SidecarError, match=r"splats\.pt was saved with thresholds"):
-        sidecar.lies_beside(path)
-
-
-def test_an_archive_that_lost_its_thresholds_on_purpose_has_no_mark(tmp_path):
-    path = tmp_path / "splats.pt"
-    with staging(path) as folder:
-        torch.save({"means": torch.zeros(3)}, folder / path.name)
-        sidecar.replace_pair(path, folder / path.name, None)
-    assert not sidecar.lies_beside(path)
 
 
 def test_a_sidecar_of_an_earlier_model_file_is_refused(model, trained):

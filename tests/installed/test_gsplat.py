@@ -423,9 +423,6 @@ def test_torch_saves_and_loads_parameters_with_their_thresholds(
         assert torch.equal(session.store(again).logits, logits)
         del saved["quats"]
         torch.save(saved, io.BytesIO())  # neither a file nor all parameters
-    sidecar.path_beside(file).unlink()
-    with session_on(Gsplat(), learn=learn), pytest.raises(SidecarError, match="with thresholds"):
-        loaded()
 
 
 def test_a_file_that_was_read_for_something_else_changes_nothing(session_on, tmp_path):
