@@ -36,7 +36,7 @@ def train(tmp_path, single_thread):
     """``train(*words, stage=...)``: the script's command."""
 
     def command(*words, strategy="default", settings=None, **options):
-        settings = settings or Settings(iterations=MORE, threshold_lr=0.5)
+        settings = settings or Settings(iterations=MORE, threshold_lr=0.5, pressure=1e-2)
         line = [str(SCRIPT), strategy, "--data_dir", str(tmp_path)]
         line += ["--result_dir", str(tmp_path / "out"), "--max_steps", str(TOTAL), *map(str, words)]
         return run(line, RunOptions(device="cpu", settings=settings, **options))
