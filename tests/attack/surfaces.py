@@ -225,7 +225,7 @@ def forged(options: Any, fresh: Any, words: Any) -> Result:
 def requests(options: Any, fresh: Any, words: Any) -> Result:
     """What another page, or a person with a socket, may send to the viewer's server."""
     del options, fresh, words
-    host = "Host: localhost:PORT\r\n"
+    host = "Host: localhost:PORT\r\nConnection: close\r\n"
     cases = {
         GOOD + "its page": f"GET / HTTP/1.1\r\n{host}\r\n",
         "another host": "GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n",
@@ -253,9 +253,7 @@ def requests(options: Any, fresh: Any, words: Any) -> Result:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             with socket.create_connection(server.server_address[:2], timeout=10) as to:
                 to.sendall(request.replace("PORT", str(server.server_port)).encode("latin-1"))
-                answer = to.recv(1 << 16)
-                time.sleep(0.05)
-                answer += to.recv(1 << 16) if answer else b""
+                answer = b"".join(iter(lambda: to.recv(1 << 16), b""))  # to the end
             server.shutdown()
         if told:
             return "traceback", repr(told[0])
