@@ -5,6 +5,7 @@ A child of its own keeps the store, as torchrun's agent does, so that it outlive
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import tempfile
@@ -18,6 +19,7 @@ import torch
 from cli.commands import run as run_command
 
 from fragprune_plugins.errors import FragpruneError
+from fragprune_plugins.finetuning import loop
 from fragprune_plugins.learning.ranks import joined
 
 LONGEST = 60  # seconds that a child may live
@@ -109,6 +111,16 @@ def learn(size: int, work: Callable[[Any], Any]) -> list[Any]:
     ended = launch(size, one)
     assert [each.code for each in ended] == [0] * size
     return [each.left for each in ended]
+
+
+def lose_nan(ranks: Any) -> None:
+    """Let the loss be NaN in the second process."""
+    real = loop.photometric_loss
+
+    def loss(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return real(image, target) * (math.nan if ranks.rank == 1 else 1.0)
+
+    loop.photometric_loss = loss  # type: ignore[assignment]
 
 
 def command(

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from finetune import tiny
-from finetune.several import learn
+from finetune.several import learn, lose_nan
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,7 +16,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.sharded import ShardedEngine, reaching
 from fragprune_plugins.errors import DivergedError, InputError, UsageError
 from fragprune_plugins.finetuning import Checkpoints, finetune, loop
-from fragprune_plugins.finetuning.processes import part_of, whole_of
+from fragprune_plugins.finetuning.processes import Shards, part_of, whole_of
 from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -214,16 +214,26 @@ def test_every_gaussian_with_a_fragment_is_sent_and_one_far_outside_is_not(seed,
         assert len(reaching(front, replace(splats, means=means + torch.tensor(away)), None)) == 0
 
 
-def test_the_rim_of_a_threshold_is_sent_too():
-    """A Gaussian beside the picture: its fragments are outside, its threshold's gradient is not."""
-    model = tiny.random_model(200)
-    cut = torch.full((200,), 0.3, requires_grad=True)
+def test_what_is_sent_ends_where_fragments_and_rims_end():
+    """Round Gaussians on a line across the picture: a sphere is as wide as they are."""
+    count = 2000
+    model = tiny.random_model(count)
+    places = torch.linspace(-4, 4, count)[:, None] * tiny.cameras()[0].rotation[0].float()
+    model = replace(
+        model, xyz=places, scaling=torch.full((count, 3), -2.0), opacity=torch.full((count, 1), 4.0)
+    )
     inputs = RasterInputs(tiny.cameras()[0].view(), model.splats(), counts=True)
-    outputs = create_engine("cpu").rasterize(inputs, cut)
-    outputs.fragments_per_pixel.backward()
-    moved = set(cut.grad.nonzero()[:, 0].tolist())
-    assert len(moved) > 100
-    assert moved <= set(reaching(inputs, inputs.splats, cut).tolist())
+    engine = create_engine("cpu")
+    drawn = engine.rasterize(inputs, None).fragments_per_gaussian.nonzero()[:, 0]
+    for gate in (1e-3, 0.3):  # within a rim the gate's surrogate has a gradient
+        cut = torch.full((count,), gate, requires_grad=True)
+        engine.rasterize(inputs, cut).fragments_per_pixel.backward()
+        moved = set(cut.grad.nonzero()[:, 0].tolist())
+        assert moved <= set(reaching(inputs, inputs.splats, cut).tolist())
+    sent = reaching(inputs, inputs.splats, None)
+    assert set(drawn.tolist()) <= set(sent.tolist())
+    assert len(drawn) > count / 8
+    assert len(sent) - len(drawn) < count / 10  # and few that draw nothing
 
 
 CASES = {
@@ -318,17 +328,30 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bits(model, dataset, tmp
 
 def test_a_gradient_that_is_not_finite_in_one_is_so_in_all(model, dataset):
     def work(ranks):
-        real = loop.photometric_loss
-
-        def loss(image, target):
-            return real(image, target) * (math.nan if ranks.rank == 1 else 1.0)
-
-        loop.photometric_loss = loss
+        lose_nan(ranks)
         return learned(model, dataset, Settings(iterations=4, views_per_step=2), ranks)
 
     one, other = learn(2, work)
     assert one == other
     assert one.code == "not-finite"
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_what_is_not_finite_in_one_part_is_nan_in_all_and_other_gradients_stay(number):
+    def work(ranks):
+        sound, broken, idle = (torch.ones(3) for _ in range(3))
+        sound.grad = torch.full((3,), 0.1 + ranks.rank)
+        broken.grad = torch.tensor([1.0, number if ranks.rank == 1 else 2.0, 3.0])
+        figures = [[1.0 + ranks.rank, 2.0, 3.0, 4.0]]
+        told = Shards(ranks, 3).exchange([sound, broken, idle], figures, 2, [not ranks.first])
+        return sound.grad, broken.grad, idle.grad, told
+
+    for rank, (sound, broken, idle, (table, flags)) in enumerate(learn(2, work)):
+        assert torch.equal(sound, torch.full((3,), 0.1 + rank))
+        assert broken.isnan().any()
+        assert idle is None
+        assert table[:, 0].tolist() == [1.0, 2.0]
+        assert flags == [True]
 
 
 def test_opacities_low_in_one_part_alone_are_no_reset(model, dataset):
