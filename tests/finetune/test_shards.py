@@ -218,14 +218,14 @@ def test_what_is_sent_ends_where_fragments_and_rims_end():
     """Round Gaussians on a line across the picture: a sphere is as wide as they are."""
     count = 2000
     model = tiny.random_model(count)
-    places = torch.linspace(-4, 4, count)[:, None] * tiny.cameras()[0].rotation[0].float()
+    places = torch.linspace(-8, 8, count)[:, None] * tiny.cameras()[0].rotation[0].float()
     model = replace(
-        model, xyz=places, scaling=torch.full((count, 3), -2.0), opacity=torch.full((count, 1), 4.0)
+        model, xyz=places, scaling=torch.full((count, 3), -1.0), opacity=torch.full((count, 1), 4.0)
     )
     inputs = RasterInputs(tiny.cameras()[0].view(), model.splats(), counts=True)
     engine = create_engine("cpu")
     drawn = engine.rasterize(inputs, None).fragments_per_gaussian.nonzero()[:, 0]
-    for gate in (1e-3, 0.3):  # within a rim the gate's surrogate has a gradient
+    for gate in (0.05, 0.3):  # within a rim the gate's surrogate has a gradient
         cut = torch.full((count,), gate, requires_grad=True)
         engine.rasterize(inputs, cut).fragments_per_pixel.backward()
         moved = set(cut.grad.nonzero()[:, 0].tolist())
