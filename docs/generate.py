@@ -105,7 +105,7 @@ def python() -> str:
 
 def command_line() -> str:
     """Every command's help."""
-    from fragprune_plugins.cli import cli
+    from fragprune_plugins.workbench.commands import cli
 
     intro = """The output of `fragprune COMMAND --help`. Every command takes `--json`: it
 prints one object on stdout, and progress on stderr. [Errors](errors.md) lists the exit codes."""

@@ -17,23 +17,13 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.constants import VERSION
 
 if TYPE_CHECKING:
-    from fragprune_plugins.bench.calibration import prices_of
-    from fragprune_plugins.datasets.cameras import load_cameras
-    from fragprune_plugins.datasets.dataset import load_dataset
     from fragprune_plugins.engines import slice_at
-    from fragprune_plugins.engines.cost import Cost
-    from fragprune_plugins.engines.sharded import ShardedEngine
-    from fragprune_plugins.finetuning import FinetuneResult, finetune, own_pictures
-    from fragprune_plugins.finetuning.processes import part_of, whole_of
+    from fragprune_plugins.files.ply import SplatFile
     from fragprune_plugins.injection.api import activate, deactivate, paused
     from fragprune_plugins.learning.ranks import joined
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
-    from fragprune_plugins.measure.scores import keep_best, keep_needed
-    from fragprune_plugins.measure.viewing import overview, render_view
     from fragprune_plugins.plugins.hooks import engine_for, rasterize
-    from fragprune_plugins.storage.models import Model, load, save
-    from fragprune_plugins.storage.ply import SplatFile
     from fragprune_plugins.types import (
         Footprints,
         Moment,
@@ -44,23 +34,34 @@ if TYPE_CHECKING:
         Splats,
         View,
     )
+    from fragprune_plugins.workbench.figures.viewing import overview, render_view
+    from fragprune_plugins.workbench.finetune.itself import own_pictures
+    from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
+    from fragprune_plugins.workbench.finetune.processes import part_of, whole_of
+    from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
+    from fragprune_plugins.workbench.models.model import Model, load, save
+    from fragprune_plugins.workbench.prices.calibration import prices_of
+    from fragprune_plugins.workbench.prices.cost import Cost
+    from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
+    from fragprune_plugins.workbench.scenes.cameras import load_cameras
+    from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 __version__ = VERSION
 
 _HOME = {
-    "Cost": "engines.cost",
-    "FinetuneResult": "finetuning",
+    "Cost": "workbench.prices.cost",
+    "FinetuneResult": "workbench.finetune.loop",
     "Footprints": "types",
-    "Model": "storage.models",
+    "Model": "workbench.models.model",
     "Moment": "types",
     "RasterInputs": "types",
     "RasterOutputs": "types",
     "Schedule": "learning.schedule",
     "Settings": "learning.schedule",
-    "ShardedEngine": "engines.sharded",
+    "ShardedEngine": "workbench.finetune.sharded",
     "Sliced": "types",
     "SpacetimeSplats": "types",
-    "SplatFile": "storage.ply",
+    "SplatFile": "files.ply",
     "Splats": "types",
     "StepPlan": "learning.schedule",
     "ThresholdStore": "learning.thresholds",
@@ -68,23 +69,23 @@ _HOME = {
     "activate": "injection.api",
     "deactivate": "injection.api",
     "engine_for": "plugins.hooks",
-    "finetune": "finetuning",
+    "finetune": "workbench.finetune.loop",
     "joined": "learning.ranks",
-    "keep_best": "measure.scores",
-    "keep_needed": "measure.scores",
-    "load": "storage.models",
-    "load_cameras": "datasets.cameras",
-    "load_dataset": "datasets.dataset",
-    "overview": "measure.viewing",
-    "own_pictures": "finetuning",
-    "part_of": "finetuning.processes",
-    "prices_of": "bench.calibration",
+    "keep_best": "workbench.pruning.scores",
+    "keep_needed": "workbench.pruning.scores",
+    "load": "workbench.models.model",
+    "load_cameras": "workbench.scenes.cameras",
+    "load_dataset": "workbench.scenes.dataset",
+    "overview": "workbench.figures.viewing",
+    "own_pictures": "workbench.finetune.itself",
+    "part_of": "workbench.finetune.processes",
+    "prices_of": "workbench.prices.calibration",
     "paused": "injection.api",
     "rasterize": "plugins.hooks",
-    "render_view": "measure.viewing",
-    "save": "storage.models",
+    "render_view": "workbench.figures.viewing",
+    "save": "workbench.models.model",
     "slice_at": "engines",
-    "whole_of": "finetuning.processes",
+    "whole_of": "workbench.finetune.processes",
 }
 
 __all__ = [

@@ -21,7 +21,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.constants import ALPHA_MIN, MARGINAL_MIN
-from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import (
     AlignmentError,
     EngineError,
@@ -33,6 +32,7 @@ from fragprune_plugins.errors import (
     Terminated,
     UsageError,
 )
+from fragprune_plugins.files.reading import Door
 from fragprune_plugins.hosts import graphdeco
 from fragprune_plugins.hosts.adapter import (
     CommandLine,
@@ -46,10 +46,10 @@ from fragprune_plugins.hosts.adapter import (
 )
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall, revised
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.storage.reading import Door
 from fragprune_plugins.types import (
     Footprints,
     Moment,
@@ -63,12 +63,12 @@ from fragprune_plugins.types import (
 
 if TYPE_CHECKING:
     from fragprune_plugins.engines import slice_at
+    from fragprune_plugins.files.ply import SplatFile, read_ply
     from fragprune_plugins.hosts.graphdeco import stand_ins
-    from fragprune_plugins.storage.ply import SplatFile, read_ply
 
 _WITH_TORCH = {
-    "SplatFile": "storage.ply",
-    "read_ply": "storage.ply",
+    "SplatFile": "files.ply",
+    "read_ply": "files.ply",
     "slice_at": "engines",
     "stand_ins": "hosts.graphdeco.stand_ins",
 }

@@ -19,7 +19,7 @@ from collections import Counter
 from pathlib import Path
 
 MADE = Path("mutants")
-PROBE = "fragprune_plugins.storage.reading.x_said__mutmut_1"
+PROBE = "fragprune_plugins.files.reading.x_said__mutmut_1"
 
 # mutmut's exit codes: https://github.com/boxed/mutmut/blob/main/src/mutmut/stats.py
 OUTCOMES = {0: "survived", 1: "killed", 3: "killed", 5: "not reached", 33: "not reached"}

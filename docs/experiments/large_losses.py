@@ -21,13 +21,13 @@ import numpy as np
 import torch
 from PIL import Image
 
-from fragprune_plugins.datasets.dataset import Dataset
-from fragprune_plugins.finetuning import finetune, load_dataset
 from fragprune_plugins.learning.pressure import ElasticPressure, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.measure import Candidate, measure
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
-from fragprune_plugins.storage import models
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.scenes.dataset import Dataset, load_dataset
 
 
 def scene(args: Namespace) -> None:

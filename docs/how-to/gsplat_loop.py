@@ -41,10 +41,10 @@ import torch  # noqa: E402
 from plyfile import PlyData  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
-from fragprune_plugins.finetuning import load_dataset  # noqa: E402
+from fragprune_plugins.files.ply import read_ply  # noqa: E402
 from fragprune_plugins.learning.losses import photometric_loss  # noqa: E402
-from fragprune_plugins.storage.ply import read_ply  # noqa: E402
 from fragprune_plugins.types import View  # noqa: E402
+from fragprune_plugins.workbench.scenes.dataset import load_dataset  # noqa: E402
 
 SH_DEGREE = 1
 device = "cuda" if torch.cuda.is_available() else "cpu"

@@ -19,7 +19,7 @@ import torch
 
 import fragprune_plugins
 from fragprune_plugins.injection.process import surroundings
-from fragprune_plugins.measure.metrics import psnr, ssim
+from fragprune_plugins.workbench.figures.metrics import psnr, ssim
 
 parser = ArgumentParser()
 parser.add_argument("checkout", type=Path)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 import fragprune_plugins as fp
-from fragprune_plugins.datasets.dataset import Dataset, Shot
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 LENGTH, STEPS, VIEWS = 200.0, 4, 4
 

@@ -12,13 +12,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import NotComparedError, UsageError
+from fragprune_plugins.files.reading import MEBIBYTE, Door, parse_json
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.flags import Flags
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo, check_seams
-from fragprune_plugins.storage.reading import MEBIBYTE, Door, parse_json
 
 if TYPE_CHECKING:
     from torch import Tensor

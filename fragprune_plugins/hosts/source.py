@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Literal
 
 from fragprune_plugins.errors import UnknownHostError
+from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.seams import Seam
-from fragprune_plugins.storage.reading import MEBIBYTE, Door, lies_in
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fragprune_plugins.constants import VERSION
-from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import (
     CheckpointError,
     HostFailed,
@@ -30,9 +29,11 @@ from fragprune_plugins.errors import (
     UsageError,
     printable,
 )
+from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import MethodAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import choose, locate
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process, ranks, starting
 from fragprune_plugins.injection.command import HostCommand, split
@@ -42,7 +43,6 @@ from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupt
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.storage.atomic import digest
 
 UNFINISHED = "stage2.fragprune-unfinished"
 """The file of an unfinished stage 2, in the host's output folder."""
@@ -194,7 +194,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     started = time.perf_counter()
     trains = script in (repo.root / name for name in host.line.scripts)
     if host.line.one_run and host.flags.resume:
-        from fragprune_plugins.storage import sidecar
+        from fragprune_plugins.files import sidecar
 
         trains = False  # it only evaluates
         if not sidecar.find(Path(host.flags.resume)):
@@ -465,9 +465,9 @@ class _Runner:
 
     def _going_on(self, start: Start) -> dict[str, Any]:
         """Options of a session that keeps an unfinished stage 2, and goes on from a kept one."""
-        from fragprune_plugins.finetuning.resuming import Checkpoints, deciding, differences
+        from fragprune_plugins.files import checkpoints
         from fragprune_plugins.plugins.hooks import schedule_for
-        from fragprune_plugins.storage import checkpoints
+        from fragprune_plugins.workbench.finetune.resuming import Checkpoints, deciding, differences
 
         options, seconds = self.options, self.options.checkpoint_every
         if self.output is None or not seconds:
@@ -557,7 +557,7 @@ class _Runner:
 
     def _is_finished(self, start: Start, result: Path | None) -> bool:
         """Whether stage 2 from this start wrote this file, with these settings."""
-        from fragprune_plugins.storage import sidecar
+        from fragprune_plugins.files import sidecar
 
         if result is None or start.path.stat().st_mtime_ns > result.stat().st_mtime_ns:
             return False

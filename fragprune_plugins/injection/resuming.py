@@ -18,9 +18,9 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import CheckpointError
+from fragprune_plugins.files.checkpoints import UNFIT
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.storage.checkpoints import UNFIT
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.atomic import staging
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
 from fragprune_plugins.hosts.seams import Role, SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.atomic import staging
 
 log = logging.getLogger("fragprune")
 

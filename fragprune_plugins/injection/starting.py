@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fragprune_plugins.errors import ModelFileError, UsageError
+from fragprune_plugins.files import records
+from fragprune_plugins.files.reading import Door
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, CommandLine, ScriptAdapter
 from fragprune_plugins.injection.command import HostCommand
 from fragprune_plugins.injection.process import host_checkpoints
-from fragprune_plugins.storage import records
-from fragprune_plugins.storage.reading import Door
 
 log = logging.getLogger("fragprune")
 
@@ -116,7 +116,7 @@ def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterat
 
 def _learned(adapter: ScriptAdapter, path: Path) -> bool:
     """Whether stage 2 or a control wrote the file, and not stage 1."""
-    from fragprune_plugins.storage import sidecar
+    from fragprune_plugins.files import sidecar
 
     record = records.beside(path)  # the only mark of a control of version 0.1
     if record is not None and record.command == "run":

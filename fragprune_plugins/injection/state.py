@@ -20,6 +20,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
@@ -31,11 +32,10 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.reprs import one_line
-from fragprune_plugins.storage import sidecar
 from fragprune_plugins.types import RasterInputs
 
 if TYPE_CHECKING:
-    from fragprune_plugins.finetuning.resuming import Checkpoints
+    from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 
 log = logging.getLogger("fragprune")
 

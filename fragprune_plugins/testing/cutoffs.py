@@ -29,10 +29,10 @@ from fragprune_plugins.constants import (
     TRANSMITTANCE_MIN,
     VERSION,
 )
-from fragprune_plugins.datasets.pinhole import Camera
-from fragprune_plugins.storage import cutoffs, formats
-from fragprune_plugins.storage.formats.values import SH_C0, of_codes, splat_of
-from fragprune_plugins.storage.ply import SplatFile, write_ply
+from fragprune_plugins.files.ply import SplatFile, write_ply
+from fragprune_plugins.workbench.models import cutoffs, formats
+from fragprune_plugins.workbench.models.formats.values import SH_C0, of_codes, splat_of
+from fragprune_plugins.workbench.scenes.pinhole import Camera
 
 WIDTH, HEIGHT, FOCAL = 128, 96, 120.0
 SUFFIXES = (".ply", ".spz", ".sog", ".glb")
@@ -136,9 +136,9 @@ def write(out: Path) -> dict[str, Any]:
     Raises:
         OutputError: the folder cannot be written.
     """
-    from fragprune_plugins.measure.metrics import psnr
-    from fragprune_plugins.measure.pictures import save_image
-    from fragprune_plugins.storage.atomic import writable_folder
+    from fragprune_plugins.files.atomic import writable_folder
+    from fragprune_plugins.workbench.figures.metrics import psnr
+    from fragprune_plugins.workbench.figures.pictures import save_image
 
     writable_folder(out)
     scenes: dict[str, Any] = {}

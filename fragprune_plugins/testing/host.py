@@ -25,7 +25,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins import demo
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.hosts.source import HostRepo
@@ -34,6 +33,7 @@ from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench import demo
 
 MINIATURE = Path(demo.__file__).with_name("host")
 """The demo's training repository: vanilla 3DGS of 2023 by its interface, small."""

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 
 @pytest.fixture(autouse=True)

@@ -19,14 +19,15 @@ from PIL import Image
 from fragprune_4dgaussians import MovingGaussians
 from fragprune_4dgaussians.config import PythonFile
 from fragprune_plugins.errors import HostFailed, Interrupted, ModelFileError, UsageError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import stepping
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.storage import models, sidecar
-from fragprune_plugins.storage.ply import read_ply
 from fragprune_plugins.testing.host import joint, running
+from fragprune_plugins.workbench.models import model as models
 from reference_renderer import Camera, Gaussians, render
 
 LAST = 20

@@ -22,9 +22,9 @@ from fragprune_mcmc import MCMC
 from fragprune_mini_splatting import MiniSplatting
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.storage import sidecar
 from fragprune_rain_gs import RainGS
 from fragprune_rt_4dgs import RT4DGS
 from fragprune_speedy_splat import SpeedySplat

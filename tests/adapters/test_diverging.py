@@ -11,13 +11,13 @@ from click.testing import CliRunner
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST, joint, running
 
-from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import DivergedError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.storage import sidecar
+from fragprune_plugins.workbench.commands import cli
 
 
 def spoil(tensor, rows, value):

@@ -20,12 +20,12 @@ from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
 
 COUNT = 16
 

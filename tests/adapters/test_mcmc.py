@@ -20,10 +20,10 @@ from miniatures.vanilla_3dgs import (
 
 from fragprune_mcmc import MCMC
 from fragprune_plugins.errors import AlignmentError, HostFailed, UsageError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import run
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
 
 COUNT = 24
 

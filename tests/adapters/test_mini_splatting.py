@@ -16,6 +16,8 @@ from miniatures.vanilla_3dgs import HOST, joint, label
 
 from fragprune_mini_splatting import MiniSplatting
 from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
@@ -23,8 +25,6 @@ from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
 
 
 @pytest.fixture(scope="module")

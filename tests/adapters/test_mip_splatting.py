@@ -15,15 +15,15 @@ from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins import rasterize
-from fragprune_plugins.cli.run import _measure, _photographs
 from fragprune_plugins.errors import ModelFileError, NotComparedError
-from fragprune_plugins.finetuning import load_dataset
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.measure import Candidate
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.workbench.figures.evaluate import Candidate
+from fragprune_plugins.workbench.run import _measure, _photographs
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 COUNT = 16
 

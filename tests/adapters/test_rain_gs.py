@@ -16,13 +16,13 @@ from miniatures.runs import OPTIONS, edit, frozen_differences, written
 from miniatures.vanilla_3dgs import expect_ancestors, identity, joint, label, running
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.cli.run import _measure, _photographs
 from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.workbench.run import _measure, _photographs
 from fragprune_rain_gs import PACKAGE, RainGS
 
 COUNT = 16

@@ -21,9 +21,10 @@ from miniatures.vanilla_3dgs import HOST
 
 from adapters import test_mini_splatting as mini_splatting
 from fragprune_plugins.errors import CheckpointError
+from fragprune_plugins.files import checkpoints
 from fragprune_plugins.injection import launch, stepping
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage import checkpoints, models
+from fragprune_plugins.workbench.models import model as models
 
 SETTINGS = Settings(iterations=12, threshold_lr=0.3, train="appearance")
 FINETUNE = replace(

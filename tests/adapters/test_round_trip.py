@@ -6,8 +6,8 @@ import pytest
 from miniatures.vanilla_3dgs import joint
 
 from fragprune_plugins.errors import OutputError, SidecarError
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply, write_ply
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply, write_ply
 
 
 def trained(host, count=20):

@@ -24,8 +24,9 @@ from miniatures import runs
 from miniatures.runs import OPTIONS, frozen_differences
 from miniatures.vanilla_3dgs import HOST, running
 
-from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import Interrupted, SessionError, UsageError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.launch import RunOptions, run
@@ -34,8 +35,7 @@ from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.workbench.commands import cli
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
@@ -209,7 +209,7 @@ def test_sigterm_in_stage_one_ends_the_process_as_the_host_alone(photographs, tm
     assert loop in text
     script.write_text(text.replace(loop, loop + kill))
     words = command(photographs, tmp_path / "out", 10)[1:]
-    program = "from fragprune_plugins.cli import main; main()"
+    program = "from fragprune_plugins.workbench.commands import main; main()"
     options = ["run", "--device", "cpu", "--", str(script), *words]
     done = subprocess.run([sys.executable, "-c", program, *options], capture_output=True)
     assert done.returncode == -signal.SIGTERM

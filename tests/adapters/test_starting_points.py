@@ -13,9 +13,9 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
+from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage import records, sidecar
 
 SETTINGS = Settings(iterations=6, threshold_lr=0.3, train="opacity")
 OPTIONS = RunOptions(device="cpu", settings=SETTINGS)

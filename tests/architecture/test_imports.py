@@ -15,8 +15,8 @@ import pytest
 
 import fragprune_plugins
 from fragprune_plugins import adapting
-from fragprune_plugins.cli import bridge as bridge_command
 from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.workbench import bridge as bridge_command
 
 ROOT = Path(__file__).parents[2]
 ADAPTERS = sorted(p.name for p in (ROOT / "adapters").glob("fragprune_*") if p.is_dir())
@@ -67,7 +67,7 @@ def test_the_outer_rooms_import_without_torch(python):
         "plugins.hookspecs plugins.loading storage.atomic"
     )
     light = [
-        *(m for m in MODULES if m.startswith("fragprune_plugins.cli")),
+        *(m for m in MODULES if m.startswith("fragprune_plugins.workbench.commands")),
         *(f"fragprune_plugins.{name}" for name in core.split(" ")),
         *ADAPTERS,
     ]

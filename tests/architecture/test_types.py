@@ -52,7 +52,9 @@ def test_a_script_of_a_user_is_checked_against_them(installed, tmp_path):
     )
     said = done.stdout.splitlines()
     revealed = [line.split('Revealed type is "')[1] for line in said if "Revealed" in line]
-    assert "fragprune_plugins.storage.models.Model" in revealed[0], done.stdout + done.stderr
+    assert "fragprune_plugins.workbench.models.model.Model" in revealed[0], (
+        done.stdout + done.stderr
+    )
     assert revealed[1] == 'PIL.Image.Image"'
     assert revealed[2].startswith("def (alpha: float, opacities: ")
     (error,) = (line for line in said if " error: " in line)

@@ -33,15 +33,16 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs
 from fragprune_plugins.errors import SidecarError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.injection.starting import _read_checkpoint
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
-from fragprune_plugins.storage import models, sidecar
-from fragprune_plugins.storage.ply import write_ply
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.models import model as models
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import write_ply
 
 GOOD = "good: "
 """Begins the names of files that have to be read."""

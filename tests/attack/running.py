@@ -20,8 +20,8 @@ from typing import Any
 from attack.hostile import GOOD
 from click.testing import CliRunner
 
-from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import FragpruneError
+from fragprune_plugins.workbench.commands import cli
 
 FINE = ("fine", "stated", "warned")
 BAD = ("traceback", "hang", "crash", "nonsense")

@@ -23,8 +23,9 @@ from attack.hostile import GOOD
 from attack.running import Outcome, Result, command, in_child, judged, raised
 from finetune import tiny
 
-from fragprune_plugins.storage import checkpoints, models
-from fragprune_plugins.viewer.server import open_server
+from fragprune_plugins.files import checkpoints
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.view.server import open_server
 
 ROOT = Path(__file__).parents[2]
 
@@ -180,7 +181,7 @@ def forged(options: Any, fresh: Any, words: Any) -> Result:
         return (*words(at, "finetune")["finetune"], "--iters", 6)
 
     def begin(at: Any) -> Outcome:
-        from fragprune_plugins.finetuning import resuming
+        from fragprune_plugins.workbench.finetune import resuming
 
         save = resuming.Checkpoints.save
 

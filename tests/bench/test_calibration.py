@@ -13,12 +13,12 @@ from cli.commands import run, run_json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fragprune_plugins.bench import calibration
-from fragprune_plugins.bench.scene import make_scene, make_view
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.cost import UNITS, Cost, fit, work_of
 from fragprune_plugins.errors import CostError
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.prices import calibration
+from fragprune_plugins.workbench.prices.cost import UNITS, Cost, fit, work_of
+from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
 PRICES = dict(zip(UNITS, (5e4, 1.5, 60.0, 30.0, 0.25, 0.125), strict=True))
 

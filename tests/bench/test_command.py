@@ -10,9 +10,8 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.bench import peers
-from fragprune_plugins.cli.bench import TRUNCATION
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.bench import TRUNCATION, peers
 
 SMALL = ("--size", "40x30", "--gaussians", 200, "--repeats", 2)
 

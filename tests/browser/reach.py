@@ -22,13 +22,13 @@ from typing import Any
 from browser.chromium import chromium, opened
 from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
 
-from fragprune_plugins.bench.machine import describe_machine
-from fragprune_plugins.bench.scene import make_scene, make_view
-from fragprune_plugins.measure.viewing import overview
-from fragprune_plugins.storage.models import Model, load
 from fragprune_plugins.types import View
-from fragprune_plugins.viewer.server import address, open_server
-from fragprune_plugins.viewer.site import Layer, make_site
+from fragprune_plugins.workbench.figures.viewing import overview
+from fragprune_plugins.workbench.models.model import Model, load
+from fragprune_plugins.workbench.prices.machine import describe_machine
+from fragprune_plugins.workbench.prices.scene import make_scene, make_view
+from fragprune_plugins.workbench.view.server import address, open_server
+from fragprune_plugins.workbench.view.site import Layer, make_site
 
 SIZE = (1280, 720)
 

@@ -13,8 +13,8 @@ from browser.engines import NoEnginesError, drawing, engines, install
 from cli.commands import run
 
 from fragprune_plugins import RasterInputs, View, rasterize
-from fragprune_plugins.storage.cutoffs import decode, encode
-from fragprune_plugins.storage.ply import SplatFile, write_ply
+from fragprune_plugins.files.ply import SplatFile, write_ply
+from fragprune_plugins.workbench.models.cutoffs import decode, encode
 
 pytestmark = pytest.mark.browser
 Error = pytest.importorskip("playwright.sync_api").Error
@@ -216,7 +216,7 @@ def test_rows_that_playcanvas_was_told_to_leave_in_order(draw, whole, cut, codes
 
 def test_playcanvas_draws_the_cutoffs_of_a_sog(draw, splat, codes, tmp_path):
     """The format reorders rows; a file keeps its codes in its own order, also without a column."""
-    formats = pytest.importorskip("fragprune_plugins.storage.formats")
+    formats = pytest.importorskip("fragprune_plugins.workbench.models.formats")
     for name, thresholds in (("cut", splat.thresholds), ("whole", None)):
         path = tmp_path / f"{name}.sog"
         formats.write(formats.named(path), path, splat, thresholds)

@@ -8,8 +8,8 @@ import torch
 from browser.chromium import opened, served
 from browser.test_viewer import INTRUDE
 
-from fragprune_plugins.measure import page
-from fragprune_plugins.measure.pictures import save_image, save_map
+from fragprune_plugins.workbench.figures import page
+from fragprune_plugins.workbench.figures.pictures import save_image, save_map
 
 pytestmark = pytest.mark.browser
 

@@ -9,11 +9,11 @@ from browser.chromium import opened, served
 from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
 from finetune import tiny
 
-from fragprune_plugins.datasets.dataset import load_dataset
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage.models import Model
 from fragprune_plugins.types import View
-from fragprune_plugins.viewer.site import Layer, Shown, make_site, save_site, single_page
+from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
+from fragprune_plugins.workbench.view.site import Layer, Shown, make_site, save_site, single_page
 from reference_renderer import Camera, Gaussians, Options
 from reference_renderer.project import project
 

@@ -14,9 +14,9 @@ import torch
 from browser.chromium import Tab, opened, served
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.storage.models import Model
 from fragprune_plugins.types import RasterInputs, View
-from fragprune_plugins.viewer.site import Layer, camera, make_site, save_site
+from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.view.site import Layer, camera, make_site, save_site
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import json
 
 from click.testing import CliRunner, Result
 
-from fragprune_plugins.cli import cli
+from fragprune_plugins.workbench.commands import cli
 
 
 def run(*arguments: object) -> Result:

@@ -12,7 +12,7 @@ from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.files.ply import write_ply
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import torch
 from cli.commands import run
 from finetune import tiny
 
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply, write_ply
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_refused(scene, tmp_path, how, code, words, command):
 RENDER = """
 import json, sys
 from click.testing import CliRunner
-from fragprune_plugins.cli import cli
+from fragprune_plugins.workbench.commands import cli
 result = CliRunner().invoke(cli, ["render", *sys.argv[1:]])
 print(json.dumps([result.exit_code, result.stderr]))
 """
@@ -122,7 +122,7 @@ def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypat
     def never(*args, **kwargs):
         raise AssertionError("learned although nothing can be written")
 
-    monkeypatch.setattr("fragprune_plugins.finetuning.finetune", never)
+    monkeypatch.setattr("fragprune_plugins.workbench.finetune.finetune", never)
     inside = out / "below-a-file.ply"
     refused(("finetune", path, "--data", data, "--out", inside), "output", "cannot be written")
     folder = tmp_path / "folder.ply"
@@ -215,7 +215,7 @@ def test_bugs_keep_their_traceback(scene, monkeypatch):
     def bug(*args, **kwargs):
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("fragprune_plugins.measure.measure", bug)
+    monkeypatch.setattr("fragprune_plugins.workbench.figures.measure", bug)
     with pytest.raises(ZeroDivisionError):
         run("profile", path, "--data", data)
 
@@ -234,7 +234,7 @@ def test_what_the_machine_refuses_is_stated(scene, monkeypatch, error, code):
     def refuse(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr("fragprune_plugins.measure.measure", refuse)
+    monkeypatch.setattr("fragprune_plugins.workbench.figures.measure", refuse)
     refused(("profile", path, "--data", data), code, "")
 
 

@@ -10,7 +10,7 @@ import pytest
 from cli.commands import run, run_json
 
 from fragprune_plugins import __version__
-from fragprune_plugins.cli import bridge
+from fragprune_plugins.workbench import bridge
 
 VIEWERS = ["playcanvas", "spark"]
 

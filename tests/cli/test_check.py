@@ -10,11 +10,11 @@ import pytest
 from cli.commands import run, run_json
 from miniatures.skeletons import STATES, skeleton
 
-from fragprune_plugins import demo
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins import loading
 from fragprune_plugins.testing import mutations
+from fragprune_plugins.workbench import demo
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 MINIATURE = Path(demo.__file__).with_name("host")
@@ -66,7 +66,7 @@ def test_nothing_is_imported(host, python):
     code = (
         "import json, sys\n"
         "from click.testing import CliRunner\n"
-        "from fragprune_plugins.cli import cli\n"
+        "from fragprune_plugins.workbench.commands import cli\n"
         "result = CliRunner().invoke(cli, ['check', sys.argv[1], '--json'])\n"
         "print(json.dumps([result.exit_code, 'torch' in sys.modules, 'scene' in sys.modules]))\n"
     )

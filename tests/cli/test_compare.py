@@ -8,7 +8,7 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.files.ply import write_ply
 
 FIGURES = ("psnr", "ssim", "fragments_per_pixel", "gaussians")
 
@@ -45,7 +45,7 @@ def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):
         sizes.extend((view.width, view.height) for view in views)
         return [{"frame_ms": 1.0, "frame_ms_se": 0.0} for _ in candidates]
 
-    module = importlib.import_module("fragprune_plugins.measure.evaluate")
+    module = importlib.import_module("fragprune_plugins.workbench.figures.evaluate")
     monkeypatch.setattr(module, "frame_times", frame_times)
     report = run_json("compare", path, path, "--data", data, "--enlarge", 3)
     assert set(sizes) == {(3 * tiny.SIDE, 3 * tiny.SIDE)}

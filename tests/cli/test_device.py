@@ -14,10 +14,10 @@ from cli.commands import run
 from finetune import tiny
 
 from fragprune_plugins import engines
-from fragprune_plugins.cli.run import _measure
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply, write_ply
+from fragprune_plugins.workbench.run import _measure
 
 
 @pytest.fixture

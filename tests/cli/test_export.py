@@ -8,9 +8,10 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import models, sidecar
-from fragprune_plugins.storage.ply import read_ply, write_ply
+from fragprune_plugins.workbench.models import model as models
 
 
 def test_one_file_with_the_thresholds(tmp_path):

@@ -18,13 +18,13 @@ from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.bench import calibration
-from fragprune_plugins.cli.finetuned import describe_untruncated
-from fragprune_plugins.engines.cost import UNITS, Cost, work_of
-from fragprune_plugins.finetuning import loop, timing
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply, write_ply
+from fragprune_plugins.workbench.finetune import loop, timing
+from fragprune_plugins.workbench.finetune.finished import describe_untruncated
+from fragprune_plugins.workbench.prices import calibration
+from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 
 
 @pytest.fixture
@@ -337,7 +337,7 @@ def test_sigterm_saves_at_once_and_leaves_with_143(scene, tmp_path, monkeypatch)
         raise AssertionError("whoever sends SIGTERM does not wait for this")
 
     monkeypatch.setattr(loop, "photometric_loss", photometric)
-    monkeypatch.setattr("fragprune_plugins.measure.measure", measured)
+    monkeypatch.setattr("fragprune_plugins.workbench.figures.measure", measured)
     result = run("finetune", path, "--data", data, "--out", out, "--iters", 50, "--json")
     assert result.exit_code == 143
     report = json.loads(result.stdout)
@@ -382,7 +382,11 @@ def test_as_a_program(scene, tmp_path):
     root = Path(__file__).parents[2]
     done = subprocess.run(
         [
-            *(sys.executable, "-c", "from fragprune_plugins.cli import main; main()"),
+            *(
+                sys.executable,
+                "-c",
+                "from fragprune_plugins.workbench.commands import main; main()",
+            ),
             *("finetune", str(path), "--data", str(data), "--out", str(tmp_path / "out.ply")),
             *("--iters", "3", "--threads", "1", "--json"),
         ],
@@ -397,7 +401,8 @@ def test_as_a_program(scene, tmp_path):
 
 def test_help_needs_no_torch():
     program = (
-        "import sys; from click.testing import CliRunner; from fragprune_plugins.cli import cli;"
+        "import sys; from click.testing import CliRunner;"
+        "from fragprune_plugins.workbench.commands import cli;"
         "out = CliRunner().invoke(cli, ['--help']).output;"
         "assert 'finetune' in out and 'export' in out, out;"
         "assert 'torch' not in sys.modules"

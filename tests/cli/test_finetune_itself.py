@@ -10,11 +10,11 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.learning.pressure import OWN_PRESSURE
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.measure.metrics import psnr
-from fragprune_plugins.storage import sidecar
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.figures.metrics import psnr
 
 
 @pytest.fixture

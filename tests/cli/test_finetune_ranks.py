@@ -17,11 +17,11 @@ from cli.commands import run, run_json
 from finetune import tiny
 from finetune.several import command
 
-from fragprune_plugins.datasets.dataset import Photograph
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.finetuning import loop
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.scenes.dataset import Photograph
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.finetuning import loop, resuming
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.atomic import locked
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.atomic import locked
+from fragprune_plugins.workbench.finetune import loop, resuming
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def test_a_finished_command_says_so_and_does_nothing(scene, tmp_path, monkeypatc
     out = tmp_path / "out.ply"
     first = run_json(*words(scene, out))
     with monkeypatch.context() as patch:
-        patch.setattr("fragprune_plugins.finetuning.finetune", None)  # cannot be called
+        patch.setattr("fragprune_plugins.workbench.finetune.finetune", None)  # cannot be called
         again = run_json(*words(scene, out))
         assert again == first | {"already_finished": True}
         text = run(*words(scene, out, "--curves", tmp_path / "curves.png"))

@@ -5,7 +5,7 @@ import pytest
 from cli.commands import run
 from click.testing import CliRunner
 
-from fragprune_plugins.cli.learning import learning_options
+from fragprune_plugins.workbench.commands.learning import learning_options
 
 HOST = ("--", "train.py")
 COMMANDS = {"run": HOST, "finetune": ("model.ply", "--data", "scene", "--out", "out.ply")}

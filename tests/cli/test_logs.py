@@ -17,7 +17,7 @@ from fragprune_plugins.errors import OutputError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import fragprune_step
 from fragprune_plugins.plugins.loading import Plugins, installed
-from fragprune_plugins.plugins.logs import COLUMNS, logging_steps
+from fragprune_plugins.workbench.commands.logs import COLUMNS, logging_steps
 
 WORDS = ("--iters", 6, "--train", "opacity")
 
@@ -175,7 +175,11 @@ def test_completion_prints_a_script_for_the_shell(shell):
 
 def test_bash_completes_commands():
     """What the script asks the program when the tab key is pressed."""
-    command = [sys.executable, "-c", "from fragprune_plugins.cli import main; main()"]
+    command = [
+        sys.executable,
+        "-c",
+        "from fragprune_plugins.workbench.commands import main; main()",
+    ]
     asked = {
         "_FRAGPRUNE_COMPLETE": "bash_complete",
         "COMP_WORDS": "fragprune fine",

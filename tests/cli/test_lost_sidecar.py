@@ -10,8 +10,8 @@ from cli.commands import run, run_json
 from finetune import tiny
 from plyfile import PlyData
 
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply, write_ply
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply, write_ply
 
 COMMANDS = {
     "render": ("--data", "DATA", "--out", "pictures"),

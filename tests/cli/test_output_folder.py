@@ -12,10 +12,10 @@ from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.hosts.graphdeco.output import trained_on
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
 
 
 def write_output(folder, data, model, **arguments):

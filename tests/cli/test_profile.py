@@ -6,7 +6,7 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.files.ply import write_ply
 
 
 def test_with_and_without_thresholds(tmp_path):

@@ -11,7 +11,7 @@ from finetune import tiny
 from finetune.several import command
 from PIL import Image
 
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.files.ply import write_ply
 
 
 @pytest.fixture

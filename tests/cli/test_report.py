@@ -12,8 +12,8 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.measure import report_page
-from fragprune_plugins.storage import records
+from fragprune_plugins.files import records
+from fragprune_plugins.workbench.report import page as report_page
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 from PIL import Image
 
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
 from fragprune_plugins.testing import mutations
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 WORDS = ["--device", "cpu", "--iters", 6]
 

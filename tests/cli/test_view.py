@@ -11,8 +11,8 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.storage.ply import write_ply
-from fragprune_plugins.viewer import server as serving
+from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.view import server as serving
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fragprune_plugins import demo
+from fragprune_plugins.workbench import demo
 
 HOST = Path(demo.__file__).with_name("host")
 

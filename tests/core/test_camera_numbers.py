@@ -10,10 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
-from fragprune_plugins.datasets import colmap
-from fragprune_plugins.datasets import transforms as layout
-from fragprune_plugins.datasets.cameras import divided, load_cameras, load_scene_cameras
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.workbench.scenes import colmap
+from fragprune_plugins.workbench.scenes import transforms as layout
+from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
 
 TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # camera to world, about z
 PLACE = [1.0, 2.0, 3.0]

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.storage import atomic
-from fragprune_plugins.storage.atomic import (
+from fragprune_plugins.files import atomic
+from fragprune_plugins.files.atomic import (
     all_in_flight,
     digest,
     in_flight,

@@ -9,7 +9,7 @@ from finetune import tiny
 
 import fragprune_plugins as fp
 from fragprune_plugins.errors import AlignmentError, OutputError, SidecarError
-from fragprune_plugins.storage import sidecar
+from fragprune_plugins.files import sidecar
 
 
 @pytest.fixture

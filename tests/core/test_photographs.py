@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from miniatures.skeletons import skeleton
 
-from fragprune_plugins.datasets.photographs import Photographs, Resolution
-from fragprune_plugins.demo import demo
 from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.graphdeco.adapter import resolution
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.workbench.demo import demo
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOST = HostRepo(Path(demo.__file__).with_name("host"))

@@ -7,8 +7,8 @@ import io
 import numpy as np
 import pytest
 
-from fragprune_plugins.storage.ply_table import header_lines, read_vertices
-from fragprune_plugins.storage.reading import Reading
+from fragprune_plugins.files.ply_table import header_lines, read_vertices
+from fragprune_plugins.files.reading import Reading
 
 ROWS = np.array([[1, 2], [3, 4], [5, 6]], dtype=np.float64)
 

@@ -18,10 +18,6 @@ from finetune import tiny
 from safetensors.torch import load_file, save_file
 
 import fragprune_plugins
-from fragprune_plugins.datasets import colmap
-from fragprune_plugins.datasets.cameras import load_cameras
-from fragprune_plugins.datasets.dataset import Photograph
-from fragprune_plugins.datasets.pinhole import Camera
 from fragprune_plugins.errors import (
     DatasetError,
     InputError,
@@ -31,14 +27,18 @@ from fragprune_plugins.errors import (
     SidecarError,
     UsageError,
 )
+from fragprune_plugins.files import records, sidecar
+from fragprune_plugins.files.ply import is_marked, read_ply, write_ply
+from fragprune_plugins.files.reading import NESTING, Door, lies_in, parse_json
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import _read_checkpoint
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import records, sidecar
-from fragprune_plugins.storage.ply import is_marked, read_ply, write_ply
-from fragprune_plugins.storage.reading import NESTING, Door, lies_in, parse_json
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.scenes import colmap
+from fragprune_plugins.workbench.scenes.cameras import load_cameras
+from fragprune_plugins.workbench.scenes.dataset import Photograph
+from fragprune_plugins.workbench.scenes.pinhole import Camera
 
 DOOR = Door(RecordError, "broken", "a file", "Write it again.", limit=100)
 

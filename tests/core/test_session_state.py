@@ -14,11 +14,11 @@ from core.sessions import Model, Role, call, follow, state
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError, SessionError, SidecarError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.atomic import staging
 from fragprune_plugins.injection import state as module
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.atomic import staging
 
 CPU = torch.device("cpu")
 

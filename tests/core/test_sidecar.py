@@ -7,9 +7,9 @@ import torch
 from safetensors.torch import save_file
 
 from fragprune_plugins.errors import DivergedError, OutputError, SidecarError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import MARK
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import MARK
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import json
 import pytest
 from cli.commands import run
 
-from fragprune_plugins.demo import demo, folder
 from fragprune_plugins.errors import OutputError
+from fragprune_plugins.workbench.demo import demo, folder
 
 
 def contents(path):

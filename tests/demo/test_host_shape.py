@@ -4,7 +4,7 @@ import ast
 
 import pytest
 
-from fragprune_plugins.demo.demo import HOST
+from fragprune_plugins.workbench.demo.demo import HOST
 
 ROOT = HOST.parent
 

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fragprune_plugins.datasets.dataset import load_dataset
-from fragprune_plugins.demo.room import furnish
-from fragprune_plugins.demo.scene import (
+from fragprune_plugins.workbench.demo.room import furnish
+from fragprune_plugins.workbench.demo.scene import (
     SceneSettings,
     make_scene,
     photograph,
     photos,
     surface_points,
 )
-from fragprune_plugins.demo.textures import displayed
+from fragprune_plugins.workbench.demo.textures import displayed
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 SMALL = SceneSettings(views=9, width=80, height=60, supersample=2, points=300)
 

@@ -10,18 +10,18 @@ from pathlib import Path
 import pytest
 from cli.commands import run_json
 
-from fragprune_plugins.demo import folder
-from fragprune_plugins.demo.demo import DemoSettings, host_command, run_demo
-from fragprune_plugins.demo.page import BANNER
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.measure.wording import outcome
+from fragprune_plugins.workbench.demo import folder
+from fragprune_plugins.workbench.demo.demo import DemoSettings, host_command, run_demo
+from fragprune_plugins.workbench.demo.page import BANNER
+from fragprune_plugins.workbench.figures.wording import outcome
 
 TINY = """
 import json, sys
 from pathlib import Path
-from fragprune_plugins.demo.scene import SceneSettings
-from fragprune_plugins.demo import folder
-from fragprune_plugins.demo.demo import DemoSettings, run_demo
+from fragprune_plugins.workbench.demo.scene import SceneSettings
+from fragprune_plugins.workbench.demo import folder
+from fragprune_plugins.workbench.demo.demo import DemoSettings, run_demo
 scene = SceneSettings(views=9, width=48, height=36, supersample=1, points=400)
 settings = DemoSettings(iterations=60, finetune=30, scene=scene)
 print(json.dumps(run_demo(Path(sys.argv[1]), settings)))

@@ -13,7 +13,7 @@ from finetune import tiny
 from finetune.several import launch
 
 import fragprune_plugins as fp
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.files.ply import read_ply
 
 HOW_TO = Path(__file__).parents[2] / "docs" / "how-to"
 

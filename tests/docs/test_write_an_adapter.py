@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "write-an-adapter.md"
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)

@@ -11,9 +11,9 @@ import torch
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.datasets.cameras import load_cameras
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.finetuning import load_dataset
+from fragprune_plugins.workbench.scenes.cameras import load_cameras
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 NAMES = [f"view{i:02d}" for i in range(9)]
 

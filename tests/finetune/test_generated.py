@@ -11,9 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from fragprune_plugins.datasets.generated import around, between, bounds, hold_out, interpolate
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.scenes.generated import (
+    around,
+    between,
+    bounds,
+    hold_out,
+    interpolate,
+)
 
 NUMBER = st.floats(-3, 3, width=32)
 PLACE = st.tuples(NUMBER, NUMBER, NUMBER)

@@ -13,12 +13,12 @@ import torch
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.datasets.cameras import load_cameras
-from fragprune_plugins.datasets.dataset import load_dataset
-from fragprune_plugins.datasets.memory import Pictures, Slot
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.finetuning.loop import photometric_loss
-from fragprune_plugins.measure import Candidate, measure
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+from fragprune_plugins.workbench.finetune.loop import photometric_loss
+from fragprune_plugins.workbench.scenes.cameras import load_cameras
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
+from fragprune_plugins.workbench.scenes.memory import Pictures, Slot
 
 NAMES = [f"view{i:02d}" for i in range(9)]
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 from PIL import Image
 
-from fragprune_plugins.datasets.dataset import load_dataset
-from fragprune_plugins.datasets.lenses import Lens
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
+from fragprune_plugins.workbench.scenes.lenses import Lens
 
 WIDTH, HEIGHT = 96, 64
 EYE = torch.eye(3, dtype=torch.float64)

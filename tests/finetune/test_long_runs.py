@@ -9,9 +9,9 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins.finetuning import finetune
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
+from fragprune_plugins.workbench.finetune.loop import finetune
 
 PAGE = 4096
 A_POINT = 600  # bytes of one point of the curves, which are kept on purpose

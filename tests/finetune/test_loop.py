@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.cost import UNITS, Cost, work_of
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
-from fragprune_plugins.finetuning import finetune, loop, save, timing
-from fragprune_plugins.finetuning.loop import mean_fragments
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.pressure import calibrate, calibrate_measured
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.finetune import loop, timing
+from fragprune_plugins.workbench.finetune.loop import finetune, mean_fragments, save
+from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 

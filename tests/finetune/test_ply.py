@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.errors import InputError, ModelFileError
-from fragprune_plugins.storage.ply import SplatFile, expect_drawable, read_ply, write_ply
+from fragprune_plugins.files.ply import SplatFile, expect_drawable, read_ply, write_ply
 
 
 def same(a: SplatFile, b: SplatFile) -> bool:

@@ -15,11 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.finetuning import Checkpoints, finetune, loop
 from fragprune_plugins.learning import ranks as module
 from fragprune_plugins.learning.ranks import Ranks, fingerprint, launched, speaks
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 STEPS = 12

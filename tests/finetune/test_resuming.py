@@ -10,13 +10,15 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins.engines.cost import UNITS, Cost, work_of
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
-from fragprune_plugins.experiments.rules import falloff_threshold
-from fragprune_plugins.finetuning import Checkpoints, finetune, load_dataset, loop, resuming, timing
+from fragprune_plugins.files import checkpoints as files
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import checkpoints as files
+from fragprune_plugins.workbench.finetune import loop, resuming, timing
+from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 STEPS = 12
@@ -128,7 +130,7 @@ def test_what_a_caller_decides_is_part_of_the_configuration(model, dataset, tmp_
     run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch, schedule=later)
     with pytest.raises(CheckpointError, match="with other schedule;"):
         run(model, dataset, settings, path)
-    one, other = falloff_threshold(0.1), falloff_threshold(0.2)
+    one, other = (lambda o, tau=tau: torch.full_like(o, tau) for tau in (0.1, 0.2))
     path.unlink()
     run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch, rule=one)
     with pytest.raises(CheckpointError, match="with other rule;"):

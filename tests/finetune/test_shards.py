@@ -13,15 +13,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.sharded import ShardedEngine, reaching
 from fragprune_plugins.errors import DivergedError, InputError, UsageError
-from fragprune_plugins.finetuning import Checkpoints, finetune, loop
-from fragprune_plugins.finetuning.processes import Shards, part_of, whole_of
 from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage.models import Model
 from fragprune_plugins.types import RasterInputs, Splats
+from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.processes import Shards, part_of, whole_of
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+from fragprune_plugins.workbench.finetune.sharded import ShardedEngine, reaching
+from fragprune_plugins.workbench.models.model import Model
 
 STEPS = 12
 ATTRIBUTES = ("means", "opacities", "scales", "rotations", "sh")

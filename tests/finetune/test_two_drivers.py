@@ -15,13 +15,13 @@ import pytest
 import torch
 from miniatures.vanilla_3dgs import running
 
-from fragprune_plugins.datasets.dataset import Dataset, Shot
-from fragprune_plugins.finetuning import finetune
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.storage.ply import read_ply
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 STEPS = 24
 

@@ -13,10 +13,10 @@ import torch
 from PIL import Image
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.datasets.dataset import Dataset, Photograph
-from fragprune_plugins.datasets.pinhole import Camera
-from fragprune_plugins.storage.ply import SplatFile, write_ply
+from fragprune_plugins.files.ply import SplatFile, write_ply
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph
+from fragprune_plugins.workbench.scenes.pinhole import Camera
 
 SIDE = 32
 FOCAL = 36.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from hypothesis import strategies as st
 
-from fragprune_plugins.storage.ply import SplatFile
+from fragprune_plugins.files.ply import SplatFile
 
 
 def random_splat(count: int, degree: int, seed: int) -> SplatFile:

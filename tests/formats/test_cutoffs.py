@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.storage.cutoffs import STEP, decode, encode
+from fragprune_plugins.workbench.models.cutoffs import STEP, decode, encode
 
 ALL = np.arange(256, dtype=np.uint8)
 

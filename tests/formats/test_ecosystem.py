@@ -17,7 +17,7 @@ from formats.scenes import apart, random_splat
 from fuzz.seeds import spz_parts
 
 from fragprune_plugins import Model, ThresholdStore, load, save
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.files.ply import write_ply
 
 pytestmark = [pytest.mark.npm, pytest.mark.timeout(600)]
 

@@ -18,9 +18,10 @@ from hypothesis import HealthCheck, given, settings
 
 from fragprune_plugins import Model, ThresholdStore, load, save
 from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
-from fragprune_plugins.storage import cutoffs, formats, sidecar
-from fragprune_plugins.storage.formats.values import morton_order, turned
-from fragprune_plugins.storage.ply import read_ply, write_ply
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.workbench.models import cutoffs, formats
+from fragprune_plugins.workbench.models.formats.values import morton_order, turned
 
 # Half a step of each format's own quantisation, with the values that ``random_splat`` has.
 # xyz lie within 8 (16 across), colours within 0.5 +- 0.43, log scales within -7 to 1.
@@ -163,8 +164,8 @@ def test_axes_that_turn_twice_are_as_they_were():
 def test_a_turned_scene_looks_the_same_from_a_turned_camera():
     """The SH signs, against an evaluation of the basis at turned directions."""
     from fragprune_plugins import rasterize
-    from fragprune_plugins.datasets.pinhole import Camera
     from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.workbench.scenes.pinhole import Camera
 
     splat, camera = tiny.random_model(degree=3), tiny.cameras(9)[2]
     signs = (-1, -1, 1)
@@ -236,7 +237,7 @@ def test_what_is_not_followed_is_named(tmp_path, caplog):
 def test_more_gaussians_than_a_file_can_hold_are_not_allocated(tmp_path):
     import struct
 
-    from fragprune_plugins.storage.formats.spz import zstd
+    from fragprune_plugins.workbench.models.formats.spz import zstd
 
     path, count = tmp_path / "a.spz", 100_000_000
     save(path, Model(random_splat(5, 0, 0)))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.cluster.vq import kmeans2
 
-from fragprune_plugins.storage.formats.palette import codebook, nearest, palette
+from fragprune_plugins.workbench.models.formats.palette import codebook, nearest, palette
 
 seeds = st.integers(0, 1 << 31)
 

@@ -16,8 +16,8 @@ from formats.scenes import random_splat
 from PIL import Image
 
 from fragprune_plugins import Model, ThresholdStore, load, save
-from fragprune_plugins.storage import cutoffs
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.models import cutoffs
 
 PAGE = (Path(__file__).parents[2] / "docs/reference/cutoff.md").read_text(encoding="utf-8")
 COUNT = 30

@@ -15,21 +15,22 @@ from finetune import tiny
 from fuzz import seeds
 from miniatures.vanilla_3dgs import HOST
 
-from fragprune_plugins.cli import finetune, report
-from fragprune_plugins.datasets import colmap
-from fragprune_plugins.datasets.cameras import load_cameras
-from fragprune_plugins.datasets.dataset import Photograph
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.cost import UNITS, Cost
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files import checkpoints, records, sidecar
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.graphdeco.output import trained_on
 from fragprune_plugins.hosts.preflight import missing_imports
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import resumed_at
-from fragprune_plugins.measure.recorded import recorded
-from fragprune_plugins.storage import checkpoints, models, records, sidecar
 from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.workbench import finetune, report
+from fragprune_plugins.workbench.figures.recorded import recorded
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.prices.cost import UNITS, Cost
+from fragprune_plugins.workbench.scenes import colmap
+from fragprune_plugins.workbench.scenes.cameras import load_cameras
+from fragprune_plugins.workbench.scenes.dataset import Photograph
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 

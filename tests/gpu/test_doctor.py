@@ -10,10 +10,10 @@ import torch
 from click.testing import CliRunner
 
 from fragprune_plugins import engines
-from fragprune_plugins.cli import cli
 from fragprune_plugins.engines.cuda import driver, kernels, self_check
 from fragprune_plugins.engines.cuda.self_check import Verdict
 from fragprune_plugins.errors import EngineError
+from fragprune_plugins.workbench.commands import cli
 
 
 class Compiler:

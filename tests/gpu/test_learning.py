@@ -8,9 +8,9 @@ from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cuda.engine import CudaEngine
-from fragprune_plugins.finetuning import finetune
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.measure import Candidate, measure
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+from fragprune_plugins.workbench.finetune.loop import finetune
 
 
 def test_learned_and_measured_as_on_the_cpu(engine: CudaEngine, tmp_path) -> None:

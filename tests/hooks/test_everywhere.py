@@ -12,14 +12,14 @@ from finetune import tiny
 
 import fragprune_plugins
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.finetuning import finetune
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.measure import Candidate, evaluate
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import write_ply
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.figures.evaluate import Candidate, evaluate
+from fragprune_plugins.workbench.finetune.loop import finetune
 
 CUT_ALL = 0.999999
 HOST = fragprune_plugins.__path__[0] + "/demo/host/train.py"

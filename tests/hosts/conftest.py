@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 
 @pytest.fixture(scope="session")

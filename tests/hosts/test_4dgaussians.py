@@ -37,8 +37,8 @@ import torch
 torch.set_num_threads(1)
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 host, data, out, *flags = sys.argv[1:]
 names = ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")
 with contextlib.redirect_stdout(sys.stderr):

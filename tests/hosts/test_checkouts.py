@@ -134,9 +134,9 @@ from dataclasses import replace
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from fragprune_plugins.storage import sidecar
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.schedule import Settings
 
 host, data, out = (Path(argument) for argument in sys.argv[1:4])
@@ -322,7 +322,7 @@ from pathlib import Path
 import torch
 torch.set_num_threads(1)
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.storage import sidecar
+from fragprune_plugins.files import sidecar
 host, out = Path(sys.argv[1]), Path(sys.argv[2])
 def pictures():
     run([str(host / "render.py"), "-m", str(out), "--skip_train"], RunOptions(device="cpu"))

@@ -17,7 +17,7 @@ import pytest
 import torch
 from installed.gsplat_host import releases
 
-from fragprune_plugins.storage import sidecar
+from fragprune_plugins.files import sidecar
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -43,9 +43,9 @@ from pathlib import Path
 from types import ModuleType
 import torch
 torch.set_num_threads(1)
-from fragprune_plugins.storage import sidecar
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.schedule import Settings
 
 def absent(name, **members):

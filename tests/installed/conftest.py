@@ -7,9 +7,9 @@ import pytest
 from installed.gaussian_splatting_host import GaussianSplattingHost
 from installed.gsplat_host import GsplatHost
 
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.testing.host import running
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 DRIVERS = {"gaussian-splatting": GaussianSplattingHost, "gsplat": GsplatHost}
 

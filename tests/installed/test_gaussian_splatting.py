@@ -12,11 +12,11 @@ from installed.gaussian_splatting_host import GaussianSplattingHost
 
 from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_plugins.errors import SessionError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 PARAMETERS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")

@@ -20,13 +20,13 @@ from installed.gsplat_host import draw as drawn_by_gsplat
 
 from fragprune_gsplat import Gsplat
 from fragprune_gsplat.projection import covariances
-from fragprune_plugins.cli import cli
 from fragprune_plugins.errors import InputError, SessionError, SidecarError, UsageError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
-from fragprune_plugins.storage import sidecar
-from fragprune_plugins.storage.ply import read_ply
+from fragprune_plugins.workbench.commands import cli
 
 WIDTH, HEIGHT = 48, 32
 LOOP = Path(__file__).parents[2] / "docs" / "how-to" / "gsplat_loop.py"

@@ -13,12 +13,12 @@ from installed.gsplat_host import releases
 
 from fragprune_gsplat import Gsplat
 from fragprune_gsplat.trainer import SimpleTrainer
-from fragprune_plugins.datasets.photographs import Photographs
 from fragprune_plugins.errors import EngineError, NotComparedError, SidecarError, UsageError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage import sidecar
 
 SCRIPT = Path(__file__).parents[1] / "miniatures" / "simple_trainer.py"
 RELEASES = releases()

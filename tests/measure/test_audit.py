@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 
 from fragprune_plugins.engines.reference import ReferenceEngine, fragments
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.measure.audit import (
+from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.audit.audit import (
     AS_IT_IS,
     HALF_LEVEL,
     HONOURING,
@@ -24,9 +26,7 @@ from fragprune_plugins.measure.audit import (
     audit,
     weigh,
 )
-from fragprune_plugins.plugins.hooks import engine_for
-from fragprune_plugins.storage.models import Model
-from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.models.model import Model
 from reference_renderer.composite import transmittances
 
 ENGINE = engine_for("auto", "cpu")

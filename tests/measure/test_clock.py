@@ -8,11 +8,12 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins.bench import timing
-from fragprune_plugins.bench.scene import make_scene, make_view
-from fragprune_plugins.bench.timing import Case
-from fragprune_plugins.engines import clock, create_engine
-from fragprune_plugins.measure import Candidate, measure
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.workbench.bench import timing
+from fragprune_plugins.workbench.bench.timing import Case
+from fragprune_plugins.workbench.figures import clock
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
 
 class Notes:

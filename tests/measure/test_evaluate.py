@@ -8,8 +8,8 @@ from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.measure import Candidate, evaluate, measure
-from fragprune_plugins.measure.pictures import save_heatmap, save_image, save_panel
+from fragprune_plugins.workbench.figures.evaluate import Candidate, evaluate, measure
+from fragprune_plugins.workbench.figures.pictures import save_heatmap, save_image, save_panel
 
 NAMES = {
     "target",

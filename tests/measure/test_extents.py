@@ -9,9 +9,9 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.measure.extents import CUTS, SQRT8, VIEWERS, Extent, Viewer, shaded
-from fragprune_plugins.storage.ply import SplatFile
+from fragprune_plugins.files.ply import SplatFile
 from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.workbench.figures.extents import CUTS, SQRT8, VIEWERS, Extent, Viewer, shaded
 
 BY_NAME = {viewer.names.split(",")[0]: viewer for viewer in VIEWERS}
 

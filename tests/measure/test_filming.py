@@ -13,9 +13,9 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.datasets.generated import bounds
-from fragprune_plugins.measure.filming import along, orbit, write_mp4
-from fragprune_plugins.storage.ply import write_ply
+from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.render.filming import along, orbit, write_mp4
+from fragprune_plugins.workbench.scenes.generated import bounds
 
 
 def frames_of(path):

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.measure import lpips, metrics, psnr, ssim
+from fragprune_plugins.workbench.figures import metrics
+from fragprune_plugins.workbench.figures.metrics import lpips, psnr, ssim
 
 
 def test_psnr_of_a_known_error():

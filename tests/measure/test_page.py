@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from fragprune_plugins.measure import page
-from fragprune_plugins.measure.pictures import colour_stops, save_map
+from fragprune_plugins.workbench.figures import page
+from fragprune_plugins.workbench.figures.pictures import colour_stops, save_map
 
 ODD = "<b>\"&'</b>"
 VOID = {"meta", "img", "input", "link", "br"}

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fragprune_plugins.measure.pictures import BESIDE, stems
-from fragprune_plugins.measure.wording import nothing_drawn
+from fragprune_plugins.workbench.figures.pictures import BESIDE, stems
+from fragprune_plugins.workbench.figures.wording import nothing_drawn
 
 
 @pytest.mark.parametrize(

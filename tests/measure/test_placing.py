@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from fragprune_plugins.measure.placing import place
+from fragprune_plugins.files.ply import SplatFile
 from fragprune_plugins.plugins.hooks import engine_for
-from fragprune_plugins.storage.ply import SplatFile
+from fragprune_plugins.workbench.audit.placing import place
 
 ENGINE = engine_for("auto", "cpu")
 

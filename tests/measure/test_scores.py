@@ -12,9 +12,9 @@ from oracle import naive
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.measure import scores
-from fragprune_plugins.storage.models import Model
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.pruning import scores
 
 COUNT = 20
 VIEWS = [

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.measure import searching
-from fragprune_plugins.measure.searching import (
+from fragprune_plugins.workbench.finetune import searching
+from fragprune_plugins.workbench.finetune.searching import (
     TOLERANCE,
     TRAININGS,
     Trial,

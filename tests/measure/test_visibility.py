@@ -15,8 +15,8 @@ from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.measure.visibility import drop_invisible, visible
 from fragprune_plugins.types import RasterInputs, Splats
+from fragprune_plugins.workbench.pruning.visibility import drop_invisible, visible
 
 VIEWS = [camera.view() for camera in tiny.cameras()]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fragprune_plugins.measure.wording import describe, fewer, gain, outcome
+from fragprune_plugins.workbench.figures.wording import describe, fewer, gain, outcome
 
 
 def measured(fragments, ms, psnr, error=0.01):

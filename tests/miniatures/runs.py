@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import RunOptions
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.storage.ply import read_ply
 from fragprune_plugins.testing import Host
 
 TINY = [

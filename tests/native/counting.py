@@ -155,8 +155,8 @@ def scene(
     """
     import torch
 
-    from fragprune_plugins.bench.scene import make_scene, make_view
     from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
     splats, view = make_scene(gaussians).splats(), make_view(size, size)
     thresholds = torch.full((gaussians,), falloff) if falloff else None
@@ -167,9 +167,9 @@ def main() -> None:
     """Count and print."""
     import torch
 
-    from fragprune_plugins.datasets.cameras import load_cameras
-    from fragprune_plugins.storage.ply import read_ply
+    from fragprune_plugins.files.ply import read_ply
     from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
     parser.add_argument("--size", type=int, action="append")

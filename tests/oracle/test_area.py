@@ -12,8 +12,8 @@ from oracle import naive
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.learning.area import ellipse_areas
-from fragprune_plugins.measure import covered_per_pixel
 from fragprune_plugins.testing import scenes
+from fragprune_plugins.workbench.figures.evaluate import covered_per_pixel
 
 F64 = torch.float64
 WIDTH, HEIGHT = 112, 80

@@ -21,11 +21,11 @@ from miniatures.runs import OPTIONS, command, edit, written
 from patching.traces import Snapshot, warm_up
 
 import fragprune_plugins
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
 from fragprune_plugins.errors import FragpruneError, HostFailed, Interrupted
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing import Host
 from fragprune_plugins.testing.fresh import fresh
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 STEP = "        loss.backward()\n"
 FAIL = "        if iteration == 9:\n            note()\n            raise ValueError('theirs')\n"

@@ -11,12 +11,12 @@ import pytest
 from finetune import several
 from miniatures.runs import OPTIONS, command, edit, written
 
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
 from fragprune_plugins.errors import RanksError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.storage import sidecar
 from fragprune_plugins.testing import Host
 from fragprune_plugins.testing.fresh import fresh
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 WORKERS = """
 import json

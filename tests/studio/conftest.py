@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from fragprune_plugins.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 
 def pytest_collection_modifyitems(items):

@@ -24,9 +24,10 @@ from plyfile import PlyData
 import fragprune_plugins
 from fragprune_nerfstudio import METHOD
 from fragprune_plugins.errors import AlignmentError, SidecarError, UsageError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.session import active_session
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.storage import models, sidecar
+from fragprune_plugins.workbench.models import model as models
 
 pytestmark = [pytest.mark.nerfstudio, pytest.mark.filterwarnings("ignore")]
 
@@ -504,7 +505,7 @@ def test_from_a_command_for_splatfacto_to_a_model_that_fragprune_reads(scene, tm
 
 KILLED = """
 import signal, sys
-from fragprune_plugins.cli import cli
+from fragprune_plugins.workbench.commands import cli
 from fragprune_plugins.injection import stepping
 
 report = stepping.report

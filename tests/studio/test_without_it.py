@@ -16,10 +16,10 @@ from fragprune_nerfstudio.command import rewritten
 from fragprune_nerfstudio.exporting import COLUMNS, rows_among, rows_exported
 from fragprune_plugins import Settings
 from fragprune_plugins.errors import AlignmentError, UsageError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import command, saving, session
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage import sidecar
 
 # -- what it costs whoever has no nerfstudio
 
@@ -106,7 +106,7 @@ def test_what_cannot_be_asked_for_is_refused(words, options, remedy):
 
 
 def test_a_command_that_pip_installed_is_run_as_its_module(monkeypatch):
-    entry = SimpleNamespace(module="fragprune_plugins.cli.run")
+    entry = SimpleNamespace(module="fragprune_plugins.workbench.run")
     asked = []
 
     def installed(**words):
@@ -115,7 +115,7 @@ def test_a_command_that_pip_installed_is_run_as_its_module(monkeypatch):
 
     monkeypatch.setattr(command, "entry_points", installed)
     script, arguments, module = command.split(["ns-train", "splatfacto", "--x"])
-    assert (arguments, module) == (["splatfacto", "--x"], "fragprune_plugins.cli.run")
+    assert (arguments, module) == (["splatfacto", "--x"], "fragprune_plugins.workbench.run")
     assert script.parts[-2:] == ("cli", "run.py")
     assert asked == [{"group": "console_scripts", "name": "ns-train"}]
 

@@ -10,8 +10,8 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.storage.models import Model
-from fragprune_plugins.viewer.packing import pack, words_per_gaussian
+from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.view.packing import pack, words_per_gaussian
 
 
 def read(data, facts):

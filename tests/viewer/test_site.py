@@ -9,8 +9,8 @@ import pytest
 from finetune import tiny
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.storage.models import Model
-from fragprune_plugins.viewer import site as sites
+from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.view import site as sites
 
 
 @pytest.fixture

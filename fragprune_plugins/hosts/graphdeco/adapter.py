@@ -10,7 +10,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.errors import ModelFileError, NotComparedError
 from fragprune_plugins.hosts.adapter import (
     CHECKPOINT_KEY,
@@ -23,13 +22,14 @@ from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_plugins.hosts.graphdeco.densifying import clones, splits
 from fragprune_plugins.hosts.graphdeco.output import WIDEST
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import Function, HostRepo
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.storage.ply import SplatFile
+    from fragprune_plugins.files.ply import SplatFile
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
@@ -331,7 +331,7 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def read_model(self, ply: Path) -> SplatFile:
         """The host's own PLY."""
-        from fragprune_plugins.storage.ply import read_ply
+        from fragprune_plugins.files.ply import read_ply
 
         return read_ply(ply)
 
@@ -339,7 +339,7 @@ class GraphdecoAdapter(ScriptAdapter):
         """Write the tuple of ``captured``."""
         import torch
 
-        from fragprune_plugins.storage.atomic import replacing
+        from fragprune_plugins.files.atomic import replacing
 
         capture = self.captured(ply)
         with replacing(target) as temporary:
@@ -349,7 +349,7 @@ class GraphdecoAdapter(ScriptAdapter):
         """The host's ``capture`` of a PLY: fresh moments, and the sidecar's thresholds."""
         import torch
 
-        from fragprune_plugins.storage import sidecar
+        from fragprune_plugins.files import sidecar
 
         m = self.read_model(ply)
         rows = len(m.xyz)

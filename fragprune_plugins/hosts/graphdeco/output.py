@@ -12,10 +12,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.datasets.photographs import Photographs, Resolution
 from fragprune_plugins.errors import DatasetError, ModelFileError, printable
+from fragprune_plugins.files.reading import MEBIBYTE, Door
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import parsed
-from fragprune_plugins.storage.reading import MEBIBYTE, Door
 
 WIDEST = 1600
 """Pixels: hosts shrink wider images to this width where no size is asked for (-r -1)."""

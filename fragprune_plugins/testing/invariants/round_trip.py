@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from fragprune_plugins.errors import SidecarError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.seams import Role
-from fragprune_plugins.storage import sidecar
 from fragprune_plugins.testing.host import Running, alone, joint, running, tensors
 from fragprune_plugins.testing.invariants.case import Case, require
 

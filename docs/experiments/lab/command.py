@@ -1,0 +1,274 @@
+"""``fragprune experiment``: runs a named experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.interruption import sigterm_interrupts
+from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS
+from fragprune_plugins.workbench.commands.common import (
+    FILE,
+    MODEL,
+    Command,
+    Function,
+    Group,
+    Number,
+    Report,
+    data_options,
+    engine_option,
+    engine_options,
+    open_engine,
+    photographs_for,
+    threads_option,
+    together,
+)
+from lab.catalogue import EXPERIMENTS, QUESTIONS
+
+if TYPE_CHECKING:
+    from lab.folder import Findings
+
+
+@click.group("experiment", cls=Group, subcommand_metavar="NAME [ARGS]...")
+def command() -> None:
+    """Answer one question by a reproducible experiment.
+
+    Each writes a table (Markdown and CSV), a plot and its exact configuration into a folder, and
+    keeps what is finished in OUT/arms: after an interruption the same command does only what is
+    missing. A folder that was begun in another configuration is refused.
+
+    \b
+    Examples:
+      fragprune experiment rules point_cloud.ply --data scene --out experiments --seeds 0,1,2
+      fragprune experiment overfitting --help
+    """
+
+
+def _seeds(ctx: click.Context, param: click.Parameter, value: str) -> tuple[int, ...]:
+    """Whole numbers from a word such as "0,1,2", each once."""
+    try:
+        return tuple(dict.fromkeys(int(part) for part in value.split(",")))
+    except ValueError as error:
+        raise click.BadParameter(f"{value!r} is not a list such as 0,1,2.") from error
+
+
+_out_option = click.option(
+    "--out", type=FILE, required=True, help="Folder for the table, plot, configuration and arms."
+)
+
+
+def _seeds_option(default: str) -> Callable[[Function], Function]:
+    return click.option(
+        "--seeds",
+        default=default,
+        show_default=True,
+        metavar="N,N,...",
+        callback=_seeds,
+        help="Train every arm once for each of these seeds.",
+    )
+
+
+_training_options = together(
+    click.argument("model", type=MODEL),
+    data_options,
+    _out_option,
+    click.option(
+        "--iters",
+        type=click.IntRange(min=1),
+        help=f"Iterations of the longest arms; default {FINETUNE_ITERATIONS}.",
+    ),
+    click.option(
+        "--scale",
+        type=Number(min=0, min_open=True),
+        help="Multiply the default iterations by this instead.",
+    ),
+    click.option(
+        "--train",
+        type=click.Choice(["opacity", "appearance", "all"]),
+        help="Parameters that move in every arm; default all. Not for moves.",
+    ),
+    _seeds_option("0"),
+    engine_options,
+)
+
+_TRAINING = """{asks}
+
+Trains MODEL in several ways and compares them on held-out views, with controls of equal length.
+Frames are timed at the photographs' size and with sides four times as long.
+
+\b
+Example:
+  fragprune experiment {name} point_cloud.ply --data scene --out experiments --seeds 0,1,2
+"""
+
+
+def _train(
+    name: str,
+    model: Path,
+    data: Path | None,
+    images: str,
+    resolution: int,
+    white_background: bool,
+    out: Path,
+    iters: int | None,
+    scale: float | None,
+    train: Any,
+    seeds: tuple[int, ...],
+    engine: str,
+    device: str,
+    threads: int | None,
+) -> Report:
+    """Run an experiment that compares trainings."""
+    if iters is not None and scale is not None:
+        raise UsageError("options", "--iters with --scale", "one of the two", "Remove one.")
+    longest = iters or max(1, round(FINETUNE_ITERATIONS * (1.0 if scale is None else scale)))
+    experiment = EXPERIMENTS[name](longest, train)
+
+    from lab import results, running
+
+    rasterizer, where = open_engine(engine, device, threads)
+    photographs = photographs_for(model, data, images, resolution, white_background)
+    with sigterm_interrupts():
+        folder, outcomes = running.run(
+            experiment,
+            model,
+            photographs,
+            out,
+            engine=rasterizer,
+            device=where,
+            seeds=seeds,
+            progress=True,
+        )
+    return _report(results.findings(experiment, outcomes, folder))
+
+
+def _report(found: Findings) -> Report:
+    """Write what an experiment found, and report it."""
+    files = found.publish()
+    data = {
+        "experiment": found.folder.name,
+        "asks": found.asks,
+        "rows": found.rows,
+        "configuration": found.folder.asked,
+        "files": [str(file) for file in files],
+    }
+    return Report(data, f"{found.asks}\n\n{found.table}\n\nWrote {', '.join(map(str, files))}.")
+
+
+for _name, _make in EXPERIMENTS.items():
+    _asks = _make(FINETUNE_ITERATIONS, None).asks
+    command.command(
+        _name, cls=Command, short_help=_asks, help=_TRAINING.format(asks=_asks, name=_name)
+    )(_training_options(partial(_train, _name)))
+
+
+@command.command("signals", cls=Command, short_help=QUESTIONS["signals"])
+@_out_option
+@click.option(
+    "--iters",
+    type=click.IntRange(min=2),
+    default=1000,
+    show_default=True,
+    help="Steps of every fit.",
+)
+@_seeds_option("0,1,2,3,4")
+@engine_option("Engine that draws, on the CPU")
+@threads_option
+def _fit_signals(
+    out: Path, iters: int, seeds: tuple[int, ...], engine: str, threads: int | None
+) -> Report:
+    """Fit lines and small pictures with Gaussians and with truncated ones.
+
+    It needs no model and no photographs, and takes some minutes. A square wave, a step, a smooth
+    line, a line of a photograph, and pictures of each kind are fitted with few primitives; as many
+    parameters are compared too. Every other pixel is held out.
+
+    \b
+    Example:
+      fragprune experiment signals --out experiments
+    """
+    from lab import signals
+
+    drawer, _ = open_engine(engine, "cpu", threads)
+    return _report(signals.run(out, engine=drawer, seeds=seeds, iterations=iters, progress=True))
+
+
+_views_options = together(
+    click.argument("models", metavar="MODEL...", type=MODEL, nargs=-1, required=True),
+    data_options,
+    _out_option,
+    engine_options,
+)
+
+
+@command.command("stages", cls=Command, short_help=QUESTIONS["stages"])
+@_views_options
+@click.option(
+    "--repeats", type=click.IntRange(min=2), default=15, show_default=True, help="Timed rounds."
+)
+def _time_stages(
+    models: tuple[Path, ...],
+    data: Path | None,
+    images: str,
+    resolution: int,
+    white_background: bool,
+    out: Path,
+    engine: str,
+    device: str,
+    threads: int | None,
+    repeats: int,
+) -> Report:
+    """Time the stages of frames on held-out views, from 256 pixels to 4K.
+
+    Every MODEL is drawn with the thresholds stored beside it, all of them in turns. One MODEL alone
+    is drawn without its thresholds too. Use an idle machine.
+
+    \b
+    Example:
+      fragprune experiment stages point_cloud.ply pruned.ply --data scene --out experiments
+    """
+    from lab import stages
+
+    drawer, where = open_engine(engine, device, threads)
+    photographs = photographs_for(models[0], data, images, resolution, white_background)
+    return _report(
+        stages.run(
+            models, photographs, out, engine=drawer, device=where, repeats=repeats, progress=True
+        )
+    )
+
+
+@command.command("fragments", cls=Command, short_help=QUESTIONS["fragments"])
+@_views_options
+def _count_fragments(
+    models: tuple[Path, ...],
+    data: Path | None,
+    images: str,
+    resolution: int,
+    white_background: bool,
+    out: Path,
+    engine: str,
+    device: str,
+    threads: int | None,
+) -> Report:
+    """Count fragments by Gaussian, opacity, size and weight on held-out views.
+
+    Every MODEL is drawn with the thresholds stored beside it. One MODEL alone is drawn without its
+    thresholds too.
+
+    \b
+    Example:
+      fragprune experiment fragments point_cloud.ply pruned.ply --data scene --out experiments
+    """
+    from lab import fragments
+
+    drawer, where = open_engine(engine, device, threads)
+    photographs = photographs_for(models[0], data, images, resolution, white_background)
+    return _report(
+        fragments.run(models, photographs, out, engine=drawer, device=where, progress=True)
+    )

@@ -1,1 +1,0 @@
-"""Benchmarks: a reproducible scene, medians with their spread, ratios within one run."""

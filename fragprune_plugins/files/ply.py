@@ -1,0 +1,367 @@
+"""Trained splats on disk: the PLY layout that all descendants of 3DGS share.
+
+One ``vertex`` element of float32 columns, values before activation: x y z, nx ny nz (zeros),
+f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
+(logit), scale_0..2 (log), rot_0..3 (w x y z, any length). ``fragprune export`` adds one column,
+``trunc_threshold``: the threshold itself, in falloff, in (0, 1). Unknown columns are ignored,
+except Mip-Splatting's ``filter_3D``: such a model is refused unless the caller draws by the rules
+of Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaussians are flat.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import InputError, ModelFileError
+from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
+from fragprune_plugins.files.reading import Door
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import Splats
+
+THRESHOLD_COLUMN = "trunc_threshold"
+
+MARK = "fragprune thresholds lie beside this file (.fragprune.safetensors)"
+"""A comment in the header of each PLY of ours that is half of a pair."""
+
+_XYZ = ("x", "y", "z")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_FILTER = "filter_3D"
+_REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
+_REMEDY = "Pass the point_cloud.ply that a 3DGS training saved."
+_DOOR = Door(
+    ModelFileError,
+    "not readable as PLY",
+    "a complete trained splat (.ply)",
+    "The file is of another kind or was cut off: copy or save it again.",
+    missing=_REMEDY,
+)
+
+LOG_SCALE_MAX = 30.0
+"""Largest logarithm of a standard deviation: 1e13 world units. Projection multiplies it by the
+focal length and squares it, and float32 ends at 1e38."""
+
+_QUATERNION_MIN = 1e-12  # torch's normalize divides by no less
+
+_SHOWN_ROWS = 5  # of those that a message is about
+
+
+@dataclass(frozen=True, eq=False)
+class SplatFile:
+    """A splat with the values of its file: N Gaussians, before activation, float32.
+
+    Attributes:
+        xyz: (N, 3) means, world.
+        f_dc: (N, 1, 3) first SH coefficient.
+        f_rest: (N, K - 1, 3) the other coefficients, K = (degree + 1)^2.
+        opacity: (N, 1) logits.
+        scaling: (N, 3) logarithms of standard deviations; (N, 2) of surfels.
+        rotation: (N, 4) quaternions w, x, y, z of any length.
+        thresholds: (N,) truncation thresholds in (0, 1); None if the file has none.
+        filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units. It widens
+            every axis and lowers the opacity accordingly.
+    """
+
+    xyz: Tensor
+    f_dc: Tensor
+    f_rest: Tensor
+    opacity: Tensor
+    scaling: Tensor
+    rotation: Tensor
+    thresholds: Tensor | None = None
+    filter_3d: Tensor | None = None
+
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz)
+        shapes = {
+            "xyz": (n, 3),
+            "f_dc": (n, 1, 3),
+            "f_rest": (n, self.f_rest.shape[1] if self.f_rest.ndim == 3 else 0, 3),
+            "opacity": (n, 1),
+            "scaling": (n, 2 if tuple(self.scaling.shape[1:]) == (2,) else 3),
+            "rotation": (n, 4),
+            "thresholds": (n,),
+            "filter_3d": (n, 1),
+        }
+        for name, shape in shapes.items():
+            if (part := getattr(self, name)) is not None and tuple(part.shape) != shape:
+                found = tuple(part.shape)
+                raise InputError(f"SplatFile.{name}", f"shape {found}", f"{shape}", "Check it.")
+        if 3 * self.f_rest.shape[1] not in _REST_COUNTS:
+            raise InputError(
+                "SplatFile.f_rest",
+                f"{self.f_rest.shape[1]} coefficients",
+                "0, 3, 8 or 15 (SH degree 0 to 3)",
+                "Check it.",
+            )
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def sh_degree(self) -> int:
+        """The SH degree, 0 to 3, from the number of coefficients."""
+        return _REST_COUNTS[3 * self.f_rest.shape[1]]
+
+    def to(self, device: torch.device | str) -> SplatFile:
+        """The same Gaussians on a device; tensors that are there already are not copied."""
+        moved = {name: each.to(device) for name, each in vars(self).items() if each is not None}
+        return replace(self, **moved)
+
+    def keep(self, mask: Tensor) -> SplatFile:
+        """The rows where mask (N,) bool is True, in their order."""
+        held = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{k: rows[mask] for k, rows in held.items() if rows is not None})
+
+    def splats(self) -> Splats:
+        """The Gaussians after activation, for engines; differentiable."""
+        opacities, scales = torch.sigmoid(self.opacity[:, 0]), torch.exp(self.scaling)
+        if self.filter_3d is not None:
+            wider = (scales.square() + self.filter_3d.square()).sqrt()
+            opacities = opacities * (scales / wider).prod(dim=1)
+            scales = wider
+        return Splats(
+            means=self.xyz,
+            opacities=opacities,
+            scales=scales,
+            rotations=torch.nn.functional.normalize(self.rotation),
+            sh=torch.cat([self.f_dc, self.f_rest], dim=1),
+            sh_degree=self.sh_degree,
+        )
+
+
+def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
+    """Read a trained splat. The number of f_rest columns gives the SH degree.
+
+    Args:
+        path: the file.
+        filtered: accept a model that the caller draws by its host's rules: one with a 3D filter
+            (Mip-Splatting), or of surfels, which have two scales (2D Gaussian Splatting).
+
+    Raises:
+        ModelFileError: missing, truncated, not a PLY, not a Gaussian splat, empty or not finite.
+    """
+    path = Path(path)
+    if path.suffix == ".pth":
+        raise ModelFileError(
+            str(path),
+            "a training codebase's checkpoint, which only that codebase can draw",
+            "a trained splat (.ply)",
+            "Pass its PLY. Fine-tune and draw a host without PLYs (4D models) through its own "
+            "script, with fragprune run.",
+        )
+    with _DOOR.reading(path) as reading:
+        try:
+            columns = read_vertices(reading)
+        except KeyError as error:
+            found = "a PLY without a vertex element"
+            raise ModelFileError(str(path), found, "a Gaussian splat", _REMEDY) from error
+        return _splat(path, columns, filtered)
+
+
+def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
+    """The splat of a file's columns; raises ModelFileError."""
+    names, count = columns.keys(), len(next(iter(columns.values())))
+    scales = _SCALES if _SCALES[2] in names else _SCALES[:2]
+    missing = [name for name in (*_XYZ, *_DC, "opacity", *scales, *_ROTATION) if name not in names]
+    if missing == list(_DC):
+        raise ModelFileError(
+            str(path),
+            "activated Gaussians without colours, from a codebase that keeps colours in a network",
+            "a splat with colours and values before activation",
+            "Fine-tune with fragprune run inside that host.",
+        )
+    if missing:
+        raise ModelFileError(
+            str(path),
+            f"a PLY without {', '.join(missing)}",
+            "the columns of a Gaussian splat",
+            "A point cloud or mesh is not a trained splat. " + _REMEDY,
+        )
+    if scales != _SCALES and not filtered:
+        raise ModelFileError(
+            str(path),
+            "flat Gaussians with two scales, as 2D Gaussian Splatting saves, and no 3D Gaussians",
+            "a splat of 3D Gaussians",
+            "Fine-tune and draw it through its host's own scripts, with fragprune run.",
+        )
+    if _FILTER in names and not filtered:
+        raise ModelFileError(
+            str(path),
+            "a Mip-Splatting model, whose 3D filter (filter_3D) changes shapes and opacities",
+            "a splat that is drawn as it is stored",
+            "Fuse the filter first (create_fused_ply.py there), or fine-tune with fragprune run.",
+        )
+    rest = sorted(
+        (name for name in names if name.startswith("f_rest_") and name[7:].isdecimal()),
+        key=lambda name: (len(name), name),
+    )
+    if len(rest) not in _REST_COUNTS or rest != [f"f_rest_{i}" for i in range(len(rest))]:
+        raise ModelFileError(
+            str(path),
+            f"{len(rest)} f_rest columns",
+            "0, 9, 24 or 45 (SH degree 0 to 3), numbered from 0",
+            _REMEDY,
+        )
+    if count == 0:
+        raise ModelFileError(str(path), "0 Gaussians", "at least one", _REMEDY)
+
+    def column(*wanted: str) -> Tensor:
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is refused
+            data = np.stack([columns[name].astype(np.float32) for name in wanted], axis=1)
+        _require_finite(path, wanted, data)
+        return torch.from_numpy(data)
+
+    splat = SplatFile(
+        xyz=column(*_XYZ),
+        f_dc=column(*_DC)[:, None, :],
+        f_rest=(
+            column(*rest).reshape(count, 3, -1).transpose(1, 2).contiguous()
+            if rest
+            else torch.zeros(count, 0, 3)
+        ),
+        opacity=column("opacity"),
+        scaling=column(*scales),
+        rotation=column(*_ROTATION),
+        thresholds=(
+            _checked_thresholds(path, column(THRESHOLD_COLUMN)[:, 0])
+            if THRESHOLD_COLUMN in names
+            else None
+        ),
+        filter_3d=column(_FILTER) if _FILTER in names else None,
+    )
+    expect_drawable(path, splat)
+    return splat
+
+
+def write_ply(
+    path: Path, model: SplatFile, thresholds: Tensor | None = None, *, marked: bool = False
+) -> None:
+    """Write a splat atomically in the hosts' layout, with the exact values that ``read_ply`` gave.
+
+    Args:
+        path: the file; an existing one is replaced only when the new one is complete.
+        model: the Gaussians.
+        thresholds: (N,) for the last column ``trunc_threshold``; None for no such column.
+        marked: note in the header that a sidecar with thresholds belongs to the file.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    from plyfile import PlyData, PlyElement
+
+    n = len(model)
+    rest = model.f_rest.transpose(1, 2).reshape(n, -1)
+    columns: list[tuple[tuple[str, ...], Tensor]] = [
+        (_XYZ, model.xyz),
+        (("nx", "ny", "nz"), torch.zeros(n, 3)),
+        (_DC, model.f_dc[:, 0]),
+        (tuple(f"f_rest_{i}" for i in range(rest.shape[1])), rest),
+        (("opacity",), model.opacity),
+        (_SCALES[: model.scaling.shape[1]], model.scaling),
+        (_ROTATION, model.rotation),
+    ]
+    if model.filter_3d is not None:
+        columns.append(((_FILTER,), model.filter_3d))
+    if thresholds is not None:
+        columns.append(((THRESHOLD_COLUMN,), thresholds.reshape(n, 1)))
+    names = [name for group, _ in columns for name in group]
+    table = torch.cat([values.detach().cpu().float() for _, values in columns], dim=1)
+    rows = np.ascontiguousarray(table.numpy()).view([(name, "<f4") for name in names])[:, 0]
+    # An element's comments come after its line: some viewers read the number of Gaussians off the
+    # header's third line, whatever it says.
+    vertices = PlyElement.describe(rows, "vertex", comments=[MARK] if marked else [])
+    with replacing(path) as temporary:
+        PlyData([vertices], byte_order="<").write(str(temporary))
+
+
+def is_marked(path: Path) -> bool:
+    """Whether a file is a PLY with the mark that its thresholds are in a sidecar.
+
+    A file with a column of thresholds needs no sidecar, so it does not count as marked.
+    """
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        head = file.read(HEADER_MAX)
+    try:
+        lines = [line.strip() for line in header_lines(head)[0]]
+    except ValueError:
+        return False
+    column = any(line.endswith(f" {THRESHOLD_COLUMN}".encode()) for line in lines)
+    return f"comment {MARK}".encode() in lines and not column
+
+
+def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, Any]) -> None:
+    bad = ~np.isfinite(data)
+    if bad.any():
+        columns = bad.any(axis=0) if len(names) == bad.shape[1] else [True]
+        where = ", ".join(n for n, b in zip(names, columns, strict=True) if b)
+        raise ModelFileError(
+            str(path),
+            f"NaN or infinity in {_rows(torch.from_numpy(bad.any(axis=1)), where)}",
+            "finite numbers",
+            "The training that wrote it diverged; use an earlier checkpoint.",
+        )
+
+
+def expect_drawable(path: Path, splat: SplatFile) -> None:
+    """Check values that were read from a file.
+
+    Raises:
+        ModelFileError: a value is not finite, or a Gaussian's scales or rotation cannot be drawn as
+            they are.
+    """
+    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
+        values = getattr(splat, name)
+        _require_finite(path, (name,), values.reshape(len(splat), -1).numpy())
+    if splat.thresholds is not None:
+        _checked_thresholds(path, splat.thresholds)
+    vast = (splat.scaling > LOG_SCALE_MAX).any(dim=1)
+    if splat.filter_3d is not None:
+        vast |= splat.filter_3d[:, 0].abs() > math.exp(LOG_SCALE_MAX)
+    length = splat.rotation.norm(dim=1)
+    for wrong, found, expected in (
+        (vast, "scales", f"logarithms of world units, at most {LOG_SCALE_MAX:g}"),
+        (~(length >= _QUATERNION_MIN), "quaternions of length 0", "rotations w, x, y, z"),
+        (length.isinf(), "quaternions too long to normalise", "rotations w, x, y, z"),
+    ):
+        if wrong.any():
+            raise ModelFileError(
+                str(path),
+                f"{found} that nothing can be drawn with in {_rows(wrong)}",
+                expected,
+                "Remove these rows, or use an earlier checkpoint.",
+            )
+
+
+def _rows(wrong: Tensor, columns: str = "") -> str:
+    """How many rows are wrong (N,) bool, in which columns, and the first of them, from 0."""
+    rows = wrong.nonzero()[:, 0]
+    listed = ", ".join(map(str, rows[:_SHOWN_ROWS].tolist()))
+    more = ", ..." if len(rows) > _SHOWN_ROWS else ""
+    where = f" ({columns})" if columns else ""
+    return f"{len(rows)} of {len(wrong)} rows{where}: {listed}{more}"
+
+
+def _checked_thresholds(path: Path, values: Tensor) -> Tensor:
+    outside = ~((values > 0) & (values < 1))
+    if outside.any():
+        raise ModelFileError(
+            str(path),
+            f"{THRESHOLD_COLUMN} outside (0, 1) in {_rows(outside)}",
+            "falloff thresholds in (0, 1)",
+            "Export the model again with fragprune export.",
+        )
+    return values

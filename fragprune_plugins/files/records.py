@@ -1,0 +1,191 @@
+"""Records: the figures of a command as JSON beside its result, for ``fragprune report``."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.errors import RecordError
+from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
+
+SUFFIX = ".fragprune.json"
+FORMAT = "fragprune-record-1"
+DOOR = Door(
+    RecordError, "unreadable", f"a file of format {FORMAT}", "Remove it.", limit=64 * MEBIBYTE
+)
+"""``DOOR.stated(record.path)`` is around whatever takes values out of a record."""
+
+_SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
+
+
+@dataclass(frozen=True)
+class Record:
+    """The figures of one command.
+
+    Attributes:
+        path: the record's file.
+        command: the command that wrote it: run, finetune, compare or profile.
+        data: the command's --json output, and further data for the page.
+    """
+
+    path: Path
+    command: str
+    data: dict[str, Any]
+
+
+def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
+    """Write a record beside a result; it replaces an earlier record.
+
+    Paths in it become relative to its folder, see ``portable``: a record may be given away.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    target = path_beside(model)
+    content = {"format": FORMAT, "command": command, "data": portable(data, target.parent)}
+    with replacing(target, durable=True) as temporary:
+        temporary.write_text(json.dumps(strict(content), indent=1) + "\n", encoding="utf-8")
+    return target
+
+
+def path_beside(result: Path) -> Path:
+    """The path of a result's record."""
+    return Path(result).with_suffix(SUFFIX)
+
+
+def beside(result: Path) -> Record | None:
+    """Read the record of a result; None if there is none or the result was rewritten since.
+
+    Raises:
+        RecordError: the record cannot be read.
+    """
+    path = path_beside(result)
+    if not os.path.exists(path) or path.stat().st_mtime_ns < result.stat().st_mtime_ns:
+        return None
+    return _read(path)
+
+
+def find(folder: Path) -> list[Record]:
+    """Read all records in a folder and below, oldest first. Links out of the folder are not read.
+
+    Raises:
+        RecordError: there is no record, or a record cannot be read.
+    """
+    found = files(folder, below=True)
+    if not found:
+        raise RecordError(
+            str(folder),
+            f"no file *{SUFFIX} in it or below",
+            "an output folder of fragprune run, finetune, or of compare and profile with --out",
+            "Run one of these first.",
+        )
+    return [_read(path) for path in found]
+
+
+def files(folder: Path, *, below: bool = False) -> list[Path]:
+    """The files of records in a folder, optionally also below it, oldest first."""
+    find_files = Path(folder).rglob if below else Path(folder).glob
+    inside = (path for path in find_files(f"*{SUFFIX}") if lies_in(path, folder))
+    return sorted(
+        (each for each in inside if os.path.exists(each)), key=lambda each: each.stat().st_mtime
+    )
+
+
+def portable(value: Any, folder: Path) -> Any:
+    """A value whose texts name no folder of this machine, as far as paths can be recognised.
+
+    A text that is an absolute path becomes relative to ``folder``, or to ``~`` if only the path is
+    in the home folder; ``located`` finds it again. Inside other texts, ``folder`` is left out and
+    the home folder becomes ``~``.
+    """
+    if isinstance(value, dict):
+        return {key: portable(item, folder) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [portable(item, folder) for item in value]
+    if not isinstance(value, str):
+        return value
+    homes, (near, base) = _spellings(Path.home()), _spellings(folder)
+    if os.path.isabs(value):
+        path = Path(os.path.normpath(value))
+        for home in homes:
+            if path.is_relative_to(home) and not Path(base).is_relative_to(home):
+                return str("~" / path.relative_to(home))
+        value = os.path.relpath(path, base)
+    for known, short in ((near, ""), (base, ""), *((home, "~" + os.sep) for home in homes)):
+        value = value.replace(known + os.sep, short)
+    return value
+
+
+def located(text: str, folder: Path) -> Path:
+    """The path that ``portable`` made a text of, from the folder of the record that has it."""
+    return Path(os.path.normpath(Path(os.path.realpath(folder)) / Path(text).expanduser()))
+
+
+def _spellings(path: str | Path) -> list[str]:
+    """A folder's absolute path, as it is named and with its links followed."""
+    return [os.path.abspath(path), os.path.realpath(path)]
+
+
+def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
+    """Find the measurement of a fine-tuning's control; None if no file records it.
+
+    The control started from the same model, with the same iterations and settings, and kept as many
+    Gaussians, but without truncation. Files that are not records are ignored.
+
+    Args:
+        data: of the fine-tuning, including "before", "iterations" and "settings".
+        among: the files to search; the last match counts.
+    """
+    for path in reversed(among):
+        with contextlib.suppress(RecordError), DOOR.stated(path):
+            other = _read(path).data
+            if _is_control(other, data):
+                after: dict[str, Any] = other["after"]
+                return after
+    return None
+
+
+def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
+    mine, theirs = data.get("settings", {}), other.get("settings", {})
+    begun, before = other.get("before"), data.get("before")
+    return bool(
+        mine.get("truncate")
+        and theirs.get("truncate") is False
+        and all(mine[key] == theirs.get(key) for key in ("train", "opacity_lr"))
+        and other["iterations"] == data["iterations"]
+        and other.get("keep") == data.get("keep")
+        and begun
+        and before
+        and all(begun[key] == before[key] for key in ("views", "gaussians"))
+        and None not in (begun["psnr"], before["psnr"])
+        and abs(begun["psnr"] - before["psnr"]) < _SAME_DB
+    )
+
+
+def _read(path: Path) -> Record:
+    with DOOR.reading(path) as reading:
+        content = reading.json()
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError("another format")
+        command, data = content["command"], content["data"]
+        if not isinstance(command, str) or not isinstance(data, dict):
+            raise ValueError("command and data of other types")
+        return Record(path, command, data)
+
+
+def strict(value: Any) -> Any:
+    """Replace NaN and infinity by null, because JSON has neither."""
+    if isinstance(value, dict):
+        return {key: strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,284 @@
+"""The sidecar: a safetensors file beside the host's own that carries a threshold store.
+
+``point_cloud.ply`` gets ``point_cloud.fragprune.safetensors``. Its metadata names the model file's
+digest and row count, so a pair that does not match is refused. The host's file stays as the host
+wrote it. A PLY that fragprune writes has a mark in its header, so a missing sidecar is noticed.
+
+``replace_pair`` renames twice, and the renaming of the model is what counts. Before it, a sidecar
+whose model is not there yet lies under an address that the model's digest gives; after it, the
+sidecar moves to its usual name. A reader looks at the address first. So model and sidecar always
+belong together, whatever ends the process: both are the old ones, or both are the new ones.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.errors import SidecarError
+from fragprune_plugins.files.atomic import (
+    all_in_flight,
+    digest,
+    in_flight,
+    locked,
+    put,
+    rename,
+    replacing,
+)
+from fragprune_plugins.files.ply import is_marked
+from fragprune_plugins.files.reading import Door, parse_json
+from fragprune_plugins.learning.finite import expect_finite
+from fragprune_plugins.learning.thresholds import ThresholdStore
+
+SUFFIX = ".fragprune.safetensors"
+FORMAT = "fragprune-thresholds-1"
+
+
+@dataclass(frozen=True)
+class SidecarInfo:
+    """The metadata of a sidecar.
+
+    Attributes:
+        rows: number of Gaussians.
+        model_sha256: digest of the model file it belongs to.
+        adapter: name of the adapter that wrote it, "" when written without a host.
+        host_commit: the host checkout's commit, "" when unknown.
+        settings: of the fine-tuning.
+    """
+
+    rows: int
+    model_sha256: str
+    adapter: str = ""
+    host_commit: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def path_beside(model: Path) -> Path:
+    """The path of a model file's sidecar."""
+    return Path(model).with_suffix(SUFFIX)
+
+
+def lies_beside(model: Path) -> bool:
+    """Whether a model file has a sidecar.
+
+    Raises:
+        SidecarError: it has none, but was saved with one.
+    """
+    path = find(model)
+    if path is None and is_marked(model):
+        raise SidecarError(
+            str(path_beside(model)),
+            f"no such file, though {Path(model).name} was saved with thresholds beside it",
+            "its sidecar, under this name",
+            "Copy it here, and always rename both files together. "
+            "Or pass --no-truncation to commands that have it.",
+        )
+    return path is not None
+
+
+def belongs(model: Path) -> bool:
+    """Whether a model file has a sidecar that was written for the file's present content.
+
+    Raises:
+        SidecarError: the sidecar cannot be read.
+    """
+    path = find(model)
+    return path is not None and _read(model, path)[1].model_sha256 == digest(model)
+
+
+def find(model: Path) -> Path | None:
+    """The sidecar to read with a model file: at the address of its content, else beside it."""
+    model, path = Path(model), path_beside(model)
+    if (waiting := all_in_flight(model, _ADDRESSES)) and model.is_file():
+        addressed = _address(model, digest(model))
+        if addressed in waiting:
+            return addressed
+    return path if os.path.exists(path) else None  # also for too long a name
+
+
+def save(
+    model: Path,
+    store: ThresholdStore,
+    *,
+    adapter: str = "",
+    host_commit: str = "",
+    settings: dict[str, Any] | None = None,
+) -> Path:
+    """Write the store beside an existing model file, which stays; returns the sidecar's path.
+
+    Raises:
+        DivergedError: learned values are not finite.
+        OutputError: the file cannot be written.
+    """
+    target = path_beside(model)
+    if all_in_flight(model, _ADDRESSES):  # a dead process left it there: it would be read first
+        with locked(model):
+            _tidy(model)
+    with replacing(target, durable=True) as new:
+        info = SidecarInfo(len(store), digest(model), adapter, host_commit, settings or {})
+        _write(new, store, info)
+    return target
+
+
+def replace_pair(
+    path: Path,
+    whole: Path,
+    store: ThresholdStore | None,
+    *,
+    adapter: str = "",
+    host_commit: str = "",
+    settings: dict[str, Any] | None = None,
+) -> None:
+    """Put a finished model file and its thresholds in the place of a model and its sidecar.
+
+    A process that ends in between, or a power cut, leaves the old pair or the new one.
+
+    Args:
+        path: of the model.
+        whole: the finished file, in a folder that ``atomic.staging`` gave for ``path``.
+        store: its thresholds; None for a model without a sidecar.
+        adapter, host_commit, settings: as ``SidecarInfo`` has them.
+
+    Raises:
+        DivergedError: learned values are not finite; the old pair stays.
+        OSError: a file cannot be written; the old pair stays, or the new one is there.
+    """
+    beside = path_beside(path)
+    _tidy(path)
+    try:
+        if store is not None:
+            sha = digest(whole)
+            info = SidecarInfo(len(store), sha, adapter, host_commit, settings or {})
+            new = whole.with_name(beside.name)
+            _write(new, store, info)
+            put(new, _address(path, sha))
+        elif beside.exists():  # it stays with the old model for as long as that is there
+            rename(beside, _address(path, digest(path) if path.is_file() else "none"))
+        put(whole, path)
+        if store is None:  # also where the model kept its bytes, and so its address
+            for each in all_in_flight(path, _ADDRESSES):
+                each.unlink()
+    finally:
+        _tidy(path)
+
+
+def _tidy(model: Path) -> None:
+    """Move a model's sidecar from its address to its usual name, and remove all other addresses."""
+    waiting = all_in_flight(model, _ADDRESSES)
+    addressed = _address(model, digest(model)) if waiting and model.is_file() else None
+    for each in waiting:
+        if each == addressed:
+            rename(each, path_beside(model))
+        else:
+            each.unlink()
+
+
+_ADDRESSES = "for-*"
+
+
+def _address(model: Path, sha: str) -> Path:
+    """Where a sidecar lies whose model has this digest and is not, or no longer, in place."""
+    return in_flight(model, f"for-{sha[:32]}")
+
+
+def _write(path: Path, store: ThresholdStore, info: SidecarInfo) -> None:
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    expect_finite(store.numbers, str(path_beside(path)))
+    state = store.state_dict()
+    tensors = {k: v.cpu().contiguous() for k, v in state.items() if isinstance(v, torch.Tensor)}
+    metadata = {
+        "format": FORMAT,
+        "rows": str(info.rows),
+        "model_sha256": info.model_sha256,
+        "adam_step": repr(state["adam_step"]),
+        "steps": str(state["steps"]),
+        "adapter": info.adapter,
+        "host_commit": info.host_commit,
+        "settings": json.dumps(info.settings, sort_keys=True),
+    }
+    try:
+        save_file(tensors, path, metadata=metadata)
+    except SafetensorError as error:  # that is how it says that the disk is full
+        raise OSError(str(error)) from error
+
+
+def load(
+    model: Path, rows: int | None = None, device: torch.device | str = "cpu"
+) -> tuple[ThresholdStore, SidecarInfo]:
+    """Read the sidecar of a model file.
+
+    Args:
+        model: the file.
+        rows: of the model, from whoever has it; others are refused. None takes as many as the
+            sidecar says that it has.
+        device: where the store is to live.
+
+    Raises:
+        SidecarError: missing, unreadable, not finite, written for another model file, or of other
+            rows than the model.
+    """
+    state, info = _read(model, find(model) or path_beside(model))
+    shape, wanted = tuple(state["logits"].shape), digest(model)
+    if wanted != info.model_sha256 or shape != (info.rows,):
+        raise SidecarError(
+            str(path_beside(model)),
+            f"thresholds of another model (sha256 {info.model_sha256[:12]}, {info.rows} rows)",
+            f"those of {Path(model).name} (sha256 {wanted[:12]})",
+            _remedy(model),
+        )
+    if rows not in (None, info.rows):
+        raise SidecarError(
+            str(path_beside(model)),
+            f"thresholds of {info.rows} Gaussian(s)",
+            f"{rows}, one for each in {Path(model).name}",
+            _remedy(model),
+        )
+    store = ThresholdStore(info.rows, device)
+    store.load_state_dict(state)
+    return store, info
+
+
+def _remedy(model: Path) -> str:
+    return f"Remove {path_beside(model).name}, or write it again with fragprune finetune."
+
+
+def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
+    """Read a sidecar's store state and metadata, without a look at the model beside it."""
+    from safetensors import safe_open
+
+    remedy = _remedy(model)
+    door = Door(SidecarError, "unreadable", f"a file of format {FORMAT}", remedy, missing=remedy)
+    with door.reading(path) as reading:
+        reading.place = "its header"
+        with safe_open(reading.path, framework="pt") as file:
+            reading.place = "its metadata"
+            metadata = file.metadata() or {}
+            if metadata["format"] != FORMAT:
+                raise ValueError(f"format {metadata['format'][:80]!r}")
+            info = SidecarInfo(
+                rows=int(metadata["rows"]),
+                model_sha256=metadata["model_sha256"],
+                adapter=metadata["adapter"],
+                host_commit=metadata["host_commit"],
+                settings=parse_json(metadata["settings"]),
+            )
+            state = {"adam_step": float(metadata["adam_step"]), "steps": int(metadata["steps"])}
+            if not isinstance(info.settings, dict):
+                raise ValueError("settings that are no object")
+            if not (0 <= state["adam_step"] < math.inf and 0 <= state["steps"] < 1 << 63):
+                raise ValueError(f"{state['adam_step']:g} and {state['steps']} steps")
+            tensors: dict[str, torch.Tensor] = {}
+            for name in ("logits", "exp_avg", "exp_avg_sq"):
+                reading.place = f"tensor {name}"
+                tensors[name] = file.get_tensor(name)
+                if tensors[name].dtype != torch.float32:
+                    raise ValueError(f"{tensors[name].dtype}, not torch.float32")
+    return tensors | state, info

@@ -1,0 +1,368 @@
+"""What a splat costs to draw, and how much of that nobody sees. No photograph is needed.
+
+A fragment is *idle* if the picture may do without it. Two measures, both of single fragments with
+their exact weights T alpha, from the reference engine on a sample of tiles:
+
+* *alone*: without this one fragment no channel of its pixel moves by half an 8-bit level.
+* *together*: as many of a pixel's fragments as their weights, times the largest colour around, sum
+  up to half a level, the least first. Without all of them no channel moves by more than that.
+
+Of a pixel the order of its fragments, and where it ends for lack of light, stay as they are.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.reference import fragments
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.plugins.hooks import thresholds_for
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import Splats, View
+from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
+from fragprune_plugins.workbench.figures.extents import (
+    CUTS,
+    SQRT8,
+    VIEWERS,
+    covered,
+    honouring,
+    shaded,
+)
+from fragprune_plugins.workbench.figures.metrics import psnr
+from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.prices.calibration import kept_at
+from fragprune_plugins.workbench.prices.cost import Cost, Work, work_of
+from fragprune_plugins.workbench.scenes.generated import Named
+
+HALF_LEVEL = 0.5 / 255
+"""What an 8-bit picture does not show."""
+
+VIEWS = 12
+"""Cameras that are generated, and most that are drawn of given ones."""
+
+TILES = 384
+"""Tiles of 16x16 pixels, of all views together, whose fragments are weighed."""
+
+SHOWN = 3
+"""Views that pictures show and frames are timed on."""
+
+REPEATS = 5
+
+OPACITIES = (0.1, 0.5)
+RADII = (8, 32)
+"""Limits of the classes of Gaussians: opacity, and the host's radius of 3 sigma in pixels."""
+
+DARK = 0.05
+"""A fragment is behind what is opaque if less light than this is left for it."""
+
+RIM = math.exp(-2.0)
+"""A fragment is at the rim where the falloff is below this: beyond 2 sigma."""
+
+FAINT = OPACITIES[0]
+
+REASONS = ("behind what is opaque", "at the rim, beyond 2 sigma", "of faint Gaussians", "others")
+"""Where an idle fragment sits: the first that is true of it."""
+
+AS_IT_IS = "as it is"
+UNTRUNCATED = "without its thresholds"
+
+_COUNTS = ("fragments_per_pixel", "evaluated_per_pixel")
+
+
+@dataclass
+class Idle:
+    """Counts of weighed fragments.
+
+    Attributes:
+        pixels: that were looked at.
+        drawn: fragments there.
+        alone: of them, those idle alone.
+        together: of them, those idle together.
+        weight: of those idle together, sum; a pixel has 1 at most.
+        classes: (2, 3, 3) drawn, and idle together, by opacity and radius.
+        reasons: (2, 4) likewise by ``REASONS``.
+    """
+
+    __repr__ = one_line
+
+    pixels: int = 0
+    drawn: int = 0
+    alone: int = 0
+    together: int = 0
+    weight: float = 0.0
+    classes: Tensor = field(default_factory=lambda: torch.zeros(2, 9, dtype=torch.int64))
+    reasons: Tensor = field(default_factory=lambda: torch.zeros(2, 4, dtype=torch.int64))
+
+    def add(self, kinds: Tensor, tile: Weighed) -> None:
+        """Count the fragments of a tile whose Gaussians are of these kinds (K,), 0 to 8."""
+        self.pixels += tile.drawn.shape[1]
+        for at, chosen in enumerate((tile.drawn, tile.together)):
+            per_row = chosen.sum(dim=1)
+            self.classes[at].index_add_(0, kinds.cpu(), per_row.cpu())
+            self.reasons[at] += tile.reasons[chosen].bincount(minlength=len(REASONS)).cpu()
+        self.drawn += int(tile.drawn.sum())
+        self.alone += int(tile.alone.sum())
+        self.together += int(tile.together.sum())
+        self.weight += float(tile.weights[tile.together].sum())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Shares, as plain values."""
+        drawn = max(self.drawn, 1)
+        share = (self.classes.double() / drawn).view(2, 3, 3).tolist()
+        return {
+            "bound": HALF_LEVEL,
+            "pixels": self.pixels,
+            "fragments": self.drawn,
+            "alone": self.alone / drawn,
+            "together": self.together / drawn,
+            "light": self.weight / max(self.pixels, 1),
+            "reasons": [
+                {"name": name, "share": int(every) / drawn, "idle": int(idle) / drawn}
+                for name, every, idle in zip(REASONS, *self.reasons, strict=True)
+            ],
+            "opacities": list(OPACITIES),
+            "radii": list(RADII),
+            "share_by_opacity_and_radius": share[0],
+            "idle_by_opacity_and_radius": share[1],
+        }
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """K Gaussians at the P pixels of a tile; all (K, P).
+
+    Attributes:
+        drawn: whether there is a fragment.
+        weights: T alpha.
+        alone: whether it is idle alone.
+        together: whether it is idle together.
+        reasons: index into ``REASONS``.
+    """
+
+    __repr__ = one_line
+
+    drawn: Tensor
+    weights: Tensor
+    alone: Tensor
+    together: Tensor
+    reasons: Tensor
+
+
+def weigh(tile: Any, background: Tensor) -> Weighed:
+    """Judge the fragments of a tile, front to back.
+
+    Args:
+        tile: of ``engines.reference.fragments``; K is 1 or more.
+        background: (3,) RGB.
+    """
+    alpha, light, drawn = tile.alpha, tile.light, tile.drawn
+    weights = alpha * light
+    left = light[-1] * (1 - alpha[-1])
+    moved = torch.zeros_like(alpha)
+    for channel in range(3):
+        given = weights * tile.color[:, channel, None]
+        behind = given.flip(0).cumsum(0).flip(0) - given + left * background[channel]
+        # Without a fragment, what is behind it shines through: 1 / (1 - alpha) as bright.
+        moved = moved.maximum((behind * alpha / (1 - alpha) - given).abs())
+    # Without fragments, back to front: each one's weight is still its own, and the colour behind
+    # it is a mean of colours there. So none moves its pixel by more than its weight times this.
+    reach = torch.maximum(tile.color.max(), background.max())
+    bounds = torch.where(drawn, weights * reach, math.inf)
+    least = bounds.sort(dim=0)
+    spared = least.values.cumsum(0) <= HALF_LEVEL
+    together = torch.zeros_like(drawn).scatter(0, least.indices, spared) & drawn
+    opacity = tile.opacity[:, None]
+    reasons = torch.full_like(alpha, 3, dtype=torch.int64)
+    reasons[(opacity < FAINT).expand_as(reasons)] = 2
+    reasons[alpha < RIM * opacity] = 1
+    reasons[light < DARK] = 0
+    return Weighed(drawn, weights, drawn & (moved < HALF_LEVEL), together, reasons)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A view whose pictures are kept.
+
+    Attributes:
+        name: of the view.
+        image: (3, H, W).
+        fragments: (H, W) drawn per pixel.
+        overdraw: (H, W) ellipses of sqrt(8) standard deviations over each pixel.
+    """
+
+    __repr__ = one_line
+
+    name: str
+    image: Tensor
+    fragments: Tensor
+    overdraw: Tensor
+
+
+@torch.no_grad()
+def audit(
+    model: Model,
+    views: Named,
+    *,
+    engine: Engine,
+    tiles: int = TILES,
+    repeats: int = REPEATS,
+    progress: bool = False,
+) -> tuple[dict[str, Any], list[Shown]]:
+    """Measure what a splat costs from some cameras.
+
+    Args:
+        model: N Gaussians, drawn with their thresholds where they have some.
+        views: the cameras with their names, on the model's device.
+        engine: draws and counts.
+        tiles: of all views together, whose fragments are weighed one by one.
+        repeats: timed frames of each timed view and cut.
+        progress: draw a bar on stderr.
+
+    Returns:
+        Figures as plain values, and the views that pictures show.
+    """
+    from tqdm import tqdm
+
+    splat, store = model
+    splats = splat.splats()
+    candidates = _candidates(model, splats)
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in candidates}
+    asked: dict[str, list[float]] = {}
+    idle, shown, overdraw = Idle(), [], []
+    chosen = _amid(len(views))
+    with tqdm(total=2 * len(views) + 1, desc="audit", unit="step", disable=not progress) as bar:
+        for number, (name, view) in enumerate(views):
+            itself = None
+            for label, candidate in candidates.items():
+                out = candidate.draw(engine, view, splats, counts=itself is None)
+                itself = out if itself is None else itself
+                error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
+                row = {
+                    "timed": number in chosen,
+                    "work": work_of(out),
+                    "mse": float(error),
+                    "psnr": psnr(out.image, itself.image),
+                }
+                row |= {key: float(getattr(out, key)) for key in _COUNTS}
+                found[label].append(row)
+            assert itself is not None
+            inputs = candidates[AS_IT_IS].inputs(view, splats)
+            squared = SQRT8.squared(splats.opacities)
+            ellipses = covered(engine, replace(inputs, counts=True), squared)
+            overdraw.append(float(ellipses.fragments_per_pixel))
+            for viewer in VIEWERS:
+                asked.setdefault(viewer.names, []).append(shaded(engine, inputs, viewer))
+            cut = thresholds_for(inputs, store)
+            if cut is not None:
+                reach = honouring(cut, splats.opacities)
+                quads = 4 / math.pi * float(covered(engine, inputs, reach).fragments_per_pixel)
+                asked.setdefault(HONOURING, []).append(quads)
+            if number in chosen:
+                assert itself.fragments is not None
+                assert ellipses.fragments is not None
+                shown.append(Shown(name, itself.image, itself.fragments, ellipses.fragments))
+            bar.update()
+            kinds = 3 * torch.bucketize(splats.opacities, splats.opacities.new_tensor(OPACITIES))
+            kinds += torch.bucketize(itself.radii, itself.radii.new_tensor(RADII))
+            for tile in fragments(inputs, cut, max(1, tiles // len(views))):
+                if len(tile.rows):
+                    idle.add(kinds[tile.rows], weigh(tile, view.background))
+            bar.update()
+        timed: list[View] = [views[number][1] for number in chosen]
+        frames = frame_times(list(candidates.values()), timed, engine, repeats=repeats)
+        bar.update()
+    cost = _prices(engine, splat)
+    cuts: list[dict[str, Any]] = [
+        {"name": label}
+        | _mean(found[label])
+        | frame
+        | {"foreseen_ms": _foreseen(cost, found[label])}
+        for label, frame in zip(candidates, frames, strict=True)
+    ]
+    figures = {
+        "gaussians": len(splat),
+        "truncated": store is not None,
+        "views": len(views),
+        "fragments_per_pixel": cuts[0]["fragments_per_pixel"],
+        "evaluated_per_pixel": cuts[0]["evaluated_per_pixel"],
+        "overdraw": statistics.fmean(overdraw),
+        "frame_ms": cuts[0]["frame_ms"],
+        "frame_ms_se": cuts[0]["frame_ms_se"],
+        "engine": engine.name,
+        "device": str(splats.device),
+        "idle": idle.as_dict(),
+        "cuts": cuts,
+        "viewers": _viewers(asked),
+    }
+    return figures, shown
+
+
+def _amid(count: int) -> list[int]:
+    """Some evenly spread numbers, the middle ones of as many parts: an orbit begins at a pole."""
+    parts = min(SHOWN, count)
+    return [(2 * part + 1) * count // (2 * parts) for part in range(parts)]
+
+
+HONOURING = "a viewer that knows its thresholds"
+
+
+def _candidates(model: Model, splats: Splats) -> dict[str, Candidate]:
+    """The model as it is, first, and with every cut on top."""
+    splat, store = model
+    found = {AS_IT_IS: Candidate(splat, store)}
+    own = None if store is None else store.values.detach()
+    for cut in CUTS:
+        thresholds = cut.thresholds(splats.opacities)
+        thresholds = thresholds if own is None else torch.maximum(own, thresholds)
+        found[cut.name] = Candidate(splat, thresholds)
+    if store is not None:
+        found[UNTRUNCATED] = Candidate(splat)
+    return found
+
+
+def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Means over views; PSNR of the mean squared error and of the worst view, infinite if equal."""
+    error = statistics.fmean(row["mse"] for row in rows)
+    return {key: statistics.fmean(row[key] for row in rows) for key in _COUNTS} | {
+        "psnr": -10 * math.log10(error) if error else math.inf,
+        "worst_psnr": min(row["psnr"] for row in rows),
+    }
+
+
+def _prices(engine: Engine, splat: SplatFile) -> Cost | None:
+    """What ``fragprune bench --calibrate`` measured on this machine; None if it never ran."""
+    path = kept_at(engine, splat.xyz.device)
+    return Cost.load(path) if path.exists() else None
+
+
+def _foreseen(cost: Cost | None, rows: Sequence[Mapping[str, Any]]) -> float | None:
+    """Milliseconds of a frame of the timed views, by the machine's prices."""
+    if cost is None:
+        return None
+    works: list[Work] = [row["work"] for row in rows if row["timed"]]
+    return statistics.median(cost.ms(work) for work in works)
+
+
+def _viewers(asked: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
+    rules = {viewer.names: (viewer.extent.name, viewer.shape) for viewer in VIEWERS}
+    rules[HONOURING] = ("quads by thresholds, 1/255", "quad")
+    means = {names: statistics.fmean(pixels) for names, pixels in asked.items()}
+    first = means[VIEWERS[0].names]
+    return [
+        {
+            "viewers": names,
+            "rule": rules[names][0],
+            "shape": rules[names][1],
+            "shaded_per_pixel": mean,
+            "against_sqrt8": mean / first if first else math.nan,
+        }
+        for names, mean in means.items()
+    ]

@@ -1,0 +1,283 @@
+"""The page, the sentence and the text of an audit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.workbench.audit.audit import DARK, SHOWN, Shown
+from fragprune_plugins.workbench.figures import page
+from fragprune_plugins.workbench.figures.pictures import save_image, save_map, stems
+from fragprune_plugins.workbench.figures.wording import fewer, frames
+from fragprune_plugins.workbench.report.page import shared_limit
+
+MEASURED = (
+    "On four splats, with their own cameras, it left 1.6x to 2.0x fewer fragments at 48 to 50 dB "
+    "against themselves, and frames of four times the size were 1.4x to 2.1x as fast."
+)
+"""What pruning without photographs gained; docs/how-to/without-photographs.md has the table."""
+
+_KINDS = ("", "_fragments", "_overdraw")
+
+
+def draw(folder: Path, shown: Sequence[Shown]) -> dict[str, Any]:
+    """Write the pictures of the shown views, one pixel for each of the view's.
+
+    Args:
+        folder: for the PNGs.
+        shown: the views.
+
+    Returns:
+        limit: the count at the top of the scale of all maps; views: name, width, height and
+        files (picture, fragments, overdraw) of each.
+    """
+    limit = shared_limit([each for view in shown for each in (view.fragments, view.overdraw)])
+    views = []
+    for stem, view in zip(stems([view.name for view in shown]), shown, strict=True):
+        files = [f"{stem}{kind}.png" for kind in _KINDS]
+        save_image(folder / files[0], view.image)
+        save_map(folder / files[1], view.fragments, limit)
+        save_map(folder / files[2], view.overdraw, limit)
+        height, width = view.fragments.shape
+        means = {
+            "fragments_per_pixel": float(view.fragments.float().mean()),
+            "overdraw": float(view.overdraw.float().mean()),
+        }
+        views.append(means | {"name": view.name, "width": width, "height": height, "files": files})
+    return {"limit": limit, "views": views}
+
+
+def sentence(figures: Mapping[str, Any]) -> str:
+    """One line to quote."""
+    idle, cameras = figures["idle"], figures["cameras"]
+    quads = figures["viewers"][0]["shaded_per_pixel"]
+    return (
+        f"{figures['gaussians']:,} Gaussians draw {figures['fragments_per_pixel']:.1f} fragments "
+        f"per pixel, {figures['frame_ms']:.1f} ms a frame on our {figures['engine']} engine; a "
+        f"viewer of fixed √8 sigma quads shades {quads:.1f} pixels per pixel. "
+        f"{idle['alone']:.0%} of the fragments are each invisible alone, and "
+        f"{idle['together']:.0%} could all go at once without moving any pixel by half an 8-bit "
+        f"level ({figures['views']} {_from(cameras['kind'], figures['views'])})."
+    )
+
+
+def pruning(figures: Mapping[str, Any]) -> str:
+    """What learned pruning saves: of this model if it is pruned, else how to find out."""
+    if not figures["truncated"]:
+        return (
+            "What learned thresholds would save on this model is not known before they are "
+            f"learned: fragprune finetune {figures['model']} --self --out pruned.ply. {MEASURED} "
+            "It needs no photographs."
+        )
+    with_, without = figures["cuts"][0], figures["cuts"][-1]
+    fragments = fewer(without["fragments_per_pixel"], with_["fragments_per_pixel"])
+    return (
+        f"This model has thresholds. With them it draws {fragments}, {frames(without, with_)}. All "
+        "cuts come on top of them. A viewer that ignores them shows another picture: "
+        f"{_decibels(without['psnr'])} PSNR against this one."
+    )
+
+
+def text(figures: Mapping[str, Any]) -> str:
+    """What a terminal shows."""
+    lines = [sentence(figures), "", figures["cameras"]["why"], ""]
+    for head, rows, _, words in _tables(figures):
+        widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+        for row in (head, *rows):
+            cells = [
+                cell.ljust(width) if at < words else cell.rjust(width)
+                for at, (cell, width) in enumerate(zip(row, widths, strict=True))
+            ]
+            lines.append("  ".join(cells).rstrip())
+        lines.append("")
+    return "\n".join([*lines, pruning(figures)])
+
+
+def compose(figures: Mapping[str, Any], folder: Path) -> str:
+    """The page as HTML, with its pictures inside.
+
+    Args:
+        figures: of ``audit``, with "model", "cameras" and "maps".
+        folder: of the pictures.
+    """
+    cuts, viewers, idle, kinds = (page.table(*each) for each in _tables(figures))
+    maps = figures["maps"]
+    return page.compose(
+        title=f"What {Path(figures['model']).name} costs to draw",
+        quote=sentence(figures),
+        parts=[
+            page.paragraph(f"{_SIDES[figures['cameras']['kind']]} {figures['cameras']['why']}"),
+            page.heading("Where the fragments are"),
+            page.paragraph(_MAPS),
+            page.legend("in a pixel: fragments drawn, or ellipses over it", maps["limit"]),
+            *(_view(view, folder) for view in maps["views"]),
+            page.heading("What changes nothing"),
+            page.paragraph(_IDLE.format(pixels=figures["idle"]["pixels"])),
+            idle,
+            kinds,
+            page.heading("What simple cuts save, and cost"),
+            page.paragraph(_CUTS),
+            cuts,
+            page.heading("What learned pruning saves"),
+            page.paragraph(pruning(figures)),
+            page.heading("Which viewer pays what"),
+            page.paragraph(_VIEWERS),
+            viewers,
+        ],
+    )
+
+
+def _view(view: Mapping[str, Any], folder: Path) -> str:
+    size = (view["width"], view["height"])
+    drawn, fragments, overdraw = (page.embedded(folder / file) for file in view["files"])
+    return page.section(
+        view["name"],
+        page.split(
+            drawn,
+            fragments,
+            f"{view['fragments_per_pixel']:.1f} fragments per pixel",
+            size,
+            ("picture", "fragments"),
+        ),
+        page.split(
+            fragments,
+            overdraw,
+            f"{view['overdraw']:.1f} ellipses of √8 sigma over a pixel",
+            size,
+            ("fragments", "overdraw"),
+        ),
+    )
+
+
+Table = tuple[list[str], list[list[str]], str, int]
+"""Head, rows, caption, columns of words."""
+
+
+def _tables(figures: Mapping[str, Any]) -> list[Table]:
+    """Cuts, viewers, where idle fragments sit, and of which Gaussians they are."""
+    idle = figures["idle"]
+    known = any(cut["foreseen_ms"] is not None for cut in figures["cuts"])
+    first = figures["cuts"][0]["fragments_per_pixel"]
+    cuts = [
+        [
+            cut["name"],
+            f"{cut['fragments_per_pixel']:.2f}",
+            f"{first / max(cut['fragments_per_pixel'], 1e-9):.2f}x",
+            _decibels(cut["psnr"]),
+            _decibels(cut["worst_psnr"]),
+            f"{cut['frame_ms']:.2f} ± {cut['frame_ms_se']:.2f}",
+            *([f"{cut['foreseen_ms']:.2f}"] if known else []),
+        ]
+        for cut in figures["cuts"]
+    ]
+    head = ["left out", "fragments/pixel", "fewer", "against itself", "worst view", "frame, ms"]
+    said = (
+        f"{figures['views']} views; frames of {min(SHOWN, figures['views'])} of them, in turns, on "
+        f"the {figures['engine']} engine ({figures['device']}). PSNR is that of the mean squared "
+        "error over all views."
+    )
+    if known:
+        said += " Foreseen: by the prices of this machine (fragprune bench --calibrate)."
+    quads = figures["viewers"][0]["shaded_per_pixel"]
+    viewers = [
+        [
+            each["viewers"],
+            each["rule"],
+            f"{each['shaded_per_pixel']:.1f}",
+            f"{each['against_sqrt8']:.2f}",
+        ]
+        for each in figures["viewers"]
+    ]
+    viewers.append(
+        [
+            "fragprune",
+            "tiles by ellipse, 1/255 or threshold; ends where opaque",
+            f"{figures['evaluated_per_pixel']:.1f}",
+            f"{figures['evaluated_per_pixel'] / max(quads, 1e-9):.2f}",
+        ]
+    )
+    shaded = f"{_SHADED} Its frames take {figures['frame_ms']:.1f} ms here."
+    reasons = [
+        [
+            each["name"],
+            f"{each['share']:.1%}",
+            f"{each['idle']:.1%}",
+            _part(each["idle"], each["share"]),
+        ]
+        for each in idle["reasons"]
+    ]
+    every, together = 1.0, idle["together"]
+    reasons.append(["all", f"{every:.1%}", f"{together:.1%}", _part(together, every)])
+    return [
+        ([*head, *(["foreseen, ms"] if known else [])], cuts, said, 1),
+        (["viewer", "draws", "shaded/pixel", "against √8 quads"], viewers, shaded, 2),
+        (["fragments", "of all", "idle together, of all", "of these"], reasons, _REASONS, 1),
+        _kinds(idle),
+    ]
+
+
+def _kinds(idle: Mapping[str, Any]) -> Table:
+    low, high = idle["opacities"]
+    opacities = (f"opacity below {low:g}", f"{low:g} to {high:g}", f"over {high:g}")
+    small, large = idle["radii"]
+    radii = (f"up to {small} px", f"{small + 1} to {large} px", f"over {large} px")
+    shares = idle["share_by_opacity_and_radius"]
+    spared = idle["idle_by_opacity_and_radius"]
+    rows = [
+        [name, *(f"{share:.1%} ({part:.1%})" for share, part in zip(*both, strict=True))]
+        for name, *both in zip(opacities, shares, spared, strict=True)
+    ]
+    return ["Gaussians", *(f"radius {name}" for name in radii)], rows, _KINDS_SAID, 1
+
+
+def _from(kind: str, count: int) -> str:
+    return _FROM[kind].format("view" if count == 1 else "views")
+
+
+def _part(some: float, every: float) -> str:
+    return f"{some / every:.0%}" if every else ""
+
+
+def _decibels(value: float | None) -> str:
+    return "equal" if value is None or math.isinf(value) else f"{value:.1f} dB"
+
+
+_FROM = {
+    "orbit": "generated {} from all around",
+    "inside": "generated {} from inside",
+    "given": "given {}",
+}
+
+_SIDES = {
+    "orbit": "Generated cameras look at it from all around.",
+    "inside": "Generated cameras look around from inside of it.",
+    "given": "The cameras were given.",
+}
+
+_MAPS = """One scale for all maps. A fragment is a Gaussian that is drawn in a pixel: it ends where
+its alpha falls below 1/255, and a pixel ends where it is opaque. Overdraw is what viewers blend
+that know neither: all ellipses of √8 standard deviations over a pixel. Drag a divider."""
+
+_IDLE = """{pixels:,} pixels of evenly spread tiles were looked into, every fragment with its exact
+weight. A fragment is invisible alone if no channel of its pixel moves by half an 8-bit level
+without it. Fragments are idle together if all of them can go at once and no channel moves by more
+than that. A cut for a whole Gaussian finds only a part of them, and takes more if it may move
+pixels a little."""
+
+_REASONS = f"""Each fragment counts where the first of these holds. Behind what is opaque: less than
+{DARK:.0%} of the light is left for it."""
+
+_KINDS_SAID = """Share of all fragments, and in brackets of those idle together. The radius is 3
+sigma, on the screen."""
+
+_CUTS = """No training, the same for all Gaussians. The picture is compared with the model's own, as
+it is: below about 35 dB the change can be seen."""
+
+_VIEWERS = """Most viewers rasterize more than they blend. The figure is how many pixels they are
+asked to shade for a pixel of the picture. It is what a fill-bound frame pays; milliseconds depend
+on the machine, and no browser was timed here. Sorting, and each Gaussian itself, come on top."""
+
+_SHADED = """Quads: their area. Tiles: the pixels of all (Gaussian, tile) pairs; tiles that are
+opaque early spare some. The last row is counted by our engine, with what it spares."""

@@ -1,0 +1,176 @@
+"""Where to look at a splat from, of which nothing is known but the splat.
+
+A splat does not say where its photographs were taken. From outside of something convex, or in front
+of a wall, at most half of all directions end on a surface; from inside a room more do. So cameras
+go inside where, from the best place, more than half of all directions end on something opaque that
+is not close by. A place in the haze of large near Gaussians is no such place. A hollow object that
+is closed all round looks like a room: then choose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.workbench.scenes.generated import Named, around, bounds, within
+
+Side = Literal["auto", "orbit", "inside"]
+"""Where cameras go: ``auto`` chooses."""
+
+ENCLOSED = 0.5
+"""Share of directions that end on a surface from which on a place is inside."""
+
+_CANDIDATES = 12
+_PLACES = 4  # that cameras stand at, at most
+_AS_GOOD = 0.8  # of the best place's share
+_GRID = 9  # places along each side of the box
+_BOX = 0.1  # share of the Gaussians left out at each of its ends
+_APART = 0.2  # distance of candidates, in radii of the splat
+_NEAR = 0.2  # likewise: nearer surfaces are not looked at, but stood before
+_SOLID = 0.1  # opacity of a Gaussian that is not air
+_NEIGHBOURS = 8  # so many Gaussians are a surface, and fewer float
+_SAMPLED = 200_000  # Gaussians that are searched for air
+_OPAQUE = 0.9
+_PIXELS = 32  # side of each of the six pictures of a candidate
+_AHEAD = ((1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1), (0, 1, 0.01), (0, -1, 0.01))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Cameras that were placed, and why there.
+
+    Attributes:
+        views: the cameras.
+        side: "orbit" or "inside".
+        why: a sentence.
+        enclosed: share of directions that end on a surface, from the best place; NaN if no place
+            was looked for.
+    """
+
+    views: Named
+    side: str
+    why: str
+    enclosed: float
+
+
+@torch.no_grad()
+def place(
+    splat: SplatFile, count: int, engine: Engine, *, side: Side = "auto", divide: int = 1
+) -> Placed:
+    """Cameras all around a splat, or inside of it.
+
+    Args:
+        splat: N Gaussians.
+        count: cameras.
+        engine: draws small pictures to choose by.
+        side: where they go.
+        divide: divisor of the sides of their pictures, which have 800 pixels.
+    """
+    pixels = 800 // divide
+    if side == "orbit":
+        return Placed(
+            around(splat, count, width=pixels, height=pixels), side, "As asked for.", math.nan
+        )
+    splats, near = splat.splats(), _NEAR * bounds(splat)[1]
+    places = _clear(splat, near / _NEAR)
+    shares = [enclosed(engine, splats, at, near) for at in places]
+    best = max(shares)
+    if side == "auto" and best <= ENCLOSED:
+        why = (
+            f"From the most open place inside, {best:.0%} of all directions end on a surface that "
+            f"is not close by, and more than {ENCLOSED:.0%} would in a room. --inside looks from "
+            "there all the same."
+        )
+        return Placed(around(splat, count, width=pixels, height=pixels), "orbit", why, best)
+    good = [at for at, share in zip(places, shares, strict=True) if share >= _AS_GOOD * best]
+    eyes = good[:_PLACES]  # the most open ones
+    if side == "inside":
+        why = "As asked for."
+    else:
+        why = (
+            f"From the best place inside, {best:.0%} of all directions end on a surface that is "
+            f"not close by; outside of an object it would be {ENCLOSED:.0%} at most. A closed "
+            "hollow object looks the same: --orbit looks from outside."
+        )
+    views = within(eyes, 2 * count, width=pixels, height=pixels)
+    seen = [float(_met(engine, splats, _small(view), near).mean()) for _, view in views]
+    half = sorted(seen, reverse=True)[count - 1]  # doors and open sides show nothing
+    chosen = [view for view, share in zip(views, seen, strict=True) if share >= half]
+    return Placed(chosen[:count], "inside", why, best)
+
+
+def _small(view: View) -> View:
+    return replace(view, width=_PIXELS, height=_PIXELS)
+
+
+def _clear(splat: SplatFile, radius: float) -> list[Tensor]:
+    """Places of a grid far from all but faint Gaussians and from each other, farthest first."""
+    from scipy.spatial import cKDTree
+
+    means = splat.xyz.detach().cpu()
+    means = means[:: max(1, len(means) // _SAMPLED)]
+    ends = torch.quantile(means, torch.tensor([_BOX, 1 - _BOX]), dim=0)
+    step = torch.linspace(0, 1, _GRID)
+    grid = torch.cartesian_prod(step, step, step) * (ends[1] - ends[0]) + ends[0]
+    solid = splat.opacity.detach().cpu()[:: max(1, len(splat) // _SAMPLED), 0].sigmoid() > _SOLID
+    tree = cKDTree((means[solid] if solid.any() else means).numpy())
+    away, _ = tree.query(grid.numpy(), k=[min(_NEIGHBOURS, tree.n)])
+    chosen: list[Tensor] = []
+    for at in torch.from_numpy(away[:, 0]).argsort(descending=True, stable=True).tolist():
+        if all(float((grid[at] - other).norm()) > _APART * radius for other in chosen):
+            chosen.append(grid[at])
+        if len(chosen) == _CANDIDATES:
+            break
+    return chosen
+
+
+def enclosed(engine: Engine, splats: Splats, place: Tensor, near: float) -> float:
+    """Share of directions from a place that end on something opaque beyond a distance.
+
+    A pixel's distance is the harmonic mean of its fragments' by weight: a large Gaussian in front
+    of the camera, however thin, brings it near.
+
+    Args:
+        engine: draws six pictures, one to each side.
+        splats: N Gaussians.
+        place: (3,).
+        near: the distance, world units.
+    """
+    angles = _solid_angles()
+    met = [float((_met(engine, splats, view, near) * angles).sum()) for view in _faces(place)]
+    return sum(met) / (len(met) * float(angles.sum()))
+
+
+def _met(engine: Engine, splats: Splats, view: View, near: float) -> Tensor:
+    """(P,) 1 where a pixel shows something opaque beyond a distance, else 0; on the CPU."""
+    out = engine.rasterize(RasterInputs(view.to(splats.device), splats), None)
+    return ((out.alpha > _OPAQUE) & (out.alpha > near * out.invdepth)).flatten().float().cpu()
+
+
+def _faces(place: Tensor) -> Sequence[View]:
+    """Six square views that together see everything."""
+    eye = place.double().cpu()
+    return [
+        View.look_at(
+            eye,
+            eye + torch.tensor(ahead, dtype=torch.float64),
+            width=_PIXELS,
+            height=_PIXELS,
+            fov_y=90,
+        )
+        for ahead in _AHEAD
+    ]
+
+
+def _solid_angles() -> Tensor:
+    """(_PIXELS^2,) what a pixel of such a view sees of the sphere, up to a factor."""
+    at = (torch.arange(_PIXELS) + 0.5) / _PIXELS * 2 - 1
+    return (1 + at[:, None] ** 2 + at**2).pow(-1.5).flatten()

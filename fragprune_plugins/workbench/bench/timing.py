@@ -1,0 +1,227 @@
+"""Timing rasterizers side by side: rounds in turns, pictures compared, peak memory."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
+from fragprune_plugins.workbench.figures.clock import synchronize, timed
+
+Pass = Literal["forward", "forward_backward"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A rasterization to time.
+
+    Attributes:
+        scene: the scene's name.
+        view: the camera, on the Gaussians' device.
+        splats: activated Gaussians; their device does the work.
+        kind: forward only, or with every gradient.
+        thresholds: (N,) or None.
+    """
+
+    scene: str
+    view: View
+    splats: Splats
+    kind: Pass
+    thresholds: Tensor | None = None
+
+    __repr__ = one_line
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        return self.splats.device
+
+
+def measure(
+    cases: Sequence[Case],
+    engines: Sequence[Engine],
+    *,
+    repeats: int = 9,
+    say: Callable[[str], None] = lambda _: None,
+) -> list[dict[str, Any]]:
+    """Time every case on every engine, all of them once a round.
+
+    On a GPU the clock stops when it is idle again, after the backward pass too.
+
+    Args:
+        cases: the rasterizations to time.
+        engines: the engines to time. Pictures are compared with those of the first engine.
+        repeats: number of rounds after one warm-up round.
+        say: called with a line of text after each finished round.
+
+    Returns:
+        One dict a case and engine: scene, width, height, gaussians, pass, engine, device, threads,
+        truncated, fragments_per_pixel, evaluated_per_pixel, ms_median, ms_min, ms_se,
+        ns_per_fragment (of the median; None where nothing is drawn), stages (medians in ms),
+        peak_mb (beyond inputs, of a GPU's own memory as torch gives it out, else of main memory;
+        None where the system cannot tell), difference (mean absolute, from the first engine's
+        picture).
+    """
+    jobs = [(case, engine, _prepare(case, engine)) for case in cases for engine in engines]
+    times: list[list[float]] = [[] for _ in jobs]
+    stages: list[list[dict[str, float]]] = [[] for _ in jobs]
+    last: list[RasterOutputs] = []
+    peaks = []
+    for case, _, job in jobs:
+        outputs, peak = _with_peak(job, case.device)
+        last.append(outputs)
+        peaks.append(peak)
+    for turn in range(repeats):
+        order = range(len(jobs)) if turn % 2 == 0 else reversed(range(len(jobs)))
+        for index in order:
+            case, _, job = jobs[index]
+            outputs, spent = timed(job, case.device)
+            times[index].append(spent)
+            parts = dict(outputs.stages or {})
+            if case.kind == "forward_backward" and parts:
+                parts["backward"] = spent - sum(parts.values())
+            stages[index].append(parts)
+        say(f"round {turn + 1} of {repeats}")
+    results = []
+    for index, (case, engine, _) in enumerate(jobs):
+        first = last[index - index % len(engines)]
+        median = statistics.median(times[index])
+        drawn = float(last[index].fragments_per_pixel.detach())
+        fragments = drawn * case.view.width * case.view.height
+        results.append(
+            {
+                "scene": case.scene,
+                "width": case.view.width,
+                "height": case.view.height,
+                "gaussians": len(case.splats),
+                "pass": case.kind,
+                "engine": engine.name,
+                "device": str(case.device),
+                "threads": torch.get_num_threads(),
+                "truncated": case.thresholds is not None,
+                "fragments_per_pixel": drawn,
+                "evaluated_per_pixel": last[index].evaluated_per_pixel,
+                "ms_median": median,
+                "ms_min": min(times[index]),
+                "ms_se": _standard_error(times[index]),
+                "ns_per_fragment": 1e6 * median / fragments if fragments else None,
+                "stages": {
+                    name: statistics.median(part[name] for part in stages[index])
+                    for name in stages[index][0]
+                },
+                "peak_mb": peaks[index],
+                "difference": float((last[index].image - first.image).detach().abs().mean()),
+            }
+        )
+    return results
+
+
+def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, dict[str, float]]:
+    """How much of the saved fragments becomes saved time, by scene and size, forward pass.
+
+    Returns:
+        For each "scene WIDTHxHEIGHT": ``fragments`` and ``time``, the ratios of untruncated to
+        truncated, and ``share``, time over fragments.
+    """
+    found: dict[str, dict[str, float]] = {}
+    forward = [r for r in results if r["engine"] == engine and r["pass"] == "forward"]
+    for plain in forward:
+        for cut in forward:
+            same = all(plain[k] == cut[k] for k in ("scene", "width", "height", "gaussians"))
+            drawn = cut["fragments_per_pixel"] > 0
+            if same and drawn and cut["truncated"] and not plain["truncated"]:
+                time_ratio = plain["ms_median"] / cut["ms_median"]
+                fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
+                found[f"{plain['scene']} {plain['width']}x{plain['height']}"] = {
+                    "fragments": fragments,
+                    "time": time_ratio,
+                    "share": time_ratio / fragments,
+                }
+    return found
+
+
+def scaling(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float] | None:
+    """The range of the time per fragment over scenes and sizes: untruncated, forward pass.
+
+    Returns:
+        ``least`` and ``most`` in ns per fragment, and their ``ratio``; None for fewer than two
+        rows.
+    """
+    prices = [
+        r["ns_per_fragment"]
+        for r in results
+        if r["engine"] == engine and r["pass"] == "forward" and not r["truncated"]
+    ]
+    known = [price for price in prices if price is not None]
+    if len(known) < 2:
+        return None
+    return {"least": min(known), "most": max(known), "ratio": max(known) / min(known)}
+
+
+def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
+    """Make a function that draws once, optionally with gradients of a fixed random loss."""
+    inputs = RasterInputs(case.view, case.splats, planes=())
+    if case.kind == "forward":
+
+        @torch.no_grad()
+        def draw() -> RasterOutputs:
+            return engine.rasterize(inputs, case.thresholds)
+
+        return draw
+
+    names = ("means", "opacities", "scales", "rotations", "sh")
+    leaves = {n: getattr(case.splats, n).detach().clone().requires_grad_(True) for n in names}
+    hook = torch.zeros(len(case.splats), 3, device=case.device, requires_grad=True)
+    thresholds = None
+    if case.thresholds is not None:
+        thresholds = case.thresholds.clone().requires_grad_(True)
+    inputs = RasterInputs(case.view, replace(case.splats, **leaves), hook, planes=())
+    stream = torch.Generator().manual_seed(0)
+    weight = torch.randn(3, case.view.height, case.view.width, generator=stream).to(case.device)
+
+    def draw_and_differentiate() -> RasterOutputs:
+        for leaf in (*leaves.values(), hook, *([] if thresholds is None else [thresholds])):
+            leaf.grad = None
+        outputs = engine.rasterize(inputs, thresholds)
+        torch.autograd.backward(outputs.image, weight)
+        return outputs
+
+    return draw_and_differentiate
+
+
+def _standard_error(values: Sequence[float]) -> float:
+    return statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
+
+
+def _with_peak(
+    job: Callable[[], RasterOutputs], device: torch.device
+) -> tuple[RasterOutputs, float | None]:
+    """Run once, which also warms up; returns the peak memory above the start, in MB."""
+    if device.type == "cuda":
+        synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        start = torch.cuda.memory_allocated(device)
+        outputs = job()
+        return outputs, (torch.cuda.max_memory_allocated(device) - start) / 2**20
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # Linux: forget the old peak
+        before = _status("VmRSS")
+        outputs = job()
+        return outputs, max(0.0, _status("VmHWM") - before)
+    except OSError:
+        return job(), None
+
+
+def _status(field: str) -> float:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field):
+            return float(line.split()[1]) / 1024
+    raise OSError(f"no {field} in /proc/self/status")

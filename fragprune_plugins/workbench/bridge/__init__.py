@@ -1,0 +1,70 @@
+"""``fragprune bridge``: gives the JavaScript modules with which viewers honour cutoffs."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+
+import click
+
+from fragprune_plugins.errors import PluginError, UsageError
+from fragprune_plugins.files.reading import said
+from fragprune_plugins.workbench.commands.common import Command, Report
+
+GROUP = "fragprune.bridges"
+"""Entry points: a viewer's name, and the package whose ``MODULE`` is its JavaScript module."""
+
+
+@click.command("bridge", cls=Command)
+@click.argument("viewer", required=False)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to copy the module into.")
+def command(viewer: str | None, out: Path | None) -> Report:
+    """Give the JavaScript module with which VIEWER honours cutoffs.
+
+    A bridge is one module without a build step, and its folder is an npm package. Without --out
+    the folder is printed. Without VIEWER all bridges are listed.
+
+    \b
+    Examples:
+      fragprune bridge playcanvas --out website
+      npm install "$(fragprune bridge spark)"
+    """
+    modules = {entry.name: entry for entry in sorted(entry_points(group=GROUP))}
+    if viewer is None:
+        found = {name: _module(entry) for name, entry in modules.items()}
+        lines = [f"{name:<16} {module}" for name, module in found.items()]
+        data = {"bridges": {name: str(module) for name, module in found.items()}}
+        return Report(data, "\n".join(lines) or "No bridge is installed.")
+    if viewer not in modules:
+        raise UsageError("VIEWER", viewer, " or ".join(modules), "Choose a bridge from the list.")
+    module = _module(modules[viewer])
+    if out is None:
+        return Report({"bridge": viewer, "module": str(module)}, str(module.parent))
+    from fragprune_plugins.files.atomic import replacing
+
+    to = out / module.name
+    out.mkdir(parents=True, exist_ok=True)
+    with replacing(to) as temporary:
+        shutil.copyfile(module, temporary)
+    return Report({"bridge": viewer, "module": str(to)}, f"Wrote {to}.")
+
+
+def _module(entry: EntryPoint) -> Path:
+    """The module of an installed bridge.
+
+    Raises:
+        PluginError: its package cannot be imported, or names no file.
+    """
+    try:
+        module = entry.load().MODULE
+        if not Path(module).is_file():
+            raise FileNotFoundError(f"no file {module}")
+    except (Exception, SystemExit) as error:
+        raise PluginError(
+            f"bridge {entry.name}",
+            f"{type(error).__name__}: {said(error)}",
+            "a package with the path of its JavaScript module",
+            f"Install {entry.value} again, or remove it.",
+        ) from error
+    return Path(module)

@@ -1,0 +1,189 @@
+"""The options of learning, for ``run`` and ``finetune``."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.pressure import (
+    ELASTICITY,
+    LEAST_PRESSURE,
+    MOST_PRESSURE,
+    PORTABLE_ELASTICITY,
+)
+from fragprune_plugins.learning.schedule import (
+    FINETUNE_ITERATIONS,
+    QUICK_ITERATIONS,
+    Settings,
+    steps_of,
+)
+from fragprune_plugins.workbench.commands.common import Number, together
+
+_OPTIONS = (
+    click.option(
+        "--iters", type=int, help=f"Iterations of stage 2; default {FINETUNE_ITERATIONS}."
+    ),
+    click.option(
+        "--quick", is_flag=True, help=f"Run {QUICK_ITERATIONS} iterations, for most of the gain."
+    ),
+    click.option(
+        "--train",
+        type=click.Choice(["opacity", "appearance", "all"]),
+        default="all",
+        show_default=True,
+        help="Parameters that learn with the thresholds: opacities alone, as in the paper; "
+        "appearance adds SH; all adds shapes and positions, and truncates in the last 2,000 "
+        "iterations only.",
+    ),
+    click.option(
+        "--pressure",
+        type=float,
+        help="Weight of drawn fragments per pixel in the loss; default: "
+        f"{2 * ELASTICITY:g} of the loss per fragment ({ELASTICITY:g} unless all parameters "
+        f"learn), from {LEAST_PRESSURE:g} to {MOST_PRESSURE:g}.",
+    ),
+    click.option(
+        "--target-speedup",
+        type=float,
+        help="Target for the ratio of fragments: those of the untruncated model at the start, "
+        "divided by those drawn now, on the training views that calibration measures.",
+    ),
+    click.option(
+        "--target-time",
+        type=float,
+        help="Target for the ratio of frame times: the untruncated model's at the start, divided "
+        "by those now, on this machine, at the size of the training views. 1.5 means frames 1.5 "
+        "times as fast. finetune only.",
+    ),
+    click.option(
+        "--max-drop",
+        type=Number(0, 10),
+        metavar="DB",
+        help="Find the strongest truncation that loses at most so much PSNR, in dB, against the "
+        "control. Trains the control and up to 7 times more, and chooses the pressure on the "
+        "held-out views. finetune only.",
+    ),
+    click.option(
+        "--portable",
+        is_flag=True,
+        help="For viewers that know no thresholds: learn none, and press on the area that the "
+        "Gaussians cover instead of on drawn fragments. --pressure is its weight then; default: "
+        f"{PORTABLE_ELASTICITY:g} of the loss per pixel of area.",
+    ),
+    click.option(
+        "--control",
+        is_flag=True,
+        help="Run the same iterations without truncation, to compare with.",
+    ),
+    click.option(
+        "--on-nonfinite",
+        "nonfinite",
+        type=click.Choice(["stop", "skip"]),
+        default="stop",
+        show_default=True,
+        help="A step whose gradients are NaN or infinite stops with an error, or is skipped.",
+    ),
+)
+
+_EXCLUDE = (
+    ("--quick", "--iters"),
+    ("--pressure", "--target-speedup"),
+    ("--pressure", "--target-time"),
+    ("--target-speedup", "--target-time"),
+    ("--max-drop", "--pressure"),
+    ("--max-drop", "--target-speedup"),
+    ("--max-drop", "--target-time"),
+    ("--max-drop", "--control"),
+    ("--control", "--pressure"),
+    ("--control", "--target-speedup"),
+    ("--control", "--target-time"),
+    ("--control", "--portable"),
+    ("--portable", "--target-time"),
+    ("--portable", "--max-drop"),
+)
+
+
+def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of learning to a command.
+
+    The command gets their values, and its own ``seed``, ``itself`` and ``views_per_step`` if it has
+    them, as ``settings``; ``max_drop`` apart, because it is a bound for several trainings.
+
+    Raises:
+        UsageError: options contradict each other, or a value is out of range.
+    """
+
+    @functools.wraps(function)
+    def with_settings(
+        *args: Any,
+        iters: int | None,
+        quick: bool,
+        train: Any,
+        pressure: float | None,
+        target_speedup: float | None,
+        target_time: float | None,
+        portable: bool,
+        control: bool,
+        nonfinite: Any,
+        **kwargs: Any,
+    ) -> Any:
+        asked = {
+            "--quick": quick,
+            "--iters": iters is not None,
+            "--pressure": pressure is not None,
+            "--target-speedup": target_speedup is not None,
+            "--target-time": target_time is not None,
+            "--max-drop": kwargs["max_drop"] is not None,
+            "--portable": portable,
+            "--control": control,
+        }
+        for one, other in _EXCLUDE:
+            if asked[one] and asked[other]:
+                raise UsageError("options", f"{one} with {other}", "one of the two", "Remove one.")
+        itself = kwargs.get("itself", False)
+        default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
+        views = kwargs.pop("views_per_step", 1)
+        settings = Settings(
+            iterations=steps_of(default, views) if iters is None else iters,
+            train=train,
+            pressure=pressure,
+            target_speedup=target_speedup,
+            target_time=target_time,
+            itself=itself,
+            portable=portable,
+            truncate=not control,
+            seed=kwargs.get("seed", 0),
+            views_per_step=views,
+            nonfinite=nonfinite,
+        )
+        return function(*args, settings=settings, **kwargs)
+
+    return functools.reduce(lambda f, option: option(f), reversed(_OPTIONS), with_settings)
+
+
+def resuming_options(kept: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The options of a stage 2 that goes on after a kill.
+
+    Args:
+        kept: the help of ``--checkpoint-every``: where an unfinished stage 2 is kept.
+    """
+    return together(
+        click.option(
+            "--checkpoint-every",
+            "every",
+            type=Number(min=0),
+            default=300.0,
+            show_default=True,
+            metavar="SECONDS",
+            help=kept,
+        ),
+        click.option(
+            "--again",
+            is_flag=True,
+            help="Begin stage 2 anew, though it is finished or there is a checkpoint.",
+        ),
+    )

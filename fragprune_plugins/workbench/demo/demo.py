@@ -1,0 +1,244 @@
+"""Runs the demo: photographs, training, fine-tuning, measurement, pictures."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.workbench.demo.folder import claiming, clear
+from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+
+if TYPE_CHECKING:
+    from fragprune_plugins.files.ply import SplatFile
+    from fragprune_plugins.injection.launch import RunOptions, RunSummary
+
+HOST = Path(__file__).with_name("host") / "train.py"
+"""The training script of the demo's host."""
+
+REPORT = "report.json"
+"""The report's file in the demo's folder; the demo writes it last."""
+
+
+_REPEATS = 20  # timed frames for each view: small frames are fast, and laptops are noisy
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """Settings of a demo.
+
+    Attributes:
+        iterations: number of iterations of the host's own training.
+        finetune: number of iterations of stage 2.
+        pressure: weight of drawn fragments per pixel; None for the default.
+        seed: seed of the scene and of the training.
+        engine: name of the engine that rasterizes.
+        device: "cpu" or a CUDA device.
+        scene: settings of the photographs.
+    """
+
+    iterations: int = 2000
+    finetune: int = 1000
+    pressure: float | None = None
+    seed: int = 0
+    engine: str = "auto"
+    device: str = "cpu"
+    scene: SceneSettings = field(default_factory=SceneSettings)
+
+
+def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
+    """The command that trains the host on the scene.
+
+    Its flags scale the timetable of densification to the number of iterations.
+
+    Args:
+        scene: the scene's folder.
+        model: the output folder.
+        settings: the demo's settings.
+    """
+    n = settings.iterations
+    flags: dict[str, object] = {
+        "-s": scene,
+        "-m": model,
+        "--iterations": n,
+        "--sh_degree": 1,
+        "--position_lr_max_steps": n,
+        "--densify_from_iter": n // 10,
+        "--densify_until_iter": int(n * 0.65),
+        "--densification_interval": max(1, n // 20),
+        "--opacity_reset_interval": 10 * n,  # never: the training is too short to recover
+        "--densify_grad_threshold": 0.0009,
+        "--test_iterations": -1,
+        "--save_iterations": n,
+        "--seed": settings.seed,
+    }
+    words = [str(word) for flag in flags.items() for word in flag]
+    return [str(HOST), *words, "--eval"]
+
+
+def run_demo(
+    out: Path,
+    settings: DemoSettings | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Make a scene, train the host on it, fine-tune, measure and draw. Progress goes to stderr.
+
+    Args:
+        out: folder for ``scene/``, ``model/``, ``pictures/``, ``index.html`` and ``report.json``.
+        settings: the demo's settings; None for the defaults.
+        say: called with one line of text at the start of each part.
+
+    Returns:
+        The report. "before", "after" and "control" are measurements on held-out views; the control
+        trains opacities alone for as many iterations. "seconds_by_part" are wall times.
+
+    Raises:
+        OutputError: the folder cannot be written, or holds files that no demo wrote.
+    """
+    from fragprune_plugins.injection.launch import run
+    from fragprune_plugins.workbench.demo.page import write_page
+
+    settings = settings or DemoSettings()
+    clear(out)
+    clock = _Clock()
+    scene, model = out / "scene", out / "model"
+    views = settings.scene.views
+    with clock.part("scene"), claiming(out, "scene"):
+        say(f"1/5  Photographing a room from {views} sides (ray-traced, nothing is downloaded)")
+        _photograph(scene, settings)
+    with (
+        clock.part("train"),
+        claiming(out, "model"),
+        contextlib.redirect_stdout(sys.stderr),
+    ):
+        command = host_command(scene.resolve(), model.resolve(), settings)
+        say(
+            f"2/5  Training for {settings.iterations} iterations, then with thresholds "
+            f"for {settings.finetune}"
+        )
+        summary = run(command, _run_options(settings))
+    with clock.part("control"):
+        say(f"3/5  The control: the same {settings.finetune} iterations without truncation")
+        control = _control(scene, summary, settings)
+    with clock.part("measure"):
+        say("4/5  Measuring on the held-out views")
+        report = _measure(scene, summary, control, settings)
+    with clock.part("pictures"), claiming(out, "pictures", "index.html", "model"):
+        say("5/5  Drawing the pictures")
+        made = replace(settings.scene, seed=settings.seed)
+        report["files"] = write_page(
+            out, report, scene, made, summary.curves, settings.engine, settings.device
+        )
+        _record(report, scene, summary)
+    report["seconds_by_part"] = clock.seconds
+    report["seconds"] = sum(clock.seconds.values())
+    with claiming(out, REPORT), replacing(out / REPORT) as path:
+        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    return report
+
+
+def _photograph(folder: Path, settings: DemoSettings) -> None:
+    from tqdm import tqdm
+
+    with tqdm(total=settings.scene.views, desc="Photographs", unit="view") as bar:
+        make_scene(
+            folder,
+            replace(settings.scene, seed=settings.seed),
+            lambda done, _: bar.update(done - bar.n) and None,
+        )
+
+
+def _run_options(settings: DemoSettings) -> RunOptions:
+    from fragprune_plugins.injection.launch import RunOptions
+    from fragprune_plugins.learning.schedule import Settings
+
+    learning = Settings(
+        iterations=settings.finetune, pressure=settings.pressure, seed=settings.seed
+    )
+    return RunOptions(settings=learning, engine=settings.engine, device=settings.device)
+
+
+def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> SplatFile:
+    from fragprune_plugins.learning.schedule import Settings
+    from fragprune_plugins.workbench.finetune.loop import finetune
+    from fragprune_plugins.workbench.models import model as models
+    from fragprune_plugins.workbench.scenes.dataset import load_dataset
+
+    assert summary.model_before is not None  # the host saves at its last iteration
+    model, _ = models.load(summary.model_before, device=settings.device)
+    learning = Settings(iterations=settings.finetune, truncate=False, seed=settings.seed)
+    data = load_dataset(scene)
+    return finetune(model, data, learning, engine=settings.engine, progress=True).model
+
+
+def _measure(
+    scene: Path, summary: RunSummary, control: SplatFile, settings: DemoSettings
+) -> dict[str, Any]:
+    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+    from fragprune_plugins.workbench.models import model as models
+    from fragprune_plugins.workbench.scenes.dataset import load_dataset
+
+    assert summary.model_before is not None
+    assert summary.model_after is not None
+    candidates = [
+        *(
+            Candidate(*models.load(path, device=settings.device))
+            for path in (summary.model_before, summary.model_after)
+        ),
+        Candidate(control, None),
+    ]
+    shots = load_dataset(scene).test
+    before, after, zero = measure(candidates, shots, engine=settings.engine, repeats=_REPEATS)
+    return {
+        "before": before,
+        "after": after,
+        "control": zero,
+        "fragments_ratio": before["fragments_per_pixel"] / max(after["fragments_per_pixel"], 1e-9),
+        "frame_ratio": before["frame_ms"] / max(after["frame_ms"], 1e-9),
+        "psnr_change": after["psnr"] - before["psnr"],
+        "control_psnr_change": zero["psnr"] - before["psnr"],
+        "ssim_change": after["ssim"] - before["ssim"],
+        "gaussians": after["gaussians"],
+        "iterations": summary.iterations,
+        "train_seconds": summary.train_seconds,
+        "adapter": summary.adapter,
+        "engine": after["engine"],
+        "device": after["device"],
+        "seed": settings.seed,
+        "model_before": str(summary.model_before),
+        "model_after": str(summary.model_after),
+        "settings": summary.settings,
+    }
+
+
+def _record(report: dict[str, Any], scene: Path, summary: RunSummary) -> None:
+    """Leave what ``fragprune run`` leaves beside its model, for ``fragprune report``."""
+    from fragprune_plugins.files import records
+    from fragprune_plugins.hosts.photographs import Photographs
+
+    models = [str(path.resolve()) for path in (summary.model_before, summary.model_after) if path]
+    photographs = {"models": models, "filtered": True, "drawing": summary.drawing}
+    photographs = Photographs(scene.resolve()).as_dict() | photographs
+    assert summary.model_after is not None
+    more = {"curves": summary.curves, "photographs": photographs}
+    records.leave(summary.model_after, "run", report | more)
+
+
+class _Clock:
+    """Measures wall time; ``seconds`` holds the seconds of each part by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Time the block as the part of this name."""
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = round(time.perf_counter() - started, 3)

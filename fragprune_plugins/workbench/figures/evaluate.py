@@ -1,0 +1,214 @@
+"""Measures quality, fragments and latency of splats against photographs or own pictures."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.learning.area import SQUARED_RADIUS
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
+from fragprune_plugins.workbench.figures.clock import timed
+from fragprune_plugins.workbench.figures.extents import covered
+from fragprune_plugins.workbench.figures.metrics import lpips, psnr, ssim
+from fragprune_plugins.workbench.scenes.dataset import Shot
+
+REPEATS = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A splat to measure, and how to draw it.
+
+    Attributes:
+        model: the Gaussians.
+        thresholds: a store, for which plugins are asked at every view; (N,) thresholds to use as
+            they are; or None for no truncation.
+        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
+        gaussians: of the whole splat, where the model is this process' part of it.
+    """
+
+    model: SplatFile
+    thresholds: Tensor | ThresholdStore | None = None
+    drawing: Mapping[str, Any] = field(default_factory=dict)
+    gaussians: int | None = None
+
+    __repr__ = one_line
+
+    def inputs(self, view: View, splats: Splats) -> RasterInputs:
+        """The inputs of one view with the activated model; only the image is asked for."""
+        return RasterInputs(view, splats, planes=(), **self.drawing)
+
+    def draw(
+        self, engine: Engine, view: View, splats: Splats, *, counts: bool = False
+    ) -> RasterOutputs:
+        """Draw one view of the activated model, optionally with counts of fragments."""
+        inputs = replace(self.inputs(view, splats), counts=counts)
+        return engine.rasterize(inputs, thresholds_for(inputs, self.thresholds))
+
+
+def evaluate(
+    model: SplatFile,
+    thresholds: Tensor | ThresholdStore | None,
+    shots: Sequence[Shot],
+    *,
+    engine: str | Engine = "auto",
+    repeats: int = REPEATS,
+) -> dict[str, Any]:
+    """Measure one splat; see ``measure``."""
+    return measure([Candidate(model, thresholds)], shots, engine=engine, repeats=repeats)[0]
+
+
+@torch.no_grad()
+def measure(
+    candidates: Sequence[Candidate],
+    shots: Sequence[Shot],
+    *,
+    engine: str | Engine = "auto",
+    repeats: int = REPEATS,
+    enlarge: int = 1,
+) -> list[dict[str, Any]]:
+    """Measure splats against the same pictures, timing them in turns.
+
+    Frames of all candidates are timed in turns, so that a busy machine slows them alike. A frame is
+    one forward rasterization of activated Gaussians with given thresholds, without reading or
+    writing images. On a GPU it ends when the GPU is idle.
+
+    Args:
+        candidates: the splats to measure, all on one device; views move there.
+        shots: the views. Figures are means over them.
+        engine: a name or an engine.
+        repeats: number of timed frames for each view and candidate.
+        enlarge: timed frames are this many times as wide and high as the pictures.
+
+    Returns:
+        One dict a candidate: target ("photographs", or "itself" for a model's own pictures), psnr
+        (dB; infinite against itself), ssim, lpips (None where not installed), fragments_per_pixel,
+        evaluated_per_pixel, entries_per_pixel (NaN from an engine that does not count them),
+        area_per_pixel (``covered_per_pixel``), gaussians, frame_ms (median over views and repeats),
+        frame_ms_se (standard error over repeats of the median over views), engine, device, views.
+    """
+    device = candidates[0].model.xyz.device
+    if isinstance(engine, str):
+        engine = engine_for(engine, device)
+    shots = [shot.to(device) for shot in shots]
+    drawn = [candidate.model.splats() for candidate in candidates]
+    reports: list[dict[str, Any]] = []
+    for candidate, splats in zip(candidates, drawn, strict=True):
+        rows, distances = [], []
+        for shot in shots:
+            outputs = candidate.draw(engine, shot.view, splats)
+            seen = shot.looked_at(outputs.image)
+            distances.append(lpips(seen, shot.image))
+            rows.append(
+                (
+                    psnr(seen, shot.image),
+                    ssim(seen, shot.image),
+                    float(outputs.fragments_per_pixel),
+                    float(outputs.evaluated_per_pixel),
+                    float(outputs.entries_per_pixel),
+                    covered_per_pixel(engine, candidate.inputs(shot.view, splats)),
+                )
+            )
+        means = map(statistics.fmean, zip(*rows, strict=True))
+        quality, likeness, fragments, evaluated, entries, area = means
+        reports.append(
+            {
+                "target": shots[0].target,
+                "psnr": quality,
+                "ssim": likeness,
+                "lpips": _mean(distances),
+                "fragments_per_pixel": fragments,
+                "evaluated_per_pixel": evaluated,
+                "entries_per_pixel": entries,
+                "area_per_pixel": area,
+                "gaussians": candidate.gaussians or len(splats),
+            }
+        )
+
+    views = [
+        replace(view, width=enlarge * view.width, height=enlarge * view.height)
+        for view in (shot.view for shot in shots)
+    ]
+    frames = frame_times(candidates, views, engine, repeats=repeats)
+    for report, frame in zip(reports, frames, strict=True):
+        report |= frame | {"engine": engine.name, "device": str(device), "views": len(shots)}
+    return reports
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if len(known) == len(values) else None
+
+
+@torch.no_grad()
+def covered_per_pixel(engine: Engine, inputs: RasterInputs) -> float:
+    """Pixels in the Gaussians' ellipses of sqrt(8) standard deviations, per pixel of the picture.
+
+    It is what viewers pay that know no thresholds and do not ask how faint a Gaussian is. They
+    draw quads, whose area is 4 / pi times as large. The pixels are counted, not estimated.
+
+    Args:
+        engine: counts them.
+        inputs: of one rasterization of ``Splats``.
+    """
+    assert isinstance(inputs.splats, Splats)
+    squared = torch.full_like(inputs.splats.opacities, SQUARED_RADIUS)
+    return float(covered(engine, inputs, squared).fragments_per_pixel)
+
+
+@torch.no_grad()
+def frame_times(
+    candidates: Sequence[Candidate],
+    views: Sequence[View],
+    engine: Engine,
+    *,
+    repeats: int = REPEATS,
+) -> list[dict[str, float]]:
+    """Time frames of splats in turns, as ``measure`` does.
+
+    Args:
+        candidates: the splats, all on the device of the views.
+        views: the cameras.
+        engine: draws them.
+        repeats: number of timed frames for each view and candidate.
+
+    Returns:
+        One dict a candidate: frame_ms and frame_ms_se, as those of ``measure``.
+    """
+    device = candidates[0].model.xyz.device
+    drawn = [candidate.model.splats() for candidate in candidates]
+    times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
+    turns = list(zip(candidates, drawn, times, strict=True))
+    for _ in range(repeats):
+        for rounds in times:
+            rounds.append([])
+        for view in views:
+            turns.reverse()  # neither is always the one that finds a cold cache
+            for candidate, splats, rounds in turns:
+                inputs = candidate.inputs(view, splats)
+                frame = partial(
+                    engine.rasterize, inputs, thresholds_for(inputs, candidate.thresholds)
+                )
+                rounds[-1].append(timed(frame, device)[1])
+    reports = []
+    for rounds in times:
+        medians = [statistics.median(frames) for frames in rounds]
+        spread = statistics.stdev(medians) if len(medians) > 1 else 0.0
+        reports.append(
+            {
+                "frame_ms": statistics.median(ms for frames in rounds for ms in frames),
+                "frame_ms_se": spread / len(medians) ** 0.5,
+            }
+        )
+    return reports

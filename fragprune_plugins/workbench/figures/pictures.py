@@ -1,0 +1,166 @@
+"""Pictures: renders, fragment-density maps, side-by-side panels, learning curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain, count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from fragprune_plugins.files.atomic import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from PIL.Image import Image
+
+
+COLOURS = "inferno"
+LABEL = "drawn fragments per pixel"
+
+BESIDE = tuple(
+    f"_{kind}"
+    for kind in (
+        *("fragments", "panel", "photograph", "before", "after", "overdraw"),
+        *(f"{model}_{shown}" for model in ("before", "after") for shown in ("fragments", "error")),
+    )
+)
+"""What commands add to a view's name for further pictures of it."""
+
+_STEM = 150  # bytes of a picture's name, of 255 that file systems allow
+
+
+def stems(names: Sequence[str]) -> list[str]:
+    """Names for the pictures of views, without ending: each its own, and one in a folder.
+
+    Views of one name get numbers, such as ``r_0`` and ``r_0-2``. What is no letter, digit, space or
+    one of ``._+-~()`` becomes ``_``.
+
+    Args:
+        names: of the views, as their files have them.
+    """
+    taken: set[str] = set()
+    found = []
+    for name in names:
+        plain = "".join(c if c.isalnum() or c in "._+-~() " else "_" for c in name)
+        stem = Path(plain).stem.lstrip(".").encode()[:_STEM].decode(errors="ignore") or "view"
+        # Some file systems take upper for lower case.
+        for each in chain([stem], (f"{stem}-{number}" for number in count(2))):
+            files = {each.lower() + beside for beside in ("", *BESIDE)}
+            if taken.isdisjoint(files):
+                break
+        taken |= files
+        found.append(each)
+    return found
+
+
+def save_image(path: Path, image: Tensor) -> None:
+    """Write an image (3, H, W), clamped to [0, 1], as 8-bit PNG.
+
+    Raises:
+        OutputError: the file cannot be written. Every function here raises it.
+    """
+    with replacing(path) as temporary:
+        picture(image).save(temporary, format="PNG")
+
+
+def picture(image: Tensor) -> Image:
+    """An image (3, H, W), clamped to [0, 1], with 8 bits a channel."""
+    from PIL import Image
+
+    return Image.fromarray(_bytes(image))
+
+
+def save_heatmap(path: Path, fragments: Tensor, limit: float) -> None:
+    """Write fragments per pixel (H, W) as colours with their scale.
+
+    Args:
+        path: the PNG.
+        fragments: (H, W) counts.
+        limit: the count at the top of the scale; use one value for pictures to compare.
+    """
+    save_panel(path, [("", fragments)], limit)
+
+
+def save_map(path: Path, values: Tensor, limit: float) -> None:
+    """Write values (H, W) as colours, one pixel for each, without a scale: ``colour_stops`` has it.
+
+    Args:
+        path: the PNG.
+        values: 0 or more.
+        limit: the value at the top of the scale; what is larger looks like it.
+    """
+    from matplotlib import colormaps
+    from PIL import Image
+
+    levels = (255 * values.detach().float().cpu() / max(limit, 1e-9)).clamp(0, 255).round()
+    shown = Image.fromarray(levels.byte().numpy(), mode="P")
+    shown.putpalette(colormaps[COLOURS](range(256), bytes=True)[:, :3].tobytes())
+    with replacing(path) as temporary:
+        shown.save(temporary, format="PNG")
+
+
+def colour_stops(count: int = 9) -> list[str]:
+    """Colours of maps from 0 to their limit, evenly spaced, as ``#rrggbb``."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colormaps[COLOURS](at / (count - 1))) for at in range(count)]
+
+
+def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float) -> None:
+    """Write pictures side by side under their titles; counts (H, W) become colours.
+
+    Args:
+        path: the PNG or JPG.
+        pictures: (title, picture), where a picture is (3, H, W) RGB or (H, W) counts, of one size.
+        limit: the count at the top of the colour scale, which all (H, W) share.
+    """
+    from matplotlib.figure import Figure
+    from mpl_toolkits.axes_grid1 import ImageGrid  # type: ignore[import-untyped]
+
+    height, width = pictures[0][1].shape[-2:]
+    tall = min(4.5, max(2.2, 3.6 * height / width))
+    wide = tall * width / height
+    maps = any(picture.ndim == 2 for _, picture in pictures)
+    figure = Figure(figsize=((wide + 0.08) * len(pictures) + 0.9 * maps + 0.3, tall + 0.55))
+    grid: Any = ImageGrid(
+        figure,
+        111,
+        nrows_ncols=(1, len(pictures)),
+        axes_pad=0.08,
+        cbar_mode="single" if maps else None,
+        cbar_size=0.12,
+        cbar_pad=0.1,
+    )
+    for axes, (title, picture) in zip(grid, pictures, strict=True):
+        axes.set_axis_off()
+        axes.set_title(title, fontsize=9)
+        if picture.ndim == 3:
+            axes.imshow(_bytes(picture), interpolation="nearest")
+        else:
+            shown = axes.imshow(
+                picture.detach().cpu().numpy(),
+                vmin=0,
+                vmax=max(limit, 1.0),
+                cmap=COLOURS,
+                interpolation="nearest",
+            )
+            grid.cbar_axes[0].colorbar(shown, label=LABEL)
+    _save(path, figure)
+
+
+def _bytes(image: Tensor) -> np.ndarray[Any, Any]:
+    values: np.ndarray[Any, Any] = image.detach().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+    return np.round(255 * values).astype(np.uint8)
+
+
+def _save(path: Path, figure: Figure) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    with replacing(path) as temporary:
+        kind = path.suffix[1:] or "png"
+        figure.savefig(temporary, format=kind, dpi=130, bbox_inches="tight")

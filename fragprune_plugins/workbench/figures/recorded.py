@@ -1,0 +1,56 @@
+"""Takes out of a record how its models are drawn, and what they were measured against."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.files.records import DOOR, Record, located
+from fragprune_plugins.hosts.photographs import Photographs
+
+_NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}
+"""Fields of ``RasterInputs`` that a record may set to a number."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The "photographs" of a record.
+
+    Attributes:
+        photographs: the scene.
+        models: the model before and the model after; joint learning leaves the latter alone.
+        filtered: whether the models may be such as only their host's rules draw; see ``read_ply``.
+        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
+    """
+
+    photographs: Photographs
+    models: tuple[Path, ...]
+    filtered: bool
+    drawing: Mapping[str, Any]
+
+
+def recorded(record: Record) -> Recorded | None:
+    """The photographs and models of a record; None if it names none.
+
+    Raises:
+        RecordError: they are of other types.
+    """
+    with DOOR.stated(record.path) as reading:
+        values = record.data.get("photographs")
+        if values is None:
+            return None
+        reading.place = "data.photographs"
+        folder = record.path.parent
+        models = tuple(located(each, folder) for each in values["models"])
+        if not 1 <= len(models) <= 2:
+            raise ValueError(f"{len(models)} models")
+        drawing = dict(values["drawing"])
+        for name, value in drawing.items():
+            number = isinstance(value, int | float) and 0 <= value < 1e6
+            if not (number if name in _NUMBERS else name == "compensation"):
+                raise ValueError(f"{name} is {value!r}")
+        filtered = bool(values["filtered"])
+        scene = values | {"folder": located(values["folder"], folder)}
+        return Recorded(Photographs.from_dict(scene), models, filtered, drawing)

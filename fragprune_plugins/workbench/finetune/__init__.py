@@ -1,0 +1,464 @@
+"""``fragprune finetune``: learns a trained splat's thresholds from photographs, or from itself."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files.atomic import locked
+from fragprune_plugins.learning.interruption import sigterm_interrupts
+from fragprune_plugins.learning.ranks import Ranks, joined, launched
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.workbench.commands.common import (
+    DATA_HELP,
+    FILE,
+    MODEL,
+    TRAINED_ON,
+    Command,
+    OutFile,
+    Report,
+    config_option,
+    dropping,
+    engine_options,
+    image_options,
+    log_option,
+    one_voice,
+    open_engine,
+    photographs_for,
+    require_place,
+    require_several,
+    shard_option,
+)
+from fragprune_plugins.workbench.commands.learning import learning_options, resuming_options
+from fragprune_plugins.workbench.models import formats
+from fragprune_plugins.workbench.models import model as models
+
+if TYPE_CHECKING:
+    from fragprune_plugins.engines import Engine
+    from fragprune_plugins.workbench.finetune.loop import FinetuneResult
+    from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+    from fragprune_plugins.workbench.finetune.searching import Bounded
+    from fragprune_plugins.workbench.scenes.dataset import Dataset
+
+
+def _share(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> float | Literal["auto"] | None:
+    """A share in (0, 1], or auto."""
+    if value is None:
+        return None
+    if value == "auto":
+        return "auto"
+    try:
+        share = float(value)
+    except ValueError:
+        share = 0.0
+    if not 0 < share <= 1:
+        raise click.BadParameter(f"{value!r} is neither auto nor a number with 0 < X <= 1.")
+    return share
+
+
+@click.command("finetune", cls=Command)
+@click.argument("model", type=MODEL)
+@click.option(
+    "--out",
+    type=OutFile(*formats.ENDINGS),
+    required=True,
+    help="New model: .ply, whose sidecar goes beside it, or .spz, .sog, .glb, which hold the "
+    "thresholds themselves. .splat and .compressed.ply cannot hold any.",
+)
+@click.option(
+    "--data",
+    type=FILE,
+    help=f"{DATA_HELP} {TRAINED_ON}",
+)
+@click.option(
+    "--self",
+    "itself",
+    is_flag=True,
+    help="Learn from MODEL's own pictures instead of photographs. Cameras: those of --data or "
+    "--cameras; else all around MODEL, which suits an object. A scene seen from within (a room, a "
+    "street) needs its own cameras: those around it see its walls from behind.",
+)
+@click.option(
+    "--cameras",
+    type=FILE,
+    help="With --self: cameras.json of a 3DGS model, or transforms_*.json; every 8th is held out.",
+)
+@image_options
+@learning_options
+@log_option
+@config_option
+@click.option(
+    "--keep",
+    metavar="SHARE|auto",
+    callback=_share,
+    help="Before learning, remove Gaussians until this share is left, such as 0.8: first those "
+    "whose removal changes the training views least. auto keeps what the photographs need. "
+    "--target-speedup counts from what is left.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")
+@click.option(
+    "--views-per-step",
+    type=click.IntRange(min=1),
+    default=lambda: launched().size,
+    show_default="one for each process",
+    metavar="N",
+    help="Views whose mean loss a step descends on. Without --iters, steps are N times fewer; "
+    "learning rates are the square root of N times higher. More than one serves several "
+    "processes under torchrun, which draw them side by side.",
+)
+@shard_option
+@click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
+@click.option(
+    "--curves", type=OutFile(".png"), help="File for a picture of the learning curves (.png)."
+)
+@click.option(
+    "--drop-invisible",
+    "drop",
+    is_flag=True,
+    help="Leave out Gaussians that reach no pixel of any training or held-out view.",
+)
+@resuming_options(
+    "Keep the unfinished fine-tuning in OUT.fragprune-unfinished; 0 keeps it at Ctrl-C and "
+    "SIGTERM only.",
+)
+@engine_options
+@one_voice()
+def command(
+    model: Path,
+    out: Path,
+    data: Path | None,
+    itself: bool,
+    cameras: Path | None,
+    images: str,
+    resolution: int,
+    white_background: bool,
+    settings: Settings,
+    keep: float | Literal["auto"] | None,
+    max_drop: float | None,
+    seed: int,
+    shard: bool,
+    no_truncation: bool,
+    curves: Path | None,
+    drop: bool,
+    every: float,
+    again: bool,
+    engine: str,
+    device: str,
+    threads: int | None,
+) -> Report | None:
+    """Learn how far each Gaussian of MODEL must reach.
+
+    Thresholds and all other parameters adapt to each other on the photographs in --data. With
+    --train opacity, positions, shapes and colours stay bit for bit. OUT has the columns of
+    MODEL, and the thresholds go beside it into OUT.fragprune.safetensors; a .spz, .sog or .glb
+    holds them itself. The table compares both models on held-out views. A line below it measures
+    OUT without its thresholds, as other viewers draw it. Ctrl-C (exit code 130) and SIGTERM (143)
+    save what was learned so far.
+
+    The same command goes on where it was interrupted or killed. If OUT is finished already, it says
+    so and does nothing; --again begins anew.
+
+    With --portable no thresholds are learned: the Gaussians themselves cover less area, OUT needs
+    no sidecar, and every viewer draws it as it is. "area/pixel" in the table is what most web
+    viewers pay for: the pixels in all ellipses of sqrt(8) standard deviations.
+
+    With --self no photograph is read: MODEL's own pictures are what it must go on showing, also
+    between the cameras. PSNR is against those pictures then. The defaults are 1000 iterations at
+    --pressure 1.5e-4.
+
+    \b
+    Examples:
+      fragprune finetune point_cloud.ply --data scene --out pruned.ply --quick
+      fragprune finetune point_cloud.ply --data scene --out half.ply --target-speedup 2
+      fragprune finetune point_cloud.ply --data scene --out fast.ply --target-time 1.4
+      fragprune finetune point_cloud.ply --data scene --out good.ply --max-drop 0.05
+      fragprune finetune point_cloud.ply --data scene --out zero.ply --control
+      fragprune finetune point_cloud.ply --data scene --out light.ply --portable
+      fragprune finetune statue.ply --self --out pruned.ply
+      fragprune finetune statue.spz --self --out pruned.spz
+      fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
+    """
+    _require_sense(data, itself, cameras, settings, max_drop, keep)
+    if shard:
+        _require_shards(settings, itself, max_drop, keep, drop)
+    if launched().first:
+        require_place(out, model, thresholds=settings.truncate and not settings.portable)
+        click.get_current_context().with_resource(locked(out, wait=0, what="run"))
+
+    from copy import deepcopy
+
+    from fragprune_plugins.workbench.figures.evaluate import Candidate
+    from fragprune_plugins.workbench.finetune import finished as finetuned
+    from fragprune_plugins.workbench.finetune import resuming
+    from fragprune_plugins.workbench.finetune.loop import save
+    from fragprune_plugins.workbench.finetune.processes import part_of
+    from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+    from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
+    from fragprune_plugins.workbench.scenes.dataset import load_photographs
+
+    photographs = None
+    if data is not None or not itself:
+        remedy = "Pass --data FOLDER with photographs; without any, --self."
+        photographs = photographs_for(
+            model, data, images, resolution, white_background, remedy=remedy
+        )
+    rasterizer, where = open_engine(engine, device, threads)
+    truncation = settings.truncate and not no_truncation
+    whole = models.load(model, truncation=truncation, device="cpu" if shard else where)
+    if itself:
+        dataset = _own_pictures(
+            whole, data, cameras, resolution, white_background, seed, rasterizer
+        )
+    else:
+        assert photographs is not None
+        dataset = load_photographs(photographs)
+
+    checkpoints = Checkpoints(resuming.path_beside(out), every or None, tell=_say)
+    asked = resuming.configuration(*whole, dataset, settings, rasterizer.name)
+    asked |= {"drop_invisible": drop, "keep": keep, "max_drop": max_drop}
+    asked |= {"sharded": True} if shard else {}
+    with sigterm_interrupts():
+        with joined(where) as ranks:
+            finished = None
+            if again and ranks.first:
+                checkpoints.clear()
+            elif ranks.first:
+                finished = finetuned.finished(model, out, asked, curves)
+            if ranks.gather(finished is not None)[0]:
+                checkpoints.clear()
+                return finished
+            count = len(whole.splat)
+            if shard:
+                whole, rasterizer = part_of(whole, ranks, where), ShardedEngine(rasterizer, ranks)
+            # learning changes the store
+            start = Candidate(whole.splat, deepcopy(whole.thresholds), gaussians=count)
+            kept = _keep(whole, keep, dataset.to(where), rasterizer)
+            result, found = _learn(
+                kept, dataset, settings, max_drop, rasterizer, checkpoints, ranks
+            )
+            saved = _whole(result, ranks) if shard else result
+            if ranks.first:
+                save(out, saved)
+            truncated = saved.thresholds is not None
+            over = finetuned.Finetuned(
+                model=model,
+                out=out,
+                start=start,
+                result=result,
+                keep=keep,
+                removed=len(whole.splat) - len(kept.splat),
+                found=found,
+                dropped=None,
+                seed=seed,
+                truncated=ranks.gather(truncated)[0] if shard else truncated,
+                shards=ranks.size if shard else 1,
+            )
+            measured = None
+            if shard and not result.terminated:  # all draw, so all measure
+                measured = over.measured(dataset, rasterizer)
+        if not ranks.first:
+            return None
+    if result.terminated:  # after SIGTERM there is no time for measurements
+        return finetuned.terminated(model, out, result, found)
+    if drop:
+        saved, dropped = _drop_invisible(out, result, dataset, rasterizer)
+        over = replace(over, result=saved, dropped=dropped)
+    if curves is not None:
+        finetuned.draw_curves(curves, [asdict(point) for point in result.curves], saved.thresholds)
+    figures = measured or over.measured(dataset, rasterizer)
+    report = over.report(figures, dataset, photographs, asked)
+    if not result.interrupted:
+        checkpoints.clear()  # not before: a kill while measuring goes on from it too
+    return report
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _keep(
+    whole: models.Model, keep: float | Literal["auto"] | None, dataset: Dataset, engine: Engine
+) -> models.Model:
+    """The Gaussians that --keep leaves."""
+    from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
+
+    if keep is None:
+        return whole
+    if keep == "auto":
+        return keep_needed(whole, dataset.train, engine=engine, progress=True)
+    views = [shot.view for shot in dataset.train]
+    return keep_best(whole, keep, views, engine=engine, progress=True)
+
+
+def _learn(
+    model: models.Model,
+    dataset: Dataset,
+    settings: Settings,
+    max_drop: float | None,
+    engine: Engine,
+    checkpoints: Checkpoints,
+    ranks: Ranks,
+) -> tuple[FinetuneResult, Bounded | None]:
+    """Fine-tune once, or as often as --max-drop needs."""
+    from fragprune_plugins.workbench.finetune.loop import finetune
+    from fragprune_plugins.workbench.finetune.searching import strongest
+    from fragprune_plugins.workbench.prices.calibration import prices_of
+
+    splat, store = model
+    if max_drop is not None:
+        found = strongest(
+            splat,
+            dataset,
+            settings,
+            max_drop,
+            store=store,
+            engine=engine,
+            progress=True,
+            say=_say,
+            ranks=ranks,
+        )
+        return found.result, found
+    timed = settings.target_time is not None
+    result = finetune(
+        splat,
+        dataset,
+        settings,
+        store=store,
+        cost=prices_of(engine, splat.xyz.device, say=_say) if timed else None,
+        engine=engine,
+        progress=True,
+        checkpoints=checkpoints,
+        ranks=ranks,
+    )
+    return result, None
+
+
+def _whole(result: FinetuneResult, ranks: Ranks) -> FinetuneResult:
+    """The result with all Gaussians, in the first process; as it is in others."""
+    from fragprune_plugins.workbench.finetune.processes import whole_of
+
+    splat, store = whole_of(result.model, result.store, ranks)
+    return replace(result, model=splat, store=store) if ranks.first else result
+
+
+def _drop_invisible(
+    out: Path, result: FinetuneResult, dataset: Dataset, engine: Engine
+) -> tuple[FinetuneResult, dict[str, int]]:
+    """Write the result again without Gaussians that no view shows; also give the counts."""
+    from fragprune_plugins.workbench.finetune.loop import save
+    from fragprune_plugins.workbench.pruning.visibility import drop_invisible
+
+    size, views = out.stat().st_size, [shot.view for shot in (*dataset.train, *dataset.test)]
+    smaller, kept = drop_invisible(result.model, result.store, views, engine=engine)
+    left = replace(result, model=smaller, store=kept)
+    save(out, left)
+    return left, dropping(out, size, len(result.model), len(smaller))
+
+
+def _require_sense(
+    data: Path | None,
+    itself: bool,
+    cameras: Path | None,
+    settings: Settings,
+    max_drop: float | None,
+    keep: float | Literal["auto"] | None,
+) -> None:
+    """Prove, before any work, that it is clear what MODEL must look like.
+
+    Raises:
+        UsageError: nothing says so, two things do, or an option needs photographs.
+    """
+    if not itself and cameras is not None:
+        raise UsageError(
+            "options",
+            "--cameras without --self",
+            "photographs, or the model's own pictures from those cameras",
+            "Add --self, or pass --data FOLDER instead of --cameras.",
+        )
+    if data is not None and cameras is not None:
+        raise UsageError(
+            "options", "--data with --cameras", "one source of cameras", "Drop one of the two."
+        )
+    if itself and max_drop is not None:
+        raise UsageError(
+            "options",
+            "--self with --max-drop",
+            "photographs, and with them a control to lose against",
+            "Drop --max-drop; --pressure steers what --self may lose.",
+        )
+    if itself and not settings.truncate:
+        raise UsageError(
+            "options",
+            "--self with --control",
+            "something to learn: without truncation the model is its own target already",
+            "Drop --control; what it came in as is the comparison.",
+        )
+    if itself and keep == "auto":
+        raise UsageError(
+            "options",
+            "--self with --keep auto",
+            "photographs, whose error says what can be spared",
+            "Pass a share, such as --keep 0.9.",
+        )
+
+
+def _require_shards(
+    settings: Settings,
+    itself: bool,
+    max_drop: float | None,
+    keep: float | Literal["auto"] | None,
+    drop: bool,
+) -> None:
+    """Check that Gaussians which are divided among processes can learn what is asked for.
+
+    Raises:
+        UsageError: there is one process, or an option needs the whole model.
+    """
+    require_several()
+    asked = {
+        "--self": itself,
+        "--portable": settings.portable,
+        "--max-drop": max_drop is not None,
+        "--keep": keep is not None,
+        "--drop-invisible": drop,
+    }
+    if found := [name for name, given in asked.items() if given]:
+        raise UsageError(
+            "options",
+            f"--shard-gaussians with {', '.join(found)}",
+            "options that each process can follow with a part of the Gaussians",
+            "Leave one of them out.",
+        )
+
+
+def _own_pictures(
+    model: models.Model,
+    data: Path | None,
+    cameras: Path | None,
+    resolution: int,
+    white_background: bool,
+    seed: int,
+    engine: Engine,
+) -> Dataset:
+    """The pictures of a model from the cameras asked for."""
+    import torch
+
+    from fragprune_plugins.workbench.finetune.itself import own_pictures
+    from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
+    from fragprune_plugins.workbench.scenes.generated import around
+
+    held_out = None
+    if data is not None:
+        views, held_out = load_scene_cameras(data, white_background=white_background)
+        held_out = divided(held_out, resolution)
+    elif cameras is not None:
+        views = load_cameras(cameras, white_background=white_background)
+    else:
+        views = around(model.splat, background=torch.full((3,), float(white_background)), seed=seed)
+    return own_pictures(model, divided(views, resolution), held_out, engine=engine, seed=seed)

@@ -1,0 +1,305 @@
+"""What ``fragprune finetune`` reports: its data, its words, and the record beside its result."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from fragprune_plugins.errors import RecordError, SidecarError
+from fragprune_plugins.files import records
+from fragprune_plugins.learning.interruption import EXIT_CODE
+from fragprune_plugins.workbench.commands.common import Report, describe_dropped, describe_written
+from fragprune_plugins.workbench.models import formats
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torch import Tensor
+
+    from fragprune_plugins.engines import Engine
+    from fragprune_plugins.hosts.photographs import Photographs
+    from fragprune_plugins.workbench.figures.evaluate import Candidate
+    from fragprune_plugins.workbench.finetune.loop import FinetuneResult
+    from fragprune_plugins.workbench.finetune.searching import Bounded
+    from fragprune_plugins.workbench.scenes.dataset import Dataset
+
+_OF_RECORDS = {"curves", "photographs", "configuration", "text"}
+
+
+@dataclass(frozen=True, eq=False)
+class Finetuned:
+    """A fine-tuning that is over.
+
+    Attributes:
+        model: the file that came in.
+        out: the file that was written.
+        start: the model as it came in.
+        result: what was learned.
+        keep: the share of Gaussians to learn with, or how to choose it; None for all.
+        removed: Gaussians that went before learning.
+        found: what a search for the strongest truncation found; None without one.
+        dropped: counts of Gaussians that went at the end; None where that was not asked.
+        seed: of the order of views.
+        truncated: the result has thresholds, here or in another process.
+        shards: processes that hold a part of the Gaussians each; 1 where each holds them all.
+    """
+
+    model: Path
+    out: Path
+    start: Candidate
+    result: FinetuneResult
+    keep: float | Literal["auto"] | None
+    removed: int
+    found: Bounded | None
+    dropped: dict[str, int] | None
+    seed: int
+    truncated: bool
+    shards: int = 1
+
+    def measured(self, dataset: Dataset, engine: Engine) -> list[dict[str, Any]]:
+        """Figures on held-out views: before, after, without thresholds, and of the control.
+
+        The last two only where there are any.
+        """
+        from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+
+        result = self.result
+        whole = result.progress.gaussians if self.shards > 1 else None
+        candidates = [self.start, Candidate(result.model, result.store, gaussians=whole)]
+        if self.truncated:
+            candidates.append(Candidate(result.model, gaussians=whole))
+        if self.found is not None:
+            candidates.append(Candidate(self.found.control.model))
+        return measure(candidates, dataset.test, engine=engine)
+
+    def report(
+        self,
+        figures: Sequence[dict[str, Any]],
+        dataset: Dataset,
+        photographs: Photographs | None,
+        asked: dict[str, Any],
+    ) -> Report:
+        """Leave a record, and say what came of it.
+
+        Args:
+            figures: as ``measured``.
+            dataset: whose held-out views it was measured on.
+            photographs: where they lie, for the record; None where there are none.
+            asked: the configuration, by which the same command is known again.
+        """
+        result, settings = self.result, self.result.settings
+        before, after, *without = figures
+        control = without.pop() if self.found is not None else None
+        done = result.progress
+        data = {
+            "model": str(self.model),
+            "out": str(self.out),
+            "target": after["target"],
+            "before": before,
+            "after": after,
+            "untruncated": without[0] if without else None,
+            "keep": self.keep,
+            "dropped": self.dropped,
+            "speedup": done.speedup,
+            "faster": done.faster,
+            "target_reached": done.target_reached,
+            "interrupted": result.interrupted,
+            "resumed_at": result.resumed_at,
+            "already_finished": False,
+            "iterations": done.steps,
+            "skipped": done.skipped,
+            "pressure": done.pressure if settings.truncate else None,
+            "train_seconds": result.train_seconds,
+            "engine": result.engine,
+            "device": after["device"],
+            "adapter": None,
+            "seed": self.seed,
+            "shards": self.shards,
+            "settings": settings.as_dict(),
+            "max_drop": None if self.found is None else self.found.as_dict(),
+        }
+        data["control"] = control or records.control_of(data, records.files(self.out.parent))
+        text = self._text(data, len(dataset.test), len(dataset.train) + len(dataset.test))
+        more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
+        if not result.interrupted:
+            more |= {"configuration": asked, "text": text}
+        if photographs is not None:
+            more["photographs"] = photographs.as_dict() | {
+                "models": [str(self.model.resolve()), str(self.out.resolve())],
+                "filtered": False,
+                "drawing": {},
+            }
+        records.leave(self.out, "finetune", data | more)
+        return Report(data, text, exit_code=130 if result.interrupted else 0)
+
+    def _text(self, data: dict[str, Any], held_out: int, views: int) -> str:
+        """What a person reads.
+
+        Args:
+            data: of the report.
+            held_out: number of held-out views.
+            views: number of all views.
+        """
+        from fragprune_plugins.files import sidecar
+        from fragprune_plugins.workbench.figures.wording import describe, outcome
+
+        result, settings, before = self.result, self.result.settings, data["before"]
+        pressure = f" at pressure {data['pressure']:.2g}" if settings.truncate else ""
+        lines = [
+            describe({"before": before, "after": data["after"]}),
+            "",
+            outcome("finetune", data, data["control"]),
+            f"{result.engine} engine, {data['iterations']} iterations{pressure} in "
+            f"{result.train_seconds:.0f} s.",
+        ]
+        if self.shards > 1:
+            lines.append(
+                f"{self.shards} processes held a part of the Gaussians each: a frame's time "
+                "includes what they send each other."
+            )
+        if self.found is not None:
+            lines.append(_describe_bound(data["max_drop"], held_out))
+        if result.interrupted:
+            of = f"{data['iterations']} of {settings.iterations}"
+            lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
+        if data["skipped"]:
+            lines.append(f"Skipped {data['skipped']} steps whose gradients were not finite.")
+        if self.keep is not None:
+            lines.append(
+                f"Removed {self.removed:,} of {len(self.start.model):,} Gaussians before learning, "
+                "those whose removal changed the training views least."
+            )
+        if self.dropped:
+            why = f"which reach no pixel of the {views} views"
+            lines.append(describe_dropped(self.dropped, why))
+        plain = data["untruncated"]
+        if plain is not None:
+            lines.append(describe_untruncated(before, plain))
+        form = formats.named(self.out)
+        if settings.portable:
+            held = ", which needs no sidecar: every viewer draws it as it is"
+            lines.append(describe_written(self.out, held))
+        elif not form.paired:
+            lines.append(
+                describe_written(self.out, ", which holds the thresholds" if plain else "")
+            )
+        else:
+            together = " Keep the two together." if plain is not None else ""
+            lines.append(f"Wrote {self.out} and {sidecar.path_beside(self.out).name}.{together}")
+        if form.keeps:
+            lines.append("The figures above are of the model as it was learned, before rounding.")
+        return "\n".join(lines)
+
+
+def finished(model: Path, out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
+    """The report of the same command, if it has written ``out`` already; else None."""
+    from fragprune_plugins.files import sidecar
+    from fragprune_plugins.workbench.models import model as models
+
+    if not out.is_file():
+        return None
+    try:
+        record = records.beside(out)
+        if not formats.named(out).paired:
+            whole = True  # the file holds its thresholds itself
+        elif asked["portable"]:
+            whole = sidecar.find(out) is None
+        else:
+            whole = sidecar.belongs(out)
+        done = record is not None and record.command == "finetune" and whole
+    except (RecordError, SidecarError):
+        return None
+    written = None if record is None else Path(str(record.data.get("out"))).name
+    if record is None or not done or record.data.get("configuration") != asked:
+        return None
+    if written != out.name:  # a model of the same name in another format
+        return None
+    data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
+    if curves is not None:
+        store = models.load(out).thresholds
+        learned = None if store is None else store.values.detach()
+        draw_curves(curves, record.data["curves"], learned)
+    text = (
+        f"{record.data['text']}\n{out} was finished before: nothing was done. "
+        "--again fine-tunes again."
+    )
+    given = {"model": str(model), "out": str(out)}  # the record names them from its own folder
+    return Report(data | given | {"already_finished": True}, text)
+
+
+def terminated(model: Path, out: Path, result: FinetuneResult, found: Bounded | None) -> Report:
+    """The report after SIGTERM: the model is saved, and nothing is measured."""
+    done, asked = result.progress, result.settings
+    data = {
+        "model": str(model),
+        "out": str(out),
+        "before": None,
+        "after": None,
+        "interrupted": True,
+        "iterations": done.steps,
+        "train_seconds": result.train_seconds,
+        "engine": result.engine,
+        "settings": asked.as_dict(),
+    }
+    alone = asked.portable or not formats.named(out).paired
+    wrote = f"{out}" if alone else f"{out} and its sidecar"
+    at = f"SIGTERM at {done.steps} of {asked.iterations} iterations."
+    text = f"{at} Wrote {wrote}. {_goes_on(found)}"
+    return Report(data, text, exit_code=EXIT_CODE)
+
+
+def draw_curves(path: Path, points: Sequence[dict[str, Any]], thresholds: Tensor | None) -> None:
+    """Draw the learning curves of --curves, if any step was made.
+
+    Args:
+        path: of the PNG.
+        points: one for each step, as plain values.
+        thresholds: (N,) learned ones, or None.
+    """
+    if points:
+        from fragprune_plugins.workbench.report.page import save_learning
+
+        save_learning(path, points, thresholds)
+
+
+def _goes_on(found: Bounded | None) -> str:
+    if found is None:
+        return "The same command goes on from there."
+    return "With --max-drop the same command begins anew."
+
+
+def _describe_bound(found: dict[str, Any], views: int) -> str:
+    """A line on what --max-drop found."""
+    if "loss" not in found:
+        return "No training was compared with the control."
+    tried = f"of {len(found['trials'])} trained"
+    chosen = f"the strongest truncation {tried}" if found["met"] else f"the least loss {tried}"
+    missed = "" if found["met"] else f" The bound of {found['bound']:g} dB was missed."
+    return (
+        f"Loss against the control: {found['loss']:.3f} dB at pressure {found['pressure']:.2g}, "
+        f"{chosen}. The pressure was chosen on these {views} views; others of their kind may "
+        f"differ by some {found['loss_se']:.2f} dB.{missed}"
+    )
+
+
+def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
+    """A line on the fine-tuned model without its thresholds.
+
+    Args:
+        before: measurement of the model before fine-tuning.
+        plain: measurement of the fine-tuned model without thresholds.
+    """
+    from fragprune_plugins.workbench.figures.wording import FELL
+
+    own = plain["target"] == "itself"
+    compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
+    advice = ""
+    if before["psnr"] is not None and plain["psnr"] < before["psnr"] - FELL:
+        advice = " For viewers that ignore thresholds: --portable."
+    return (
+        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
+        f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "
+        f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
+        f"{advice}"
+    )

@@ -1,0 +1,83 @@
+"""A dataset without photographs: what a model must show is what it shows as it came in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
+from fragprune_plugins.workbench.scenes.generated import Named, around, between, hold_out
+
+
+@dataclass(frozen=True, eq=False)
+class OwnPicture(Shot):
+    """A camera, and the picture that a model gives there.
+
+    Attributes:
+        draw: draws it, (3, H, W). It is asked at every use: a forward pass more in a step costs
+            less than to hold the pictures of hundreds of views, and rounds nothing.
+    """
+
+    target: ClassVar[str] = "itself"
+
+    draw: Callable[[View], Tensor]
+
+    __repr__ = one_line
+
+    @property
+    def image(self) -> Tensor:
+        """(3, H, W) RGB on the view's device, not clamped."""
+        return self.draw(self.view)
+
+
+def own_pictures(
+    model: Model | SplatFile,
+    cameras: Named | None = None,
+    held_out: Named | None = None,
+    *,
+    engine: str | Engine = "auto",
+    seed: int = 0,
+) -> Dataset:
+    """A model's own pictures, to learn its thresholds from without photographs.
+
+    It is drawn as it came in: untruncated, or truncated by the thresholds that it has.
+
+    Args:
+        model: what ``load`` gave, or a splat without thresholds. It is kept.
+        cameras: named views to learn from; views between near ones are added. None takes cameras
+            all around the splat, which suit an object but no scene seen from within.
+        held_out: named views for the figures; every eighth of ``cameras`` when None.
+        engine: a name or an engine.
+        seed: of what is generated.
+
+    Raises:
+        DatasetError: fewer than two cameras.
+        EngineError: no such engine here.
+    """
+    splat, store = (model, None) if isinstance(model, SplatFile) else model
+    drawer = engine_for(engine, splat.xyz.device) if isinstance(engine, str) else engine
+    splats = splat.splats()
+    thresholds = None if store is None or store.neutral else store.values.detach().clone()
+
+    @torch.no_grad()
+    def draw(view: View) -> Tensor:
+        return drawer.rasterize(RasterInputs(view, splats, planes=()), thresholds).image
+
+    views = around(splat, seed=seed) if cameras is None else cameras
+    if held_out is None:
+        views, held_out = hold_out(views)
+    train, test = (
+        [OwnPicture(name, view, draw) for name, view in part]
+        for part in ([*views, *between(views, seed=seed)], held_out)
+    )
+    return Dataset(train, test).to(splat.xyz.device)

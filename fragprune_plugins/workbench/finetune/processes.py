@@ -1,0 +1,254 @@
+"""How several processes learn one model: each holds a copy of it, or each a part.
+
+Replicas sum their gradients, and stay equal to the bit. Shards have the gradients of their own
+Gaussians, which the ``ShardedEngine`` brings to them, and tell each other figures alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import accumulate
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.learning.ranks import Ranks, fingerprint
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
+from fragprune_plugins.workbench.models.model import Model
+
+
+class Replicas:
+    """Processes that each hold the whole model; often there is one.
+
+    Args:
+        ranks: the processes.
+    """
+
+    sharded = False
+
+    def __init__(self, ranks: Ranks) -> None:
+        self.ranks = ranks
+
+    def exchange(
+        self,
+        leaves: Sequence[Tensor],
+        rows: Sequence[Sequence[float]],
+        views: int,
+        flags: Sequence[bool],
+    ) -> tuple[Tensor, list[bool]]:
+        """Make gradients those of all views of a step; tell each process all figures.
+
+        It is one reduction of one tensor.
+
+        Args:
+            leaves: the tensors that learn. Their gradients are changed in place, and are there
+                afterwards if any process has one.
+            rows: four figures of each view that this process drew.
+            views: how many all processes drew.
+            flags: what this process noticed.
+
+        Returns:
+            (views, 4) figures of all views; and of each flag, whether any process has it.
+
+        Raises:
+            RanksError: another process is gone.
+        """
+        table = leaves[0].new_zeros(views, 4)
+        if rows:
+            table[self.ranks.rank :: self.ranks.size] = table.new_tensor(rows)
+        noticed = table.new_tensor(flags)
+        there = table.new_tensor([leaf.grad is not None for leaf in leaves])
+        told = self._told(leaves)
+        *sums, there, noticed, table = self._summed([*told, there, noticed, table])
+        for leaf, total, some in zip(leaves, sums, there.tolist(), strict=True):
+            leaf.grad = self._gradient(leaf, total) if some else None
+        return table, [some > 0 for some in noticed.tolist()]
+
+    def _told(self, leaves: Sequence[Tensor]) -> list[Tensor]:
+        """What the others are told of each leaf's gradient."""
+        return [torch.zeros_like(each) if each.grad is None else each.grad for each in leaves]
+
+    def _gradient(self, leaf: Tensor, total: Tensor) -> Tensor:
+        """A leaf's gradient, from what all processes told together."""
+        return total
+
+    def _summed(self, parts: Sequence[Tensor]) -> list[Tensor]:
+        flat = torch.cat([part.reshape(-1) for part in parts])
+        self.ranks.sum(flat)
+        ends = accumulate(part.numel() for part in parts)
+        return [
+            flat[end - part.numel() : end].view_as(part)
+            for end, part in zip(ends, parts, strict=True)
+        ]
+
+    def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Stop unless all processes hold the same bits.
+
+        Raises:
+            RanksError: they differ.
+        """
+        known = {name: fingerprint(tensor) for name, tensor in tensors.items()}
+        self.ranks.agree(known, f"fine-tuning, after step {step}")
+
+    def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
+        """What decides the result, in the words of all processes together."""
+        return configuration
+
+    def total(self, count: int) -> int:
+        """Gaussians of the whole model, from those that this process holds."""
+        return count
+
+    def everywhere(self, rows: Tensor) -> Tensor:
+        """The rows of all Gaussians, in each process."""
+        return rows
+
+    def whole(self, rows: Tensor) -> Tensor:
+        """The rows of all Gaussians, in the first process; there may be none in others."""
+        return rows
+
+    def own(self, rows: Tensor) -> Tensor:
+        """This process' rows, of those of all Gaussians."""
+        return rows
+
+
+class Shards(Replicas):
+    """Processes that each hold a part of the model's Gaussians.
+
+    Args:
+        ranks: the processes.
+        count: of this process' Gaussians.
+    """
+
+    sharded = True
+
+    def __init__(self, ranks: Ranks, count: int) -> None:
+        super().__init__(ranks)
+        self.counts: list[int] = ranks.gather(count)
+
+    def _told(self, leaves: Sequence[Tensor]) -> list[Tensor]:
+        """0, or NaN for a gradient that is not finite: as in a sum, it is everybody's then."""
+        none = leaves[0].new_zeros(())
+        return [none if each.grad is None else (0 * each.grad).sum() for each in leaves]
+
+    def _gradient(self, leaf: Tensor, total: Tensor) -> Tensor:
+        return total.expand_as(leaf).clone() if leaf.grad is None else leaf.grad + total
+
+    def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Do nothing: no two processes hold the same Gaussian."""
+
+    def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
+        """As the processes have it, but for the digests of their parts, which are in a list."""
+        parts = {name: self.ranks.gather(configuration[name]) for name in ("model", "thresholds")}
+        return configuration | parts
+
+    def total(self, count: int) -> int:
+        """Gaussians of the whole model."""
+        return sum(self.counts)
+
+    def everywhere(self, rows: Tensor) -> Tensor:
+        """The rows of all Gaussians, in each process."""
+        size = self.ranks.size
+        return self.ranks.exchange(
+            rows.detach().repeat(size, *(1 for _ in rows.shape[1:])),
+            [len(rows)] * size,
+            self.counts,
+        )
+
+    def whole(self, rows: Tensor) -> Tensor:
+        """The rows of all Gaussians in the main memory of the first process; elsewhere none."""
+        none = [0] * (self.ranks.size - 1)
+        by = self.counts if self.ranks.first else [0, *none]
+        return self.ranks.exchange(rows.detach().cpu(), [len(rows), *none], by)
+
+    def own(self, rows: Tensor) -> Tensor:
+        """This process' rows, of those of all Gaussians."""
+        start = sum(self.counts[: self.ranks.rank])
+        return rows[start : start + self.counts[self.ranks.rank]]
+
+
+def processes_of(engine: Engine, ranks: Ranks, count: int) -> Replicas:
+    """What processes are to each other that draw with an engine and hold ``count`` Gaussians."""
+    return Shards(ranks, count) if isinstance(engine, ShardedEngine) else Replicas(ranks)
+
+
+def expect_divisible(settings: Settings, engine: Engine, ranks: Ranks) -> None:
+    """Check that several processes can share the work of settings.
+
+    Raises:
+        UsageError: they cannot.
+    """
+    if settings.portable and isinstance(engine, ShardedEngine):
+        raise UsageError(
+            "finetune",
+            "portable, and Gaussians divided among processes",
+            "thresholds, or the whole model in each process",
+            "Leave --portable or --shard-gaussians out.",
+        )
+    if not ranks.several:
+        return
+    if settings.target_time is not None:
+        raise UsageError(
+            "target time",
+            f"{ranks.size} processes, which would disturb each other's measurements",
+            "one process",
+            "Use --target-speedup, or start one process.",
+        )
+    if settings.views_per_step % ranks.size:
+        raise UsageError(
+            "views per step",
+            f"{settings.views_per_step} for {ranks.size} processes",
+            f"a multiple of {ranks.size}",
+            "Change --views-per-step.",
+        )
+
+
+def part_of(model: Model, ranks: Ranks, device: torch.device | str) -> Model:
+    """This process' share of a model's Gaussians, on a device: successive rows.
+
+    Args:
+        model: the same in all processes.
+        ranks: the processes.
+        device: where this one learns and draws.
+    """
+    count = len(model.splat)
+    start, end = (count * rank // ranks.size for rank in (ranks.rank, ranks.rank + 1))
+    rows = torch.arange(count, device=model.splat.xyz.device)
+    mask = (rows >= start) & (rows < end)
+    splat = model.splat.keep(mask).to(device)
+    if model.thresholds is None:
+        return Model(splat)
+    return Model(splat, _store_of(model.thresholds, lambda each: each[mask], device))
+
+
+def whole_of(
+    splat: SplatFile, store: ThresholdStore, ranks: Ranks
+) -> tuple[SplatFile, ThresholdStore]:
+    """The whole model, in the main memory of the first process, from everyone's part.
+
+    Other processes get one without Gaussians.
+
+    Raises:
+        RanksError: another process is gone.
+    """
+    shards = Shards(ranks, len(splat))
+    parts = vars(splat).items()
+    rows = {name: shards.whole(each) for name, each in parts if isinstance(each, Tensor)}
+    return replace(splat, **rows), _store_of(store, shards.whole, "cpu")
+
+
+def _store_of(
+    store: ThresholdStore, rows: Callable[[Tensor], Tensor], device: torch.device | str
+) -> ThresholdStore:
+    """Thresholds with their moments, after a change of rows."""
+    known = store.state_dict().items()
+    state = {name: rows(each) if isinstance(each, Tensor) else each for name, each in known}
+    changed = ThresholdStore(len(state["logits"]), device)
+    changed.load_state_dict(state)
+    return changed

@@ -1,0 +1,181 @@
+"""An unfinished fine-tuning is kept in a file, from which the same fine-tuning goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from fragprune_plugins.constants import VERSION
+from fragprune_plugins.errors import CheckpointError, OutputError
+from fragprune_plugins.files import checkpoints
+from fragprune_plugins.files.atomic import digest
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.hooks import schedule_for
+from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph, Shot
+from fragprune_plugins.workbench.scenes.images import DOOR
+
+SUFFIX = ".fragprune-unfinished"
+EVERY = 300.0
+"""Seconds between two checkpoints."""
+
+
+def path_beside(out: Path) -> Path:
+    """Where the checkpoint of a fine-tuning lies whose result goes into a model file."""
+    return Path(out).with_suffix(SUFFIX)
+
+
+@dataclass
+class Checkpoints:
+    """Keeps an unfinished fine-tuning in a file.
+
+    Attributes:
+        path: the file; see ``path_beside``.
+        seconds: between two checkpoints; None for none but at Ctrl-C and SIGTERM.
+        steps: write one after every so many steps as well.
+        tell: is told in a sentence from which step the fine-tuning goes on.
+    """
+
+    path: Path
+    seconds: float | None = EVERY
+    steps: int | None = None
+    tell: Callable[[str], None] = lambda _: None
+    _last: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self) -> None:
+        self.path = Path(self.path)
+
+    def due(self, step: int) -> bool:
+        """Whether it is time for a checkpoint after a step."""
+        if self.steps is not None and step % self.steps == 0:
+            return True
+        return self.seconds is not None and time.monotonic() - self._last >= self.seconds
+
+    def save(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
+        """Write a checkpoint. Where it cannot be written, the one before stays, and that is told.
+
+        Raises:
+            DivergedError: a tensor holds NaN or infinity.
+        """
+        try:
+            checkpoints.save(self.path, tensors, values)
+        except OutputError as error:  # the fine-tuning is worth more than its checkpoint
+            self.tell(f"no checkpoint was written. {error}")
+        self._last = time.monotonic()
+
+    def load(self, asked: dict[str, Any], device: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Read the checkpoint; ({}, {}) if there is none.
+
+        Args:
+            asked: the ``configuration`` of the fine-tuning that is to go on.
+            device: of the tensors.
+
+        Raises:
+            CheckpointError: it cannot be read, or is another fine-tuning's.
+        """
+        if not self.path.exists():
+            return {}, {}
+        tensors, values = checkpoints.load(self.path, device)
+        found = values.get("configuration", {})
+        if differ := differences(found, asked):
+            other = [name for name in differ if name != "schedule"] or differ  # settings make it
+            raise CheckpointError(
+                str(self.path),
+                f"an unfinished fine-tuning with other {', '.join(other)}",
+                "the fine-tuning that was asked for",
+                "Repeat the command that was interrupted to finish it, or begin anew with --again.",
+            )
+        return tensors, values
+
+    def clear(self) -> None:
+        """Remove the file: the result is saved."""
+        self.path.unlink(missing_ok=True)
+
+
+def configuration(
+    model: SplatFile,
+    store: ThresholdStore | None,
+    dataset: Dataset,
+    settings: Settings,
+    engine: str,
+    schedule: Schedule | None = None,
+) -> dict[str, Any]:
+    """What decides the result of a fine-tuning, as plain values.
+
+    Args:
+        model: as it comes in.
+        store: the thresholds that it comes in with; None for neutral ones.
+        dataset: its files are read whole, for their digest.
+        settings: of the fine-tuning.
+        engine: the engine's name.
+        schedule: gives the plan of each step; when None a plugin's, or the default one.
+    """
+    shots = (*dataset.train, *dataset.test)
+    known = {} if store is None or store.neutral else store.numbers
+    return {
+        "version": VERSION,
+        "model": _digest(each for each in vars(model).values() if isinstance(each, Tensor)),
+        "thresholds": _digest(known.values()),
+        "photographs": _digest(each for shot in shots for each in _of(shot)),
+        "engine": engine,
+        "plugins": deciding(),
+        "schedule": (schedule or schedule_for(settings)).as_dict(),
+        "device": model.xyz.device.type,
+        **settings.as_dict(),
+    }
+
+
+def deciding() -> list[str]:
+    """Names of the plugins that may decide about thresholds or about the schedule."""
+    plugins = installed()
+    hooks = (hookspecs.fragprune_truncate, hookspecs.fragprune_create_schedule)
+    return sorted({name for hook in hooks for name in plugins.answering(hook)})
+
+
+def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """Names under which two configurations differ."""
+    return [key for key in sorted(one | other) if one.get(key) != other.get(key)]
+
+
+def _of(shot: Shot) -> Iterable[Tensor | str]:
+    yield f"{shot.name} {shot.view.width} {shot.view.height} {shot.target}"
+    yield from (shot.view.viewmatrix, shot.view.projmatrix, shot.view.background)
+    if isinstance(shot, Photograph):
+        yield _content(shot.path)
+        if shot.lens is not None:
+            yield repr(shot.lens)
+        if shot.mask is not None:
+            yield _content(shot.mask)
+
+
+def _content(image: Path) -> str:
+    with DOOR.reading(image) as reading:
+        version = os.fstat(reading.file.fileno())
+    return _photograph(image, version.st_mtime_ns, version.st_size)
+
+
+@lru_cache(maxsize=10_000)  # a command asks for its configuration more than once
+def _photograph(path: Path, changed: int, size: int) -> str:
+    """The digest of a photograph, read once for as long as it does not change."""
+    return digest(path)
+
+
+def _digest(parts: Iterable[Tensor | str]) -> str:
+    sha = hashlib.sha256()
+    for part in parts:
+        text = part if isinstance(part, str) else f"{part.dtype} {tuple(part.shape)}"
+        sha.update(text.encode(errors="surrogatepass") + b"\0")
+        if isinstance(part, Tensor):
+            sha.update(part.detach().cpu().contiguous().numpy().tobytes())
+    return sha.hexdigest()

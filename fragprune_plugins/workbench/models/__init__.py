@@ -1,0 +1,1 @@
+"""Model files: splats with their thresholds, in every format that holds them."""

@@ -1,0 +1,55 @@
+""".splat, of antimatter15's viewer: 32 bytes a Gaussian, without header, SH or thresholds.
+
+xyz 3 float32, standard deviations 3 float32, r g b opacity 4 uint8, quaternion w x y z 4 uint8
+(128 + 128 q).
+"""
+
+from __future__ import annotations
+
+from typing import BinaryIO
+
+import numpy as np
+from torch import Tensor
+
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.reading import Reading
+from fragprune_plugins.workbench.models.formats.values import (
+    SH_C0,
+    array,
+    byte,
+    opacities_of,
+    quaternions_of,
+    splat_of,
+)
+
+_ROW = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
+_SCALE_MIN = 1e-30  # some writers leave 0, which has no logarithm
+
+
+def read(reading: Reading) -> SplatFile:
+    """The Gaussians of an open file."""
+    if reading.size % _ROW.itemsize:
+        raise EOFError(f"{reading.size} bytes are no multiple of {_ROW.itemsize}")
+    data = np.frombuffer(reading.take(reading.size), _ROW)
+    if (data["scale"] < 0).any():
+        raise ValueError("negative standard deviations")
+    rgba = data["rgba"] / np.float32(255)
+    return splat_of(
+        xyz=data["xyz"],
+        colours=(rgba[:, :3] - 0.5) / SH_C0,
+        rest=np.zeros((len(data), 0, 3)),
+        opacities=rgba[:, 3],
+        log_scales=np.log(np.maximum(data["scale"], _SCALE_MIN)),
+        rotations=(data["rot"].astype(np.float32) - 128) / 128,
+    )
+
+
+def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
+    """Write the Gaussians; the registry has refused thresholds."""
+    data = np.zeros(len(splat), _ROW)
+    data["xyz"] = array(splat.xyz)
+    data["scale"] = np.exp(array(splat.scaling))
+    data["rgba"][:, :3] = byte(255 * (0.5 + SH_C0 * array(splat.f_dc)[:, 0]))
+    data["rgba"][:, 3] = byte(255 * opacities_of(splat))
+    data["rot"] = byte(128 + 128 * quaternions_of(splat))
+    file.write(data.tobytes())

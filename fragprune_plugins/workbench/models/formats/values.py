@@ -1,0 +1,173 @@
+"""What formats share: arrays to and from a ``SplatFile``, activations, order, bounded streams."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from fragprune_plugins.constants import NEUTRAL_LOGIT
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.reading import MEBIBYTE
+from fragprune_plugins.workbench.models import cutoffs
+
+Floats = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
+
+SH_C0 = 0.28209479177387814
+"""The SH basis function of degree 0: a colour is 0.5 + SH_C0 f_dc."""
+
+_ALPHA_EDGE = 1e-6  # an 8-bit opacity of 0 or 255 has no finite logit
+
+PER_BYTE = 1
+"""Most Gaussians that a byte of a compressed file may stand for; of scenes it is a tenth of one."""
+
+log = logging.getLogger("fragprune")
+
+
+def splat_of(
+    *,
+    xyz: npt.NDArray[Any],
+    colours: npt.NDArray[Any],
+    rest: npt.NDArray[Any],
+    opacities: npt.NDArray[Any],
+    log_scales: npt.NDArray[Any],
+    rotations: npt.NDArray[Any],
+    thresholds: Tensor | None = None,
+) -> SplatFile:
+    """A splat of arrays.
+
+    Args:
+        xyz: (N, 3) means.
+        colours: (N, 3) first SH coefficients.
+        rest: (N, K - 1, 3) other coefficients.
+        opacities: (N,) in [0, 1], activated.
+        log_scales: (N, 3) logarithms of standard deviations.
+        rotations: (N, 4) quaternions w, x, y, z; one of length 0 becomes no rotation.
+        thresholds: (N,), or None.
+
+    Raises:
+        ValueError: there are no Gaussians.
+    """
+    if not len(xyz):
+        raise ValueError("0 Gaussians")
+    inside = np.clip(np.asarray(opacities, np.float64), _ALPHA_EDGE, 1 - _ALPHA_EDGE)
+    rotations = np.array(rotations, np.float32)
+    rotations[(rotations == 0).all(axis=1), 0] = 1
+
+    def tensor(values: npt.NDArray[Any]) -> Tensor:
+        with np.errstate(over="ignore"):
+            return torch.from_numpy(np.array(values, np.float32))
+
+    return SplatFile(
+        xyz=tensor(xyz),
+        f_dc=tensor(colours)[:, None],
+        f_rest=tensor(rest),
+        opacity=tensor(np.log(inside / (1 - inside)))[:, None],
+        scaling=tensor(log_scales),
+        rotation=torch.from_numpy(rotations),
+        thresholds=thresholds,
+    )
+
+
+def of_codes(codes: Bytes) -> Tensor | None:
+    """The thresholds of codes; those that cut nothing are neutral, and None if all are."""
+    if not codes.any():
+        return None
+    neutral = float(torch.sigmoid(torch.tensor(NEUTRAL_LOGIT)))
+    return torch.from_numpy(
+        np.where(codes == cutoffs.NEUTRAL, np.float32(neutral), cutoffs.decode(codes))
+    )
+
+
+def codes_of(thresholds: Tensor | None) -> Bytes | None:
+    """The codes of thresholds; None where nothing is cut, so that nothing need be written."""
+    if thresholds is None:
+        return None
+    codes = cutoffs.encode(thresholds.detach().numpy())
+    return codes if codes.any() else None
+
+
+def array(values: Tensor) -> Floats:
+    """A tensor's values, float32."""
+    return values.detach().float().numpy()
+
+
+def opacities_of(splat: SplatFile) -> Floats:
+    """(N,) activated opacities."""
+    return array(torch.sigmoid(splat.opacity[:, 0]))
+
+
+def quaternions_of(splat: SplatFile) -> Floats:
+    """(N, 4) unit quaternions w, x, y, z."""
+    return array(torch.nn.functional.normalize(splat.rotation))
+
+
+def byte(values: npt.NDArray[Any]) -> Bytes:
+    """Values rounded to 0..255; halves go up."""
+    return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
+
+
+def morton_order(splat: SplatFile) -> Tensor:
+    """(N,) rows along a Z-order curve: near ones in space are near in the file."""
+    xyz = array(splat.xyz).astype(np.float64)
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    cells = (1023 * (xyz - low) / np.maximum(high - low, 1e-30)).astype(np.uint32)
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        cells = (cells | (cells << shift)) & mask
+    return torch.from_numpy(np.argsort(cells @ np.array([1, 2, 4], np.uint32), kind="stable"))
+
+
+def turned(splat: SplatFile, signs: tuple[int, int, int]) -> SplatFile:
+    """The same scene with axes negated: means, rotations and SH of degrees 1 to 3.
+
+    Args:
+        splat: the scene.
+        signs: of x, y and z, 1 or -1.
+    """
+    x, y, z = signs
+    per_axis = torch.tensor(signs, dtype=torch.float32)
+    turn = torch.tensor([1, y * z, x * z, x * y], dtype=torch.float32)
+    sh = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]
+    rest = splat.f_rest.shape[1]
+    return SplatFile(
+        xyz=splat.xyz * per_axis,
+        f_dc=splat.f_dc,
+        f_rest=splat.f_rest * torch.tensor(sh[:rest], dtype=torch.float32)[None, :, None],
+        opacity=splat.opacity,
+        scaling=splat.scaling,
+        rotation=splat.rotation * turn,
+        thresholds=splat.thresholds,
+    )
+
+
+def take(stream: Any, count: int) -> bytes:
+    """Exactly so many bytes of a stream that decompresses; allocates no more than it gives.
+
+    Raises:
+        EOFError: the stream ends before.
+    """
+    pieces: list[bytes] = []
+    missing = count
+    while missing:
+        piece: bytes = stream.read(min(missing, MEBIBYTE))
+        if not piece:
+            raise EOFError(f"{count} bytes announced, {count - missing} there")
+        pieces.append(piece)
+        missing -= len(piece)
+    return b"".join(pieces)
+
+
+def expect_plausible(count: int, size: int) -> None:
+    """Raise ValueError if so many bytes cannot hold the positions of so many Gaussians."""
+    if not 0 < count <= size * PER_BYTE:
+        raise ValueError(f"{count} Gaussians in {size} bytes")
+
+
+def rows(data: bytes, count: int, kind: str = "u1") -> npt.NDArray[Any]:
+    """Bytes as (count, width) numbers."""
+    return np.frombuffer(data, kind).reshape(count, -1)

@@ -1,0 +1,1 @@
+"""What a frame costs on one machine: prices, their measurement, and predictions from them."""

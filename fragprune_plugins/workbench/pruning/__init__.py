@@ -1,0 +1,1 @@
+"""Which Gaussians can go: scores over views, and Gaussians that no view shows."""

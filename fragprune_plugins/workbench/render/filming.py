@@ -1,0 +1,139 @@
+"""Films of a splat: a camera that goes around it or through given ones, written as MP4."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import OutputError, UsageError
+from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.types import View
+from fragprune_plugins.workbench.figures.viewing import overview
+from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate
+
+
+def orbit(
+    splat: SplatFile,
+    count: int,
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0),
+    *,
+    width: int = 1280,
+    height: int = 720,
+    fov_y: float = 50.0,
+) -> Named:
+    """Cameras once around a splat, from ``overview``'s height and distance, evenly spaced.
+
+    Args:
+        splat: N Gaussians.
+        count: cameras; the one after the last would be the first.
+        up: (3,) what is up in its world; COLMAP's worlds have y down.
+        width: pixels.
+        height: pixels.
+        fov_y: vertical field of view, degrees.
+
+    Raises:
+        InputError: there is no such view.
+    """
+    from scipy.spatial.transform import Rotation
+
+    first = overview(splat, up, width=width, height=height, fov_y=fov_y)
+    centre, _ = bounds(splat)
+    axis = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
+    away = first.campos.double() - centre.double()
+    views = []
+    for number in range(count):
+        turn = Rotation.from_rotvec((2 * math.pi * number / count * axis).numpy())
+        eye = centre.double() + torch.from_numpy(turn.apply(away.numpy()))
+        view = View.look_at(eye.float(), centre, up, width=width, height=height, fov_y=fov_y)
+        views.append((f"orbit{number:04d}", view))
+    return views
+
+
+def along(cameras: Named, count: int) -> Named:
+    """Cameras on the way through given ones, in their order, at an even pace from one to the next.
+
+    Args:
+        cameras: the given ones. The pictures have the size and lens of the first.
+        count: of the result, from the first to the last.
+    """
+    views = [_with_lens(view, cameras[0][1]) for _, view in cameras]
+    found = []
+    for number in range(count):
+        at = number / max(1, count - 1) * (len(views) - 1)
+        begin = min(int(at), max(0, len(views) - 2))
+        end = min(begin + 1, len(views) - 1)
+        view = interpolate(views[begin], views[end], at - begin)
+        found.append((f"frame{number:04d}", view))
+    return found
+
+
+def _with_lens(view: View, other: View) -> View:
+    """A view with another one's lens and picture."""
+    lens = torch.linalg.solve(other.viewmatrix.double(), other.projmatrix.double())
+    return replace(
+        other,
+        viewmatrix=view.viewmatrix,
+        projmatrix=(view.viewmatrix.double() @ lens).to(view.projmatrix),
+        campos=view.campos,
+    )
+
+
+def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> int:
+    """Write pictures as an H.264 film; an existing file stays until the film is complete.
+
+    Args:
+        path: the film, in .mp4.
+        frames: (3, H, W) RGB in [0, 1] each, all of one size. A side of odd length loses its last
+            row or column, because H.264 halves the colours' sides.
+        fps: frames a second.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        UsageError: imageio-ffmpeg is not installed.
+        OutputError: the film cannot be written.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise UsageError(
+            "--out",
+            f"{path.name}, and imageio-ffmpeg is not installed",
+            "the package imageio-ffmpeg, to write films",
+            "pip install 'fragprune-plugins[video]', or name a folder for pictures.",
+        ) from error
+    count = 0
+    with replacing(path) as temporary:
+        writer = None
+        try:
+            for pixels in _bytes(frames):
+                if writer is None:
+                    height, width = pixels.shape[:2]
+                    writer = imageio_ffmpeg.write_frames(
+                        str(temporary), (width, height), fps=fps, macro_block_size=2, quality=8
+                    )
+                    writer.send(None)
+                writer.send(pixels.numpy().tobytes())
+                count += 1
+        except OSError as error:
+            why = str(error).strip().split("\n")[-1][:200]
+            raise OutputError(str(path), why, "a film", "Check the place and its space.") from error
+        finally:
+            if writer is not None:
+                writer.close()
+    return count
+
+
+def _bytes(frames: Iterable[Tensor]) -> Iterator[Tensor]:
+    """(H, W, 3) bytes of each picture, both sides even."""
+    for frame in frames:
+        _, height, width = frame.shape
+        even = frame[:, : height // 2 * 2, : width // 2 * 2]
+        yield (255 * even.clamp(0, 1)).round().byte().permute(1, 2, 0).contiguous().cpu()

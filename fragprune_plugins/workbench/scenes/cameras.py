@@ -1,0 +1,112 @@
+"""Cameras without their photographs: of a file, or of a scene folder.
+
+Three kinds of file: the ``cameras.json`` a host writes beside its model (a list of ``id, img_name,
+width, height, position, rotation, fx, fy``; rotation is camera to world, principal point centred),
+a transforms file, which needs ``w`` and ``h`` where its images are absent, and the
+``camera_path.json`` that nerfstudio's viewer saves (``camera_to_world`` of 16 numbers in OpenGL's
+axes, ``fov`` of the height in degrees).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.files.reading import Door
+from fragprune_plugins.hosts.photographs import Resolution
+from fragprune_plugins.types import View
+from fragprune_plugins.workbench.scenes.dataset import read_scene
+from fragprune_plugins.workbench.scenes.pinhole import Camera
+from fragprune_plugins.workbench.scenes.transforms import (
+    load_json,
+    matrix,
+    opengl_pose,
+    read_transforms,
+)
+
+_CAMERAS = Door(
+    DatasetError,
+    "not a cameras file",
+    "cameras.json of a 3DGS model, or a transforms file",
+    "Pass the cameras.json that a training wrote.",
+)
+
+
+def load_cameras(path: Path, *, white_background: bool = False) -> list[tuple[str, View]]:
+    """Read the named views of a cameras file.
+
+    Raises:
+        DatasetError: the file is missing, broken or empty.
+    """
+    content = load_json(path)
+    if isinstance(content, dict) and "camera_path" in content:
+        with _CAMERAS.stated(path) as reading:
+            size = int(content["render_width"]), int(content["render_height"])
+            cameras = []
+            for number, entry in enumerate(content["camera_path"]):
+                reading.place = f"camera_path[{number}]"
+                cameras.append((f"{number:05d}", _of_path(entry, *size)))
+    elif isinstance(content, dict):
+        cameras = [(row.name, row.camera) for row in read_transforms(path)]
+    else:
+        cameras = []
+        with _CAMERAS.stated(path) as reading:
+            for number, entry in enumerate(content):
+                reading.place = f"[{number}]"
+                cameras.append((str(entry["img_name"]), _camera(entry)))
+    if not cameras:
+        raise DatasetError(str(path), "0 cameras", "at least one", "Pass another file.")
+    background = torch.full((3,), float(white_background))
+    return [(name, camera.view(background)) for name, camera in cameras]
+
+
+def load_scene_cameras(
+    folder: Path, *, white_background: bool = False
+) -> tuple[list[tuple[str, View]], list[tuple[str, View]]]:
+    """Read the named training and held-out views of a scene folder, at their cameras' own sizes.
+
+    Raises:
+        DatasetError: see ``dataset.read_scene``.
+    """
+    background = torch.full((3,), float(white_background))
+    train, test = (
+        [(row.name, row.camera.view(background)) for row in part] for part in read_scene(folder)
+    )
+    return train, test
+
+
+def divided(views: list[tuple[str, View]], by: int) -> list[tuple[str, View]]:
+    """The same views with both sides of their pictures divided, rounded as photographs are."""
+    size = Resolution(divide=by)
+    sizes = [size.of(view.width, view.height) for _, view in views]
+    return [
+        (name, replace(view, width=width, height=height))
+        for (name, view), (width, height) in zip(views, sizes, strict=True)
+    ]
+
+
+def _of_path(entry: dict[str, Any], width: int, height: int) -> Camera:
+    pose = matrix([entry["camera_to_world"][at : at + 4] for at in (0, 4, 8)], (3, 4))
+    focal = height / (2 * math.tan(math.radians(float(entry["fov"])) / 2))
+    return Camera(*opengl_pose(pose), width, height, focal, focal, width / 2, height / 2)
+
+
+def _camera(entry: dict[str, Any]) -> Camera:
+    rotation = matrix(entry["rotation"], (3, 3)).T.contiguous()
+    position = matrix(entry["position"], (3,))
+    width, height = int(entry["width"]), int(entry["height"])
+    return Camera(
+        rotation,
+        -rotation @ position,
+        width,
+        height,
+        float(entry["fx"]),
+        float(entry["fy"]),
+        width / 2,
+        height / 2,
+    )

@@ -1,0 +1,235 @@
+"""Reads COLMAP's sparse model: cameras and images, text or binary."""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.files.reading import Door, Reading
+from fragprune_plugins.workbench.scenes.images import find_image
+from fragprune_plugins.workbench.scenes.lenses import Lens
+from fragprune_plugins.workbench.scenes.pinhole import Posed, split
+
+NERFSTUDIOS = Path("colmap", "sparse", "0")
+
+_DOOR = Door(
+    DatasetError,
+    "cut off or not COLMAP's",
+    "COLMAP's cameras and images files, complete",
+    "Export the model again (colmap model_converter).",
+    missing="Copy both files from COLMAP's model.",
+)
+
+_NAME_MAX = 4096  # bytes of an image's name
+
+# COLMAP's numbers for camera models, src/colmap/sensor/models.h, with their parameter counts.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
+
+# The models that OpenCV can straighten: how many focal lengths, and where in OpenCV's order
+# (k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4) the parameters after cx, cy belong.
+_OPENCV: dict[str, tuple[int, tuple[int, ...]]] = {
+    "SIMPLE_PINHOLE": (1, ()),
+    "PINHOLE": (2, ()),
+    "SIMPLE_RADIAL": (1, (0,)),
+    "RADIAL": (1, (0, 1)),
+    "OPENCV": (2, (0, 1, 2, 3)),
+    "FULL_OPENCV": (2, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "OPENCV_FISHEYE": (2, (0, 1, 2, 3)),
+    "SIMPLE_RADIAL_FISHEYE": (1, (0,)),
+    "RADIAL_FISHEYE": (1, (0, 1)),
+}
+
+Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
+"""name, camera id, quaternion w x y z, translation"""
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder with the cameras and images files; None if there is none.
+
+    sparse/0 or sparse, as COLMAP and the hosts have it; else colmap/sparse/0, as nerfstudio has.
+    """
+    for candidate in (folder / "sparse" / "0", folder / "sparse", folder / NERFSTUDIOS):
+        if any(os.path.exists(candidate / f"images.{kind}") for kind in ("bin", "txt")):
+            return candidate
+    return None
+
+
+def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
+    """Read training and held-out views.
+
+    Args:
+        folder: the scene.
+        images: name of the folder with the images.
+
+    Raises:
+        DatasetError: a file is broken, an image has no camera, or a lens cannot be straightened.
+    """
+    model = find_model(folder)
+    assert model is not None, "the caller looked"
+    # Binary first, as hosts do: COLMAP writes binary files, and text files are an export.
+    if (model / "images.bin").exists():
+        found = model / "cameras.bin", model / "images.bin"
+        parsers = _cameras_binary, _images_binary
+    else:
+        found = model / "cameras.txt", model / "images.txt"
+        parsers = _cameras_text, _images_text
+    with _DOOR.reading(found[0]) as reading:
+        cameras = dict(parsers[0](reading))
+    rows = []
+    with _DOOR.reading(found[1]) as reading:
+        for name, camera_id, quaternion, translation in parsers[1](reading):
+            if camera_id not in cameras:
+                raise DatasetError(
+                    str(model),
+                    f"image {name} of camera {camera_id}",
+                    f"one of the cameras {sorted(cameras)[:20]}",
+                    "Export images and cameras from the same COLMAP model.",
+                )
+            place = torch.tensor(translation, dtype=torch.float64)
+            lens = cameras[camera_id]
+            rows.append(
+                Posed(
+                    name,
+                    lens.camera(_rotation(quaternion), place),
+                    _image_path(folder / images, name),
+                    None if lens.straight else lens,
+                    _mask_path(folder / "masks", name),
+                )
+            )
+    return split(rows)
+
+
+def _image_path(images: Path, name: str) -> Path:
+    """The image's path, by its base name as hosts do; COLMAP's name may include subfolders."""
+    full = find_image(images / name)
+    return full if full.exists() else find_image(images / Path(name).name)
+
+
+def _mask_path(masks: Path, name: str) -> Path | None:
+    """The image's mask, named as COLMAP names it (with .png at the end) or as the image."""
+    if not masks.is_dir():
+        return None
+    named = masks / f"{name}.png"
+    found = named if named.exists() else find_image(masks / name)
+    return found if found.exists() else None
+
+
+def _rotation(quaternion: tuple[float, ...]) -> Tensor:
+    """(3, 3) float64 rotation from a quaternion w, x, y, z of any length but 0."""
+    q = torch.tensor(quaternion, dtype=torch.float64)
+    if not 0 < float(q.norm()) < math.inf:
+        raise ValueError(f"the quaternion {list(quaternion)}, which is no rotation")
+    w, x, y, z = (q / q.norm()).tolist()
+    return torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=torch.float64,
+    )
+
+
+def _lens(model: str, width: int, height: int, values: Sequence[float]) -> Lens:
+    """A lens by COLMAP's parameters of a model."""
+    if model not in _OPENCV:
+        raise DatasetError(
+            "COLMAP camera",
+            f"model {model}",
+            f"one of {', '.join(_OPENCV)}",
+            "Undistort first: colmap image_undistorter.",
+        )
+    focals, places = _OPENCV[model]
+    f, rest = values[:focals], values[focals + 2 :]
+    cx, cy = values[focals : focals + 2]
+    fisheye = model.endswith("FISHEYE")
+    bend = [0.0] * (4 if fisheye else 8)
+    for place, value in zip(places, rest, strict=True):
+        bend[place] = value
+    return Lens(width, height, f[0], f[-1], cx, cy, tuple(bend), fisheye)
+
+
+def _text_lines(reading: Reading) -> Iterator[str]:
+    """The lines of a text file that are no comments; empty ones too."""
+    for number, line in enumerate(reading.file, start=1):
+        reading.place = f"line {number}"
+        if not line.startswith(b"#"):
+            yield line.decode("utf-8")
+
+
+def _cameras_text(reading: Reading) -> Iterator[tuple[int, Lens]]:
+    for line in _text_lines(reading):
+        if line.strip():
+            number, model, width, height, *values = line.split()
+            numbers = [float(value) for value in values]
+            yield int(number), _lens(model, int(width), int(height), numbers)
+
+
+def _images_text(reading: Reading) -> Iterator[Pose]:
+    # Two lines an image; the second, its 2D points, may be empty.
+    for index, line in enumerate(_text_lines(reading)):
+        if index % 2 == 0 and line.strip():
+            fields = line.split(maxsplit=9)
+            numbers = tuple(float(value) for value in fields[1:8])
+            yield fields[9].strip(), int(fields[8]), numbers[:4], numbers[4:]
+
+
+def _unpack(reading: Reading, layout: str) -> tuple[Any, ...]:
+    return struct.unpack("<" + layout, reading.take(struct.calcsize("<" + layout)))
+
+
+def _announced(reading: Reading, least: int) -> Iterator[int]:
+    """Count through what the next number announces, of at least so many bytes each."""
+    count = _unpack(reading, "Q")[0]
+    if count * least > reading.left:
+        raise EOFError(f"{count} announced, in {reading.left} bytes")
+    for number in range(count):
+        reading.place = f"number {number + 1} of {count}, byte {reading.file.tell()}"
+        yield number
+
+
+def _cameras_binary(reading: Reading) -> Iterator[tuple[int, Lens]]:
+    for _ in _announced(reading, least=24):
+        number, code, width, height = _unpack(reading, "iiQQ")
+        if code not in _MODELS:
+            raise ValueError(f"camera model number {code}")
+        model, count = _MODELS[code]
+        yield number, _lens(model, width, height, _unpack(reading, f"{count}d"))
+
+
+def _images_binary(reading: Reading) -> Iterator[Pose]:
+    for _ in _announced(reading, least=73):
+        _number, *numbers, camera_id = _unpack(reading, "i7di")
+        name = _name(reading)
+        reading.skip(24 * _unpack(reading, "Q")[0])  # 2D points: x, y, id
+        yield name, camera_id, tuple(numbers[:4]), tuple(numbers[4:])
+
+
+def _name(reading: Reading) -> str:
+    """A name that a zero byte ends."""
+    begin = reading.file.tell()
+    name, zero, _ = reading.file.read(_NAME_MAX).partition(b"\0")
+    if not zero:
+        raise ValueError(f"a name without end at byte {begin}")
+    reading.file.seek(begin + len(name) + 1)
+    return name.decode("utf-8")

@@ -1,0 +1,297 @@
+"""Loads photographs with their cameras from a COLMAP folder or one with transforms files."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+import numpy as np
+import PIL.Image
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import DatasetError, printable
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import View
+from fragprune_plugins.workbench.scenes import colmap, transforms
+from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened
+from fragprune_plugins.workbench.scenes.lenses import Lens
+from fragprune_plugins.workbench.scenes.memory import PICTURES, Slot
+from fragprune_plugins.workbench.scenes.pinhole import Camera, Posed
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from fragprune_plugins.workbench.scenes.lenses import Pixels
+
+_ASPECT_TOLERANCE = 0.01
+_ROWS = 256  # of a picture, composited at a time
+_SEEN = 128  # grey levels of a mask, from which on the photograph is looked at
+_SMALLER = ("images_2", "images_4", "images_8")
+_LAYOUTS = (
+    "sparse/0 with images/ (COLMAP), or transforms_train.json (Blender) or transforms.json "
+    "(nerfstudio)"
+)
+
+log = logging.getLogger(__name__)
+
+SomeShot = TypeVar("SomeShot", bound="Shot")
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A camera, and the picture to be seen from it.
+
+    Attributes:
+        name: unique in its dataset.
+        view: the camera, with the background colour of its picture.
+        target: what the picture is: "photographs", or "itself" for the model's own.
+    """
+
+    target: ClassVar[str] = "photographs"
+
+    name: str
+    view: View
+
+    __repr__ = one_line
+
+    @property
+    def image(self) -> Tensor:
+        """(3, H, W) RGB on the view's device."""
+        raise NotImplementedError
+
+    def looked_at(self, image: Tensor) -> Tensor:
+        """A picture of this view (3, H, W), black where the target is not to be looked at."""
+        return image
+
+    def to(self: SomeShot, device: torch.device | str) -> SomeShot:
+        """The same with its view on a device; ``self`` if it is there already."""
+        if self.view.background.device == torch.device(device):
+            return self
+        return replace(self, view=self.view.to(device))
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph(Shot):
+    """One photograph with its camera; RGB in [0, 1], composited over the view's background.
+
+    Attributes:
+        path: the image file. It is read at first use, and kept in main memory at 8 bits a channel
+            as long as there is room: a scene's photographs may be larger than any memory.
+        camera: of the whole photograph, straightened; None if ``lens`` is.
+        lens: what bends the photograph; None if it is straight.
+        mask: an image of the same aspect. The photograph is black where this is.
+    """
+
+    path: Path
+    camera: Camera | None = None
+    lens: Lens | None = None
+    mask: Path | None = None
+    _pixels: Slot = field(default_factory=Slot, repr=False)
+
+    __repr__ = one_line
+
+    @property
+    def image(self) -> Tensor:
+        """(3, H, W) RGB in [0, 1] on the view's device."""
+        return self._read()[..., :3].permute(2, 0, 1).float() / 255
+
+    def looked_at(self, image: Tensor) -> Tensor:
+        """A picture of this view (3, H, W), black where the mask is."""
+        return image if self.mask is None else image * (self._read()[..., 3] > 0)
+
+    def _read(self) -> Tensor:
+        """(H, W, 3) uint8, or 4 with a mask, on the view's device."""
+        return PICTURES.get(self._pixels, self._load).to(self.view.background.device)
+
+    def _load(self) -> Tensor:
+        size = (self.view.width, self.view.height)
+        with opened(self.path) as file:
+            whole = file.size
+            transparent = "A" in file.getbands() or "transparency" in file.info
+            picture = self._fitted(file.convert("RGBA" if transparent else "RGB"), size)
+        flat = _over(picture, 255 * self.view.background.cpu().numpy())
+        if self.mask is not None:
+            with opened(self.mask) as file:
+                _expect_aspect(self.mask, file.size, "its photograph", whole)
+                seen = self._fitted(file.convert("L"), size) >= _SEEN
+            shown = seen[..., None].astype(np.uint8)
+            flat = np.concatenate([flat * shown, shown], axis=2)
+        return torch.from_numpy(flat)
+
+    def _fitted(self, picture: Image, size: tuple[int, int]) -> Pixels:
+        """The pixels of a picture, straightened and of the view's size."""
+        if self.lens is not None:
+            assert self.camera is not None
+            straight = self.lens.straighten(np.asarray(picture), self.camera)
+            picture = PIL.Image.fromarray(straight)
+        return np.array(picture if picture.size == size else picture.resize(size))
+
+
+def _over(picture: Pixels, behind: np.ndarray[Any, Any]) -> Pixels:
+    """A picture (H, W, 3 or 4) over a colour (3,) in [0, 255]."""
+    if picture.shape[2] == 3:
+        return picture
+    flat = np.empty((*picture.shape[:2], 3), np.uint8)
+    for begin in range(0, len(picture), _ROWS):  # as floats, a large picture takes gigabytes
+        rows = picture[begin : begin + _ROWS]
+        alpha = rows[..., 3:].astype(np.float32) / 255
+        over = rows[..., :3] * alpha + behind * (1 - alpha)
+        flat[begin : begin + _ROWS] = np.round(over).astype(np.uint8)
+    return flat
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Training views, and held-out views for measuring."""
+
+    train: Sequence[Shot]
+    test: Sequence[Shot]
+
+    __repr__ = one_line
+
+    @property
+    def extent(self) -> float:
+        """1.1 times the largest distance of a training camera from their mean, world units.
+
+        Hosts scale the learning rate of positions by this.
+        """
+        centres = torch.stack([shot.view.campos for shot in self.train])
+        return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max()) or 1.0
+
+    def to(self, device: torch.device | str) -> Dataset:
+        """The same photographs with their views on a device."""
+        return Dataset([s.to(device) for s in self.train], [s.to(device) for s in self.test])
+
+
+def load_photographs(photographs: Photographs) -> Dataset:
+    """Load the photographs of a run with ``load_dataset``."""
+    return load_dataset(
+        photographs.folder,
+        resolution=photographs.resolution,
+        white_background=photographs.white_background,
+        images=photographs.images,
+    )
+
+
+def load_dataset(
+    folder: Path,
+    *,
+    resolution: int | Resolution = 1,
+    white_background: bool = False,
+    images: str = "images",
+) -> Dataset:
+    """Read a COLMAP folder (sparse/, images/), or Blender's or nerfstudio's transforms files.
+
+    COLMAP holds out every 8th view of the sorted names, as hosts do. Images whose size differs
+    from their camera's are accepted when the aspect agrees to 1 %: intrinsics scale with them.
+
+    Args:
+        folder: the scene.
+        resolution: a divisor of the images' sides, or a ``Resolution``.
+        white_background: composite images with alpha over white instead of black, and render so.
+        images: name of the image folder, if it is not ``images`` or not what the transforms say.
+            Without ``images/``, the largest of ``images_2``, ``images_4`` and ``images_8`` serves.
+
+    Raises:
+        DatasetError: the folder has neither layout or both, an image is missing, a camera model is
+            unknown, a lens cannot be straightened, or sizes do not match.
+    """
+    background = torch.full((3,), float(white_background))
+    size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
+    train, test = (
+        [make_shot(row, background, size) for row in part] for part in read_scene(folder, images)
+    )
+    return Dataset(train, test)
+
+
+def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
+    """Read the training and the held-out cameras of a scene, and where their images should be.
+
+    No image is opened, but for the size of one whose transforms file has no ``w`` and ``h``.
+
+    Args:
+        folder: the scene.
+        images: name of the image folder; see ``load_dataset``.
+
+    Raises:
+        DatasetError: the folder has neither layout or both, a file is broken, a camera model is
+            unknown, or there are no training or no held-out cameras.
+    """
+    folder = Path(folder)
+    if not os.path.isdir(folder):  # False for a name that no folder can have, too
+        raise DatasetError(
+            str(folder), "no such folder", "a folder with photographs", "Check --data."
+        )
+    model = colmap.find_model(folder)
+    has_transforms = transforms.has_transforms(folder)
+    if model is not None and has_transforms and model != folder / colmap.NERFSTUDIOS:
+        raise DatasetError(
+            str(folder), "both COLMAP's and a transforms layout", _LAYOUTS, "Move one aside."
+        )
+    if model is None and not has_transforms:
+        raise DatasetError(str(folder), "neither layout", _LAYOUTS, _where_else(folder))
+    images = _image_folder(folder, images)
+    train, test = (transforms if has_transforms else colmap).read(folder, images)
+    for name, part in (("training", train), ("held-out", test)):
+        if not part:
+            raise DatasetError(
+                str(folder),
+                f"no {name} view ({len(train) + len(test)} in all)",
+                "at least one training and one held-out view",
+                "Add photographs; every 8th is held out.",
+            )
+    return train, test
+
+
+def _where_else(folder: Path) -> str:
+    """What to do about a folder that is no scene."""
+    for other in (folder.parent, *sorted(each for each in folder.iterdir() if each.is_dir())):
+        if colmap.find_model(other) is not None or transforms.has_transforms(other):
+            return f"Pass {other}."
+    if any(each.suffix.lower() in SUFFIXES for each in folder.iterdir()):
+        return "These images have no cameras; run COLMAP on them first."
+    return "Pass the folder that contains them."
+
+
+def _image_folder(folder: Path, images: str) -> str:
+    """The image folder asked for; a smaller one in place of an ``images/`` that is not there."""
+    if images == "images" and not (folder / images).exists():
+        for smaller in _SMALLER:
+            if (folder / smaller).is_dir():
+                said = printable(str(folder))
+                log.warning("%s: no images/; reading the photographs of %s/", said, smaller)
+                return smaller
+    return images
+
+
+def make_shot(row: Posed, background: Tensor, resolution: Resolution) -> Photograph:
+    """Pair an image file with its camera. This reads only the file's header.
+
+    Raises:
+        DatasetError: the file is missing or unreadable, or its size does not fit the camera.
+    """
+    width, height = image_size(row.image)
+    camera = row.camera
+    _expect_aspect(row.image, (width, height), "its camera", (camera.width, camera.height))
+    view = camera.resized(*resolution.of(width, height)).view(background)
+    return Photograph(row.name, view, row.image, camera, row.lens, row.mask)
+
+
+def _expect_aspect(
+    path: Path, size: tuple[int, int], whose: str, expected: tuple[int, int]
+) -> None:
+    """Raise DatasetError if a picture has another aspect than it should."""
+    (width, height), (wide, high) = size, expected
+    if abs(width * high / (height * wide) - 1) > _ASPECT_TOLERANCE:
+        raise DatasetError(
+            str(path),
+            f"{width}x{height} pixels",
+            f"those of {whose}, {wide}x{high}, or that aspect",
+            "Use the images that the cameras were calibrated with.",
+        )

@@ -1,0 +1,202 @@
+"""Cameras that nobody took a photograph with: around a splat, inside of it, and between given ones.
+
+They are the same for the same seed. Cameras around a splat suit an object. Inside of one they need
+to be told where its air is, which a splat does not say: ``measure.placing`` estimates it.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.types import View
+from fragprune_plugins.workbench.scenes.pinhole import HOLD_OUT
+
+Named = list[tuple[str, View]]
+"""Names of views, and the views."""
+
+Item = TypeVar("Item")
+
+ORBIT_VIEWS = 96
+"""Cameras that ``around`` gives by default."""
+
+_SHOWN = 0.9  # share of the Gaussians that an orbit goes around: some float far out
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+_NEARER = (0.6, 1.0)  # of the distance that shows them all: viewers zoom
+_LEVEL = 0.5  # sine of the steepest look from inside: 30 degrees
+_NEIGHBOURS = 4
+_BETWEEN = (0.1, 0.9)  # of the way; nearer to a camera is its own picture again
+
+
+def bounds(splat: SplatFile) -> tuple[Tensor, float]:
+    """Where most of a splat is: the median of the means, and the radius of nine tenths around it.
+
+    Args:
+        splat: N Gaussians, one or more.
+
+    Returns:
+        (3,) on the CPU, and world units above 0.
+    """
+    means = splat.xyz.detach().cpu()
+    centre = means.median(dim=0).values
+    distances = (means - centre).norm(dim=1)
+    radius = float(distances.kthvalue(math.ceil(_SHOWN * len(means))).values)
+    return centre, max(radius, 1e-3)
+
+
+def around(
+    splat: SplatFile,
+    count: int = ORBIT_VIEWS,
+    *,
+    width: int = 800,
+    height: int = 800,
+    fov_y: float = 50.0,
+    background: Tensor | None = None,
+    seed: int = 0,
+) -> Named:
+    """Cameras all around a splat, evenly spread over a sphere; from below, too.
+
+    They look at its robust centre from where nine tenths of it fill the picture, or from nearer.
+
+    Args:
+        splat: N Gaussians.
+        count: cameras.
+        width: pixels.
+        height: pixels.
+        fov_y: vertical field of view, degrees.
+        background: (3,) RGB; black when None.
+        seed: of the distances.
+    """
+    stream = random.Random(seed)
+    centre, radius = bounds(splat)
+    half = math.atan(math.tan(math.radians(fov_y) / 2) * min(1.0, width / height))
+    views = []
+    for number in range(count):
+        rise, turn = 1 - (2 * number + 1) / count, number * _GOLDEN_ANGLE
+        level = math.sqrt(1 - rise * rise)
+        away = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
+        eye = centre + radius / math.sin(half) * stream.uniform(*_NEARER) * away
+        view = View.look_at(
+            eye, centre, width=width, height=height, fov_y=fov_y, background=background
+        )
+        views.append((f"around{number:03d}", view))
+    return views
+
+
+def within(
+    places: Sequence[Tensor],
+    count: int,
+    *,
+    width: int = 800,
+    height: int = 800,
+    fov_y: float = 75.0,
+    background: Tensor | None = None,
+) -> Named:
+    """Cameras that look around from places inside a splat, to all sides and a little up and down.
+
+    Args:
+        places: (3,) each, taken in turns.
+        count: cameras.
+        width: pixels.
+        height: pixels.
+        fov_y: vertical field of view, degrees; rooms are looked at with wide lenses.
+        background: (3,) RGB; black when None.
+    """
+    views = []
+    for number in range(count):
+        rise, turn = _LEVEL * (1 - (2 * number + 1) / count), number * _GOLDEN_ANGLE
+        level = math.sqrt(1 - rise * rise)
+        ahead = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
+        eye = places[number % len(places)].detach().float().cpu()
+        view = View.look_at(
+            eye, eye + ahead, width=width, height=height, fov_y=fov_y, background=background
+        )
+        views.append((f"within{number:03d}", view))
+    return views
+
+
+def between(cameras: Named, *, seed: int = 0) -> Named:
+    """Cameras between each given one and those near it, in place and in what they look at.
+
+    Args:
+        cameras: the given ones, on one device.
+        seed: of how far each is on the way.
+
+    Returns:
+        Up to four for each camera: none towards one that looks more than a quarter turn away.
+    """
+    views = [view for _, view in cameras]
+    if len(views) < 2:
+        return []
+    stream = random.Random(seed)
+    centres = torch.stack([view.campos for view in views])
+    looks = torch.stack([view.viewmatrix[:3, 2] for view in views])
+    apart = torch.cdist(centres, centres)
+    typical = float(apart[~torch.eye(len(views), dtype=torch.bool)].median())
+    agree = looks @ looks.T
+    apart = apart / max(typical, 1e-9) + 1 - agree
+    apart[agree < 0] = math.inf  # the way there would look at what neither sees
+    nearest = apart.fill_diagonal_(math.inf).argsort(dim=1)[:, :_NEIGHBOURS]
+    return [
+        (
+            f"{cameras[i][0]}~{cameras[j][0]}",
+            interpolate(views[i], views[j], stream.uniform(*_BETWEEN)),
+        )
+        for i, near in enumerate(nearest.tolist())
+        for j in near
+        if apart[i, j] < math.inf
+    ]
+
+
+def interpolate(a: View, b: View, t: float) -> View:
+    """The camera at ``t`` of the way from one to another, with the lens and picture of the first.
+
+    Its centre lies on the straight line between theirs; its rotation is the spherical
+    interpolation of theirs, the short way round.
+
+    Args:
+        a: where ``t`` is 0.
+        b: where ``t`` is 1.
+        t: in [0, 1].
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    one, other = (view.viewmatrix.detach().double().cpu() for view in (a, b))
+    ends = Rotation.from_matrix([one[:3, :3].T.numpy(), other[:3, :3].T.numpy()])
+    rotation = torch.from_numpy(Slerp([0.0, 1.0], ends)(t).as_matrix())
+    centre = torch.lerp(a.campos.double().cpu(), b.campos.double().cpu(), t)
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3] = rotation.T
+    view[3, :3] = -rotation @ centre
+    lens = torch.linalg.solve(one, a.projmatrix.double().cpu())  # camera to clip
+    return replace(
+        a,
+        viewmatrix=view.to(a.viewmatrix),
+        projmatrix=(view @ lens).to(a.projmatrix),
+        campos=centre.to(a.campos),
+    )
+
+
+def hold_out(items: Sequence[Item]) -> tuple[list[Item], list[Item]]:
+    """Every 8th for measuring, the rest to learn from: the rest, and every 8th.
+
+    Raises:
+        DatasetError: there is nothing to learn from.
+    """
+    if len(items) < 2:
+        raise DatasetError(
+            "cameras",
+            f"{len(items)}",
+            "at least two: the first of each eight is held out for the figures",
+            "Pass more cameras.",
+        )
+    rest = [item for index, item in enumerate(items) if index % HOLD_OUT]
+    return rest, list(items[::HOLD_OUT])

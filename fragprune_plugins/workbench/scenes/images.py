@@ -1,0 +1,97 @@
+"""Opens image files: PNG, JPEG, WebP, TIFF and BMP, of bounded size."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fragprune_plugins.constants import SIDE_MAX
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.files.reading import Door
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+PIXELS_MAX = 160_000_000
+"""Most pixels of a photograph; cameras reach 151 million. Pillow itself refuses 179 million."""
+
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+"""All that Pillow may take a file for. Some of its other readers run programs."""
+
+_CUT = ("I", "F")
+"""Modes besides 16-bit grey whose values Pillow cuts at 255: a bright photograph is white then."""
+
+DOOR = Door(
+    DatasetError,
+    "not readable",
+    "a PNG or JPEG image",
+    "Save the image again.",
+    missing="Add it, or remove the view.",
+    noun="image",
+)
+
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+
+
+def find_image(path: Path) -> Path:
+    """The image file that a scene lists: the path, or one of its folder and stem.
+
+    Scenes list images without a suffix (Blender's), or with that of the images before they were
+    made smaller or renamed (.JPG, .png).
+
+    Returns:
+        The path of the file; the path as it came if there is no file, or more than one.
+    """
+    if path.is_file():
+        return path
+    stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
+    try:
+        beside = [each for each in path.parent.iterdir() if each.stem == stem]
+    except OSError:
+        return path
+    found = [each for each in beside if each.suffix.lower() in SUFFIXES]
+    return found[0] if len(found) == 1 else path
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Image]:
+    """Open an image for the length of a block; its pixels are read on use.
+
+    Raises:
+        DatasetError: the file is missing, no image, or too large; or the block raised.
+    """
+    from PIL import Image
+
+    with DOOR.reading(path) as reading, warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # PIXELS_MAX decides
+        with Image.open(reading.file, formats=_FORMATS) as image:
+            width, height = image.size
+            if width * height > PIXELS_MAX or max(width, height) > SIDE_MAX:
+                raise DatasetError(
+                    str(path),
+                    f"{width}x{height} pixels",
+                    f"at most {PIXELS_MAX:,} pixels, and {SIDE_MAX:,} a side",
+                    "Make the image smaller.",
+                )
+            if image.mode in _CUT or image.mode.startswith("I;16"):
+                raise DatasetError(
+                    str(path),
+                    f"pixels of mode {image.mode}, which would all be cut to 8 bits",
+                    "8 bits a channel",
+                    "Save the image with 8 bits a channel.",
+                )
+            yield image
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, pixels. Only its header is read.
+
+    Raises:
+        DatasetError: the file is missing or not an image.
+    """
+    with opened(path) as image:
+        return image.size

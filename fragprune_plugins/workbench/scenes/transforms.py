@@ -1,0 +1,180 @@
+"""Reads transforms files: Blender's pair (NeRF synthetic), and nerfstudio's one."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.files.reading import MEBIBYTE, Door
+from fragprune_plugins.workbench.scenes.images import find_image, image_size
+from fragprune_plugins.workbench.scenes.lenses import Lens
+from fragprune_plugins.workbench.scenes.pinhole import Posed, split
+
+PAIR = ("transforms_train.json", "transforms_test.json")
+SINGLE = "transforms.json"
+
+_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE")
+_BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
+_FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+JSON_MAX = 32 * MEBIBYTE
+"""Ten thousand frames of nerfstudio take 11 to 13 MiB, of a ``cameras.json`` 4."""
+
+_JSON = Door(
+    DatasetError,
+    "not readable as JSON",
+    "a JSON file of cameras",
+    "Save it again.",
+    limit=JSON_MAX,
+)
+_TRANSFORMS = Door(
+    DatasetError,
+    "not a transforms file",
+    "frames with file_path and transform_matrix, and camera_angle_x or fl_x",
+    "Export it again.",
+)
+
+
+def has_transforms(folder: Path) -> bool:
+    """Whether a folder has one of the two layouts."""
+    return (folder / PAIR[0]).exists() or (folder / SINGLE).exists()
+
+
+def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
+    """Read training and held-out views of Blender's pair of files, else of nerfstudio's one.
+
+    One file may name its ``train_filenames``, and its ``test_filenames`` or ``val_filenames``.
+    Otherwise every 8th of the sorted names is held out, as of COLMAP's.
+
+    Args:
+        folder: the scene.
+        images: name of the folder with the images, if it is another than the file says.
+
+    Raises:
+        DatasetError: a file or image is missing or broken, or a lens cannot be straightened.
+    """
+    if (folder / PAIR[0]).exists():
+        train, test = (read_transforms(folder / name, images) for name in PAIR)
+        return train, test
+    path = folder / SINGLE
+    rows = read_transforms(path, images)
+    content = load_json(path)
+    with _TRANSFORMS.stated(path):
+        kept, held = (
+            {_listed(each) for key in keys for each in content.get(key, ())}
+            for keys in (("train_filenames",), ("test_filenames", "val_filenames"))
+        )
+        files = [_listed(frame["file_path"]) for frame in content["frames"]]
+    named = [(row, file) for row, file in zip(rows, files, strict=True)]
+    wanted = [row for row, file in named if file not in held and (not kept or file in kept)]
+    return (wanted, [row for row, file in named if file in held]) if held else split(wanted)
+
+
+def read_transforms(path: Path, images: str = "images") -> list[Posed]:
+    """Read the views of one transforms file.
+
+    Every number may stand in a frame or in the file. Intrinsics are ``fl_x, fl_y, cx, cy`` where
+    given, else ``camera_angle_x`` and a centred principal point; ``w, h`` where given, else the
+    size of the image. Poses are taken as they stand: an ``applied_transform`` has been applied.
+
+    Raises:
+        DatasetError: see ``read``.
+    """
+    content = load_json(path)
+    with _TRANSFORMS.stated(path) as reading:
+        rows = []
+        for number, frame in enumerate(content["frames"]):
+            reading.place = f"frames[{number}]"
+            rows.append(_row(path.parent, {**content, **frame}, images))
+        return rows
+
+
+def load_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        DatasetError: the file is missing or not JSON.
+    """
+    with _JSON.reading(path) as reading:
+        return reading.json()
+
+
+def matrix(values: Any, *shapes: tuple[int, ...]) -> torch.Tensor:
+    """Nested lists of numbers as float64, in one of the shapes; raises ValueError."""
+    found = torch.tensor(values, dtype=torch.float64)
+    if tuple(found.shape) not in shapes:
+        raise ValueError(
+            f"numbers of shape {tuple(found.shape)}, not {' or '.join(map(str, shapes))}"
+        )
+    return found
+
+
+def opengl_pose(to_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rotation (3, 3) and translation (3,), world to camera, of a camera to world (3, 4).
+
+    ``to_world`` has OpenGL's axes (y up, z back), the result COLMAP's (y down, z forward).
+    """
+    rotation = (to_world[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.contiguous()
+    return rotation, -rotation @ to_world[:, 3]
+
+
+def _listed(file: str) -> Path:
+    """A path that a transforms file lists, to compare with others: its suffix may differ."""
+    path = Path(file)
+    return path.with_name(_name(path))
+
+
+def _name(image: Path) -> str:
+    return image.name.rsplit(".", 1)[0]
+
+
+def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
+    listed = Path(frame["file_path"])
+    image = find_image(folder / (listed if images == "images" else Path(images) / listed.name))
+    width, height = (int(frame["w"]), int(frame["h"])) if "w" in frame else image_size(image)
+    fx = (
+        float(frame["fl_x"])
+        if "fl_x" in frame
+        else width / (2 * math.tan(float(frame["camera_angle_x"]) / 2))
+    )
+    pose = opengl_pose(matrix(frame["transform_matrix"], (4, 4), (3, 4))[:3])
+    fisheye, coefficients = _distortion(frame)
+    lens = Lens(
+        width,
+        height,
+        fx,
+        float(frame.get("fl_y", fx)),
+        float(frame.get("cx", width / 2)),
+        float(frame.get("cy", height / 2)),
+        coefficients,
+        fisheye,
+    )
+    return Posed(
+        _name(listed),
+        lens.camera(*pose),
+        image,
+        None if lens.straight else lens,
+        folder / frame["mask_path"] if frame.get("mask_path") else None,
+    )
+
+
+def _distortion(frame: dict[str, Any]) -> tuple[bool, tuple[float, ...]]:
+    """Whether a frame's lens is a fisheye, and its coefficients in OpenCV's order."""
+    model = str(frame.get("camera_model", ""))
+    if model not in (*_PINHOLES, *_BENT, *_FISHEYES):
+        raise DatasetError(
+            str(frame["file_path"])[:200],
+            f"camera_model {model[:80]!r}",
+            f"one of {', '.join((*_PINHOLES[1:], *_BENT, *_FISHEYES))}",
+            "Undistort the images first (colmap image_undistorter).",
+        )
+    k1, k2, p1, p2, k3, k4, k5, k6 = (
+        float(frame.get(key, 0)) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    )
+    if model in _FISHEYES or frame.get("is_fisheye"):
+        return True, (k1, k2, k3, k4)
+    return False, (k1, k2, p1, p2, k3, k4, k5, k6)

@@ -1,0 +1,193 @@
+"""The files of a viewer: to serve, to write into a folder, or to put into one page."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.errors import OutputError
+from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.types import View
+from fragprune_plugins.workbench.figures.page import allowed
+from fragprune_plugins.workbench.figures.pictures import picture
+from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.scenes.dataset import Shot
+from fragprune_plugins.workbench.scenes.generated import bounds
+from fragprune_plugins.workbench.view.packing import pack
+
+Site = dict[str, bytes]
+"""Names of files, with slashes, and what they hold."""
+
+STATIC = Path(__file__).parent / "static"
+
+SINGLE_MAX = 64 << 20
+"""Most bytes that one page holds: about 500,000 Gaussians of degree 3, a page of 85 MiB."""
+
+_MODULES = ("shaders.js", "sorting.js", "splats.js", "camera.js", "drawing.js", "main.js")
+_PHOTOGRAPH_SIDE = 960
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One of at most two sides of the picture.
+
+    Attributes:
+        name: what the page calls it.
+        model: which of the models.
+        truncated: whether its thresholds apply.
+    """
+
+    name: str
+    model: int
+    truncated: bool
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A camera of the page's list.
+
+    Attributes:
+        name: what the page calls it.
+        view: the camera.
+        photograph: of this camera; None where there is none.
+    """
+
+    name: str
+    view: View
+    photograph: Shot | None = None
+
+
+def make_site(
+    title: str,
+    models: Sequence[Model],
+    layers: Sequence[Layer],
+    cameras: Sequence[Shown],
+    start: View,
+    *,
+    up: Sequence[float] = (0.0, -1.0, 0.0),
+) -> Site:
+    """All files of a viewer.
+
+    Args:
+        title: of the page.
+        models: one or two.
+        layers: one or two; the first is on the left.
+        cameras: to choose from; may be none.
+        start: the first camera; its background is the page's.
+        up: (3,) what is up in the world.
+
+    Raises:
+        DatasetError: a photograph cannot be read.
+    """
+    site = {each.name: each.read_bytes() for each in sorted(STATIC.iterdir()) if each.is_file()}
+    described = []
+    for number, model in enumerate(models):
+        file = f"model-{number}.splats"
+        site[file], facts = pack(model)
+        described.append({"file": file, **facts})
+    centre, radius = bounds(models[0].splat)
+    listed = []
+    for number, each in enumerate(cameras):
+        entry = {"name": each.name, **camera(each.view), "photograph": None}
+        if each.photograph is not None:
+            name = entry["photograph"] = f"photographs/{number:04d}.jpg"
+            site[name] = _jpeg(each.photograph)
+        listed.append(entry)
+    scene = {
+        "title": title,
+        "models": described,
+        "layers": [vars(each) for each in layers],
+        "cameras": listed,
+        "start": listed[0] if cameras and start is cameras[0].view else camera(start),
+        "background": start.background.tolist(),
+        "up": list(up),
+        "centre": centre.tolist(),
+        "radius": radius,
+    }
+    site["scene.json"] = json.dumps(scene, allow_nan=False).encode()
+    return site
+
+
+def camera(view: View) -> dict[str, Any]:
+    """A view as the page has it: lens in pixels, rotation from world to camera, row by row."""
+    lens = torch.linalg.solve(view.viewmatrix.double(), view.projmatrix.double())
+    return {
+        "width": view.width,
+        "height": view.height,
+        "fx": view.width / (2 * view.tan_fov_x),
+        "fy": view.height / (2 * view.tan_fov_y),
+        "cx": (float(lens[2, 0]) + 1) * view.width / 2,
+        "cy": (float(lens[2, 1]) + 1) * view.height / 2,
+        "rotation": view.viewmatrix[:3, :3].T.flatten().tolist(),
+        "position": view.campos.tolist(),
+    }
+
+
+def save_site(folder: Path, site: Site) -> None:
+    """Write a viewer's files into a folder, which any web server can serve.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    for name, content in site.items():
+        path = Path(folder, *name.split("/"))
+        writable_folder(path.parent)
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+
+
+def single_page(site: Site) -> bytes:
+    """A viewer as one HTML file, which a browser opens from disk.
+
+    Raises:
+        OutputError: it is larger than ``SINGLE_MAX``.
+    """
+    data = {name: each for name, each in site.items() if not (STATIC / name).is_file()}
+    size = sum(map(len, data.values()))
+    if size > SINGLE_MAX:
+        raise OutputError(
+            "--single-file",
+            f"{size >> 20} MiB of data",
+            f"at most {SINGLE_MAX >> 20} MiB in one page",
+            "Write a folder: leave out --single-file.",
+        )
+    # Names of all modules differ, so that one after the other they are one module.
+    code = "\n".join(
+        re.sub(r"^(import .*|export (?=\w))", "", site[name].decode(), flags=re.MULTILINE)
+        for name in _MODULES
+    )
+    held = "".join(
+        f'<script type="text/plain" data-name="{name}">{base64.b64encode(each).decode()}</script>\n'
+        for name, each in data.items()
+    )
+    style = site["style.css"].decode()
+    page = site["index.html"].decode()
+    for before, after in (
+        ("script-src 'self'", f"script-src {allowed(code)}"),
+        ("style-src 'self'", f"style-src {allowed(style)}"),
+        ("connect-src 'self'; img-src 'self' data:", "img-src data:"),
+        ('<link rel="stylesheet" href="style.css">', f"<style>{style}</style>"),
+        (
+            '<script type="module" src="main.js"></script>',
+            f'{held}<script type="module">{code}</script>',
+        ),
+    ):
+        page = page.replace(before, after, 1)
+    return page.encode()
+
+
+def _jpeg(photograph: Shot) -> bytes:
+    """A photograph as a JPEG of at most ``_PHOTOGRAPH_SIDE`` pixels a side; none is enlarged."""
+    image = picture(photograph.image)
+    image.thumbnail((_PHOTOGRAPH_SIDE, _PHOTOGRAPH_SIDE))
+    held = io.BytesIO()
+    image.save(held, format="JPEG", quality=88)
+    return held.getvalue()
