@@ -164,7 +164,7 @@ def test_the_command_prints_and_keeps_prices(exact: None, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     "arguments",
-    [("--calibrate", "--peers"), ("--calibrate", "--size", "9x9"), ("--out", "prices.json")],
+    [("--calibrate", "--forward-only"), ("--calibrate", "--size", "9x9"), ("--out", "prices.json")],
 )
 def test_usage(arguments: tuple[str, ...]) -> None:
     assert run("bench", *arguments).exit_code == 2

@@ -11,14 +11,14 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 from fragprune_plugins.files.ply import write_ply
-from fragprune_plugins.workbench.bench import TRUNCATION, peers
+from fragprune_plugins.workbench.bench import TRUNCATION
 
 SMALL = ("--size", "40x30", "--gaussians", 200, "--repeats", 2)
 
 
 def test_json_shape() -> None:
     found = run_json("bench", *SMALL, "--threads", 1)
-    parts = {"results", "translation", "saved", "scaling", "peers", "machine"}
+    parts = {"results", "translation", "saved", "scaling", "machine"}
     assert set(found) == parts
     assert found["scaling"] is None  # one scene at one size
     assert len(found["results"]) == 4
@@ -27,7 +27,6 @@ def test_json_shape() -> None:
     assert set(found["saved"]) == {"bench-200 40x30"}
     assert set(found["saved"]["bench-200 40x30"]) == {"fragments", "time", "share"}
     assert found["translation"] == {"40x30": found["saved"]["bench-200 40x30"]["share"]}
-    assert found["peers"] == []
     assert set(found["machine"]) == {
         "processor",
         "cores",
@@ -93,20 +92,6 @@ def test_a_model_of_ones_own_with_its_thresholds(tmp_path: Path, learned: bool) 
     assert plain > cut > 0
     assert (cut < 0.5 * plain) == learned
     assert TRUNCATION < 0.1
-
-
-def test_peers_are_timed_beside_ourselves(monkeypatch: pytest.MonkeyPatch) -> None:
-    def time_peer(name, splats, view, truth, *, repeats):
-        assert splats.sh_degree == 0
-        assert truth.shape == (3, view.height, view.width)
-        return {"name": name, "width": 40, "height": 30, "device": "x", "failed": "no device"}
-
-    monkeypatch.setattr(peers, "installed", lambda: ["somebody"])
-    monkeypatch.setattr(peers, "time_peer", time_peer)
-    found = run_json("bench", *SMALL, "--forward-only", "--peers")["peers"]
-    assert [row["name"] for row in found] == ["fragprune", "somebody"]
-    assert found[0]["ms_median"] > 0
-    assert "no device" in run("bench", *SMALL, "--forward-only", "--peers").stdout
 
 
 @pytest.mark.parametrize(

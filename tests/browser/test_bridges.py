@@ -149,7 +149,7 @@ CONFORMING = 40
 @pytest.mark.parametrize("name", ["rims", "faint", "cloud"])
 def test_the_conformance_scenes_are_drawn_as_expected(draw, engine, name, tmp_path):
     """PlayCanvas draws the cloud's smallest Gaussians smaller than 3DGS does; see DILATION."""
-    conformance = pytest.importorskip("fragprune_plugins.testing.cutoffs")
+    conformance = pytest.importorskip("cutoff_files")
     splat, camera = conformance.scene(name), conformance.cameras()["front"]
     path = tmp_path / "scene.ply"
     write_ply(path, splat, splat.thresholds)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cutoff_files
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,6 @@ from PIL import Image
 
 from fragprune_plugins import load
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.testing import cutoffs
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.models.cutoffs import encode
@@ -21,7 +21,7 @@ from fragprune_plugins.workbench.scenes.cameras import load_cameras
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("conformance")
-    cutoffs.write(out)
+    cutoff_files.write(out)
     return out
 
 
@@ -45,28 +45,33 @@ def drawn(path, view):
     return out.image.clamp(0, 1), float(out.fragments_per_pixel)
 
 
-@pytest.mark.parametrize("scene", cutoffs.SCENES)
+@pytest.mark.parametrize("scene", cutoff_files.SCENES)
 def test_our_engine_draws_every_carrier_as_expected(folder, said, scene):
     for name in said["scenes"][scene]["files"]:
         for view, of in said["scenes"][scene]["views"].items():
             image, fragments = drawn(folder / name, said["views"][view])
-            assert psnr(image, expected(folder / of["picture"])) > cutoffs.PSNR_MIN, (name, view)
-            assert fragments == pytest.approx(of["fragments_per_pixel"], rel=cutoffs.FRAGMENTS)
+            assert psnr(image, expected(folder / of["picture"])) > cutoff_files.PSNR_MIN, (
+                name,
+                view,
+            )
+            assert fragments == pytest.approx(of["fragments_per_pixel"], rel=cutoff_files.FRAGMENTS)
 
 
-@pytest.mark.parametrize("scene", cutoffs.SCENES)
+@pytest.mark.parametrize("scene", cutoff_files.SCENES)
 def test_a_renderer_that_ignores_cutoffs_fails(folder, said, scene):
     for view, of in said["scenes"][scene]["views"].items():
         plain = folder / said["scenes"][scene]["file_without_cutoffs"]
         image, fragments = drawn(plain, said["views"][view])
-        assert psnr(image, expected(folder / of["picture"])) < cutoffs.PSNR_MIN - 10
-        assert fragments > (1 + 5 * cutoffs.FRAGMENTS) * of["fragments_per_pixel"]
+        assert psnr(image, expected(folder / of["picture"])) < cutoff_files.PSNR_MIN - 10
+        assert fragments > (1 + 5 * cutoff_files.FRAGMENTS) * of["fragments_per_pixel"]
         ignored = of["without_cutoffs"]
-        assert psnr(image, expected(folder / ignored["picture"])) > cutoffs.PSNR_MIN
-        assert fragments == pytest.approx(ignored["fragments_per_pixel"], rel=cutoffs.FRAGMENTS)
+        assert psnr(image, expected(folder / ignored["picture"])) > cutoff_files.PSNR_MIN
+        assert fragments == pytest.approx(
+            ignored["fragments_per_pixel"], rel=cutoff_files.FRAGMENTS
+        )
 
 
-@pytest.mark.parametrize("scene", cutoffs.SCENES)
+@pytest.mark.parametrize("scene", cutoff_files.SCENES)
 def test_codes_are_listed_in_the_order_of_rows(folder, said, scene):
     codes = said["scenes"][scene]["codes"]
     for suffix in (".ply", ".spz", ".glb"):
@@ -75,7 +80,7 @@ def test_codes_are_listed_in_the_order_of_rows(folder, said, scene):
 
 
 def test_the_same_files_come_out_again(folder, tmp_path):
-    cutoffs.write(tmp_path)
+    cutoff_files.write(tmp_path)
     files = sorted(path.name for path in tmp_path.iterdir())
     assert len(files) == 3 * (5 + 4) + 1
     for name in files:

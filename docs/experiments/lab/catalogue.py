@@ -306,7 +306,6 @@ EXPERIMENTS: dict[str, Callable[[int, Train | None], Experiment]] = {
 """By name: makes the experiment from the iterations of its longest arms and from what moves."""
 
 QUESTIONS = {
-    "signals": "Which signals do truncated Gaussians fit better than Gaussians, and why?",
     "fragments": "Which Gaussians own the fragments, and how many fragments are hardly seen?",
     "stages": "Where does the time of a frame go, from small pictures to 4K?",
 }

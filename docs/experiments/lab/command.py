@@ -1,4 +1,4 @@
-"""``fragprune experiment``: runs a named experiment."""
+"""The command line of the lab: runs a named experiment."""
 
 from __future__ import annotations
 
@@ -21,11 +21,9 @@ from fragprune_plugins.workbench.commands.common import (
     Number,
     Report,
     data_options,
-    engine_option,
     engine_options,
     open_engine,
     photographs_for,
-    threads_option,
     together,
 )
 from lab.catalogue import EXPERIMENTS, QUESTIONS
@@ -34,7 +32,7 @@ if TYPE_CHECKING:
     from lab.folder import Findings
 
 
-@click.group("experiment", cls=Group, subcommand_metavar="NAME [ARGS]...")
+@click.group(cls=Group, subcommand_metavar="NAME [ARGS]...")
 def command() -> None:
     """Answer one question by a reproducible experiment.
 
@@ -44,8 +42,8 @@ def command() -> None:
 
     \b
     Examples:
-      fragprune experiment rules point_cloud.ply --data scene --out experiments --seeds 0,1,2
-      fragprune experiment overfitting --help
+      python -m lab rules point_cloud.ply --data scene --out experiments --seeds 0,1,2
+      python -m lab overfitting --help
     """
 
 
@@ -103,7 +101,7 @@ Frames are timed at the photographs' size and with sides four times as long.
 
 \b
 Example:
-  fragprune experiment {name} point_cloud.ply --data scene --out experiments --seeds 0,1,2
+  python -m lab {name} point_cloud.ply --data scene --out experiments --seeds 0,1,2
 """
 
 
@@ -167,37 +165,6 @@ for _name, _make in EXPERIMENTS.items():
     )(_training_options(partial(_train, _name)))
 
 
-@command.command("signals", cls=Command, short_help=QUESTIONS["signals"])
-@_out_option
-@click.option(
-    "--iters",
-    type=click.IntRange(min=2),
-    default=1000,
-    show_default=True,
-    help="Steps of every fit.",
-)
-@_seeds_option("0,1,2,3,4")
-@engine_option("Engine that draws, on the CPU")
-@threads_option
-def _fit_signals(
-    out: Path, iters: int, seeds: tuple[int, ...], engine: str, threads: int | None
-) -> Report:
-    """Fit lines and small pictures with Gaussians and with truncated ones.
-
-    It needs no model and no photographs, and takes some minutes. A square wave, a step, a smooth
-    line, a line of a photograph, and pictures of each kind are fitted with few primitives; as many
-    parameters are compared too. Every other pixel is held out.
-
-    \b
-    Example:
-      fragprune experiment signals --out experiments
-    """
-    from lab import signals
-
-    drawer, _ = open_engine(engine, "cpu", threads)
-    return _report(signals.run(out, engine=drawer, seeds=seeds, iterations=iters, progress=True))
-
-
 _views_options = together(
     click.argument("models", metavar="MODEL...", type=MODEL, nargs=-1, required=True),
     data_options,
@@ -230,7 +197,7 @@ def _time_stages(
 
     \b
     Example:
-      fragprune experiment stages point_cloud.ply pruned.ply --data scene --out experiments
+      python -m lab stages point_cloud.ply pruned.ply --data scene --out experiments
     """
     from lab import stages
 
@@ -263,7 +230,7 @@ def _count_fragments(
 
     \b
     Example:
-      fragprune experiment fragments point_cloud.ply pruned.ply --data scene --out experiments
+      python -m lab fragments point_cloud.ply pruned.ply --data scene --out experiments
     """
     from lab import fragments
 

@@ -58,9 +58,6 @@ def _size(text: str) -> tuple[int, int]:
 )
 @click.option("--forward-only", is_flag=True, help="Time the forward pass only.")
 @click.option(
-    "--peers", is_flag=True, help="Also time other installed rasterizers, at SH degree 0."
-)
-@click.option(
     "--calibrate",
     is_flag=True,
     help="Instead, measure what a pixel, a Gaussian, a list entry, an evaluated and a drawn "
@@ -81,7 +78,6 @@ def command(
     cameras: Path | None,
     repeats: int,
     forward_only: bool,
-    peers: bool,
     calibrate: bool,
     out: Path | None,
     engine: str,
@@ -132,7 +128,6 @@ def command(
         click.echo(text, err=True)
 
     results = measure(cases, [rasterizer], repeats=repeats, say=say)
-    others = _peers(scenes, rasterizer, repeats, say) if peers else []
     machine = describe_machine(where) | {
         "load_before": before,
         "load_after": os.getloadavg()[0],
@@ -146,13 +141,12 @@ def command(
         },
         "saved": share,
         "scaling": scaling(results, rasterizer.name),
-        "peers": others,
         "machine": machine,
     }
     return Report(data, _table(data))
 
 
-_OF_BENCH = ("sizes", "gaussians", "model", "cameras", "repeats", "forward_only", "peers")
+_OF_BENCH = ("sizes", "gaussians", "model", "cameras", "repeats", "forward_only")
 
 
 def _require_alone(ctx: click.Context) -> None:
@@ -242,32 +236,8 @@ def _scenes(
     ]
 
 
-def _peers(
-    scenes: list[tuple[str, Any, Any, Any]], rasterizer: Any, repeats: int, say: Any
-) -> list[dict[str, Any]]:
-    """For each scene at SH degree 0, our own row and a row for each peer (``peers.time_peer``)."""
-    from dataclasses import replace
-
-    from fragprune_plugins.types import RasterInputs
-    from fragprune_plugins.workbench.bench.peers import installed, time_peer
-    from fragprune_plugins.workbench.bench.timing import Case, measure
-
-    rows = []
-    for name, splats, view, _ in scenes:
-        flat = replace(splats, sh=splats.sh[:, :1].contiguous(), sh_degree=0)
-        (ours,) = measure([Case(name, view, flat, "forward")], [rasterizer], repeats=repeats)
-        keys = ("width", "height", "gaussians", "ms_median", "ms_min", "ms_se")
-        row = {"name": "fragprune", "device": ours["device"], "psnr": None, "failed": None}
-        rows.append({"scene": name, **row, **{key: ours[key] for key in keys}})
-        truth = rasterizer.rasterize(RasterInputs(view, flat, planes=()), None).image
-        for peer in installed():
-            say(f"{peer}, {name}, {view.width}x{view.height}")
-            rows.append({"scene": name, **time_peer(peer, flat, view, truth, repeats=repeats)})
-    return rows
-
-
 def _table(data: dict[str, Any]) -> str:
-    results, others, machine = data["results"], data["peers"], data["machine"]
+    results, machine = data["results"], data["machine"]
     lines = [
         f"{'scene':<16}{'size':>11}  {'pass':<17}{'cut':<5}{'frag/px':>8}{'tested':>8}"
         f"{'median ms':>11}{'min':>9}{'±se':>7}{'ns/frag':>9}{'peak MB':>9}"
@@ -293,14 +263,6 @@ def _table(data: dict[str, Any]) -> str:
         lines.append(
             f"a fragment costs {prices['least']:.2f} to {prices['most']:.2f} ns: "
             f"{prices['ratio']:.1f}x between the cheapest and the dearest scene and size"
-        )
-    if others:
-        lines.append("forward, SH degree 0, 8 bits from peers:")
-    for row in others:
-        what = row["failed"] or f"{row['ms_median']:.2f} ms median, {row['ms_min']:.2f} min"
-        lines.append(
-            f"{row['scene']:<16}{row['width']:>6}x{row['height']:<4}  {row['name']} "
-            f"({row['device']}): {what}"
         )
     first = results[0]
     lines.append(

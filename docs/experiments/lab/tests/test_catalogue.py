@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from cli.commands import run
 from finetune import tiny
 from lab.catalogue import EXPERIMENTS
 from lab.rules import shrunk, without_faint
+from lab.tests.commands import run
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.workbench.pruning.scores import SCORES
@@ -99,6 +99,6 @@ def test_schedules_compares_when_thresholds_learn():
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_is_listed_with_its_question(name):
-    listed = "".join(run("experiment", "--help").stdout.split())
+    listed = "".join(run("--help").stdout.split())
     asks = EXPERIMENTS[name](5000, None).asks
     assert name + "".join(asks.split()) in listed

@@ -1,4 +1,4 @@
-"""fragprune experiment, end to end on a tiny scene with few arms."""
+"""An experiment, end to end on a tiny scene with few arms."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import run, run_json
 from finetune import tiny
 from lab import catalogue, running
 from lab.catalogue import Arm, Experiment, Pruning
 from lab.rules import alpha_cutoff, shrunk
+from lab.tests.commands import run, run_json
 from PIL import Image
 
 from fragprune_plugins.learning.schedule import Settings
@@ -52,7 +52,7 @@ def trained(monkeypatch):
 @pytest.fixture
 def words(tmp_path):
     data, model, _ = tiny.scene(tmp_path)
-    return ["experiment", "rules", model, "--data", data, "--out", tmp_path / "out", "--iters", 3]
+    return ["rules", model, "--data", data, "--out", tmp_path / "out", "--iters", 3]
 
 
 def test_writes_table_sheet_plot_and_configuration(words, trained, tmp_path):
@@ -153,7 +153,7 @@ def test_a_changed_list_of_arms_is_refused(words, trained, monkeypatch):
 
 def test_changed_photographs_are_refused(words, trained):
     run_json(*words)
-    data = words[4]
+    data = words[3]
     shutil.copy(data / "images" / "view01.png", data / "images" / "view02.png")
     result = run(*words)
     assert result.exit_code == 1
@@ -195,21 +195,21 @@ def test_ctrl_c_keeps_finished_arms(words, trained, monkeypatch, tmp_path):
     ],
 )
 def test_contradictions_are_usage_errors(words, said, tmp_path):
-    result = run("experiment", *words, "--data", tmp_path, "--out", tmp_path / "out")
+    result = run(*words, "--data", tmp_path, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert said in result.stderr
 
 
 def test_the_configuration_tells_models_apart(words, trained, tmp_path):
     run_json(*words)
-    model = words[2]
+    model = words[1]
     other = tmp_path / "other"
     other.mkdir()
     shutil.copy(model, other / model.name)
-    words[2] = other / model.name
+    words[1] = other / model.name
     run_json(*words)  # the same model elsewhere
     assert len(trained) == 3
-    tiny.write_ply(words[2], tiny.random_model(seed=5))
+    tiny.write_ply(words[1], tiny.random_model(seed=5))
     result = run(*words)
     assert result.exit_code == 1
     assert "model.sha256 was" in result.stderr

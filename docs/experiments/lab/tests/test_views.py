@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import run_json as fragprune
 from finetune import tiny
 from lab import stages
 from lab.fragments import weigh
+from lab.tests.commands import run, run_json
 
 import fragprune_plugins as fp
 from fragprune_plugins.engines import create_engine
@@ -41,10 +42,10 @@ def test_weights_one_by_one_sum_to_what_is_drawn(tau):
 
 
 def test_fragments_are_counted_alike_in_every_way(words):
-    report = run_json("experiment", "fragments", *words)
+    report = run_json("fragments", *words)
     for label, path in (("model", words[0]), ("cut", words[1])):
         figures = {row["figure"]: row[label] for row in report["rows"]}
-        measured = run_json("profile", path, *words[2:4])
+        measured = fragprune("profile", path, *words[2:4])
         drawn = figures["fragments per pixel"]
         assert drawn == pytest.approx(measured["fragments_per_pixel"], rel=1e-5)
         for what in ("opacity", "radius"):
@@ -60,7 +61,7 @@ def test_fragments_are_counted_alike_in_every_way(words):
 @pytest.mark.parametrize("name", ["fragments", "stages"])
 def test_one_model_is_drawn_without_its_thresholds_too(words, name, monkeypatch):
     monkeypatch.setattr(stages, "SIZES", (16,))
-    report = run_json("experiment", name, *words[1:])
+    report = run_json(name, *words[1:])
     assert list(report["configuration"]["models"]) == ["cut"]
     assert report["configuration"]["models"]["cut"]["thresholds"]
     if name == "stages":
@@ -72,7 +73,7 @@ def test_one_model_is_drawn_without_its_thresholds_too(words, name, monkeypatch)
 
 def test_stages_make_up_the_frame(words, monkeypatch):
     monkeypatch.setattr(stages, "SIZES", (16, 32))
-    report = run_json("experiment", "stages", *words, "--repeats", 3, "--engine", "cpu")
+    report = run_json("stages", *words, "--repeats", 3, "--engine", "cpu")
     rows = report["rows"]
     assert {row["size"] for row in rows} == {"16x16", "32x32"}
     for row in rows:
@@ -88,21 +89,21 @@ def test_stages_make_up_the_frame(words, monkeypatch):
     names = [row["stage"] for row in rows if (row["size"], row["model"]) == ("16x16", "cut")]
     assert names == ["projection", "binning", "blend", "rest", "frame"]
     out = words[-1]
-    assert run_json("experiment", "stages", *words, "--repeats", 3, "--engine", "cpu") == report
+    assert run_json("stages", *words, "--repeats", 3, "--engine", "cpu") == report
     (first, _) = sorted((out / "arms").iterdir())
     first.unlink()
-    assert run_json("experiment", "stages", *words, "--repeats", 3, "--engine", "cpu") != report
+    assert run_json("stages", *words, "--repeats", 3, "--engine", "cpu") != report
 
 
 def test_an_engine_without_a_clock_shows_frames_alone(words, monkeypatch):
     monkeypatch.setattr(stages, "SIZES", (16,))
-    report = run_json("experiment", "stages", *words, "--repeats", 2, "--engine", "reference")
+    report = run_json("stages", *words, "--repeats", 2, "--engine", "reference")
     assert {row["stage"] for row in report["rows"]} == {"frame"}
 
 
 @pytest.mark.parametrize("name", ["fragments", "stages"])
 def test_a_model_is_needed(words, name):
-    assert run("experiment", name, *words[2:]).exit_code == 2
+    assert run(name, *words[2:]).exit_code == 2
 
 
 def test_one_disturbed_round_does_not_widen_the_error():

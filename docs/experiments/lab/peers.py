@@ -1,22 +1,26 @@
 """Times other installed rasterizers on our scene, if they draw the same picture.
 
+    cd docs/experiments; python -m lab.peers
+
 A peer runs in its own process, so a crash or a deadlock of its driver is reported like any other
 failure. To add a peer, write a function like ``_gausscam`` and enter it in ``PEERS``.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +31,9 @@ if TYPE_CHECKING:
 
 SAME_PICTURE_DB = 40.0
 """Peers answer in 8 bits and end Gaussians at other radii; another camera or colour is below 25."""
+
+LAB = Path(__file__).parents[1]
+"""Where this package is imported from."""
 
 Arrays = dict[str, NDArray[np.float32]]
 
@@ -80,17 +87,13 @@ def time_peer(
     with tempfile.TemporaryDirectory() as folder:
         inputs, outputs = Path(folder, "inputs.npz"), Path(folder, "outputs.npz")
         np.savez(inputs, allow_pickle=False, **_arrays(splats, view))
-        command = [
-            sys.executable,
-            "-m",
-            __spec__.name,
-            name,
-            str(inputs),
-            str(outputs),
-            str(repeats),
-        ]
+        command = [sys.executable, "-m", "lab.peers", "--repeats", str(repeats)]
+        command += ["--child", name, str(inputs), str(outputs)]
+        lab = {"PYTHONPATH": os.pathsep.join([str(LAB), os.environ.get("PYTHONPATH", "")])}
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=limit, env=os.environ | lab
+            )
         except subprocess.TimeoutExpired:
             return {**row, "failed": f"no end after {limit:.0f} s"}
         if done.returncode:
@@ -159,13 +162,13 @@ PEERS: dict[str, tuple[tuple[str, ...], Callable[[Arrays], Drawing]]] = {
 """By name: the modules it needs, and how it draws."""
 
 
-def _child(name: str, inputs: str, outputs: str, repeats: str) -> None:
+def _child(name: str, inputs: str, outputs: str, repeats: int) -> None:
     """Draw in this process, and write picture, times in ms and device to a file."""
     with np.load(inputs) as given:
         drawing = PEERS[name][1](dict(given))
     frame = drawing.draw()
     times = []
-    for _ in range(int(repeats)):
+    for _ in range(repeats):
         started = time.perf_counter()
         frame = drawing.draw()
         times.append(1e3 * (time.perf_counter() - started))
@@ -177,5 +180,39 @@ def _child(name: str, inputs: str, outputs: str, repeats: str) -> None:
     )
 
 
+def _table(sizes: Sequence[str], count: int, repeats: int) -> Iterator[str]:
+    """A line for our engine and for each peer, at each size: forward, SH degree 0."""
+    from fragprune_plugins.engines import create_engine
+    from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.workbench.bench.timing import Case, measure
+    from fragprune_plugins.workbench.prices.scene import make_scene, make_view
+
+    engine = create_engine("auto")
+    scene = make_scene(count).splats()
+    splats = replace(scene, sh=scene.sh[:, :1].contiguous(), sh_degree=0)
+    for size in sizes:
+        view = make_view(*map(int, size.split("x")))
+        (ours,) = measure([Case("peers", view, splats, "forward")], [engine], repeats=repeats)
+        truth = engine.rasterize(RasterInputs(view, splats, planes=()), None).image
+        yield f"{size} fragprune: {ours['ms_median']:.2f} ms median, {ours['ms_min']:.2f} min"
+        for name in installed():
+            row = time_peer(name, splats, view, truth, repeats=repeats)
+            times = f"{row['ms_median']} ms median, {row['ms_min']} min, {row['psnr']} dB from ours"
+            yield f"{size} {name} ({row['device']}): {row['failed'] or times}"
+
+
+@click.command(epilog=f"Peers: {', '.join(PEERS)}.")
+@click.option("--size", "sizes", multiple=True, default=("640x480", "1280x960"), show_default=True)
+@click.option("--gaussians", type=click.IntRange(min=1), default=100_000, show_default=True)
+@click.option("--repeats", type=click.IntRange(min=2), default=9, show_default=True)
+@click.option("--child", nargs=3, hidden=True, help="Draw here: a peer, its inputs, its outputs.")
+def main(sizes: tuple[str, ...], gaussians: int, repeats: int, child: tuple[str, ...]) -> None:
+    """Time our engine and every installed peer on the scene of ``fragprune bench``."""
+    if child:
+        return _child(*child, repeats)
+    for line in _table(sizes, gaussians, repeats):
+        click.echo(line)
+
+
 if __name__ == "__main__":
-    _child(*sys.argv[1:])
+    main()

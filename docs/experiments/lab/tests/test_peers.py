@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 import torch
+from lab import peers
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.bench import peers
 from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
 PIPELINE = '''

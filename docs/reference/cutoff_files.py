@@ -1,6 +1,6 @@
 """Conformance files for renderers that draw with per-Gaussian cutoffs.
 
-    python -m fragprune_plugins.testing.cutoffs --out DIR
+    python docs/reference/cutoff_files.py --out DIR
 
 writes small scenes in every carrier, the pictures that a renderer is to draw of them, and
 ``cutoffs.json`` with cameras and tolerances. ``docs/reference/cutoff.md`` says how to use them.
