@@ -1,20 +1,16 @@
-"""Writes the pages of docs/reference that are read off the code: ``python docs/generate.py``.
+"""The pages of docs/reference that are read off the code; ``site.py`` adds them to the site.
 
-Each page has a function that returns its Markdown; a test compares them with the files.
+Each page has a function that returns its Markdown.
 """
 
 from __future__ import annotations
 
 import inspect
 import re
-import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import click
-
-REFERENCE = Path(__file__).parent / "reference"
 
 
 def hooks() -> str:
@@ -153,8 +149,7 @@ def _commands(group: click.Group, context: click.Context) -> Iterator[str]:
 
 
 def _page(title: str, intro: str, *parts: str) -> str:
-    made = "<!-- Made from the code by docs/generate.py. -->"
-    return "\n\n".join([f"# {title}", made, intro, *parts]) + "\n"
+    return "\n\n".join([f"# {title}", intro, *parts]) + "\n"
 
 
 def _functions(module: Any) -> Iterator[tuple[str, Any]]:
@@ -223,9 +218,3 @@ def _fields(text: str) -> str:
 def _sentence(text: str) -> str:
     text = text.strip()
     return text if text.endswith(".") else f"{text}."
-
-
-if __name__ == "__main__":
-    for name, page in PAGES.items():
-        (REFERENCE / name).write_text(page(), encoding="utf-8")
-        print(f"docs/reference/{name}", file=sys.stderr)

@@ -1,6 +1,7 @@
 """What the site has beside the pages of this folder; a hook of mkdocs, named in mkdocs.yml.
 
-The README and its neighbours become pages. The tutorial is run, and becomes a page with what it
+The README and its neighbours become pages, and so does what ``generate.py`` reads off the code. The
+tutorial is run, and becomes a page with what it
 printed and drew. The navigation is read off index.md, which lists every page.
 """
 
@@ -10,8 +11,10 @@ import base64
 import posixpath
 import re
 import tempfile
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from runpy import run_path
 from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -66,6 +69,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, page in OUTSIDE.items():
         text = (DOCS.parent / name).read_text("utf-8").replace("](docs/", "](")
         files.append(File.generated(config, page, content=text))
+    for name, make in generated().items():
+        files.append(File.generated(config, f"reference/{name}", content=make()))
     text, pictures = run((DOCS / "tutorial.ipynb").read_text("utf-8"))
     files.append(File.generated(config, "tutorial.md", content=text))
     for name, picture in pictures.items():
@@ -83,6 +88,12 @@ def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
         return posixpath.relpath(page, folder or ".") if page else link[1]
 
     return LINK.sub(turned, markdown)
+
+
+def generated() -> dict[str, Callable[[], str]]:
+    """The pages of generate.py: by name, a function that makes the text."""
+    pages: dict[str, Callable[[], str]] = run_path(str(DOCS / "generate.py"))["PAGES"]
+    return pages
 
 
 @lru_cache
