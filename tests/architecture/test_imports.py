@@ -21,7 +21,9 @@ from fragprune_plugins.workbench import bridge as bridge_command
 ROOT = Path(__file__).parents[2]
 ADAPTERS = sorted(p.name for p in (ROOT / "adapters").glob("fragprune_*") if p.is_dir())
 PACKAGES = ["fragprune_plugins", "reference_renderer", *ADAPTERS]
-HOST = ROOT / "fragprune_plugins" / "demo" / "host"  # a program of its own, not our package
+HOST = (
+    ROOT / "fragprune_plugins" / "workbench" / "demo" / "host"
+)  # a program of its own, not our package
 INSIDE = {  # run inside an installed host alone, which imports them
     "fragprune_nerfstudio.method": "nerfstudio",
     "fragprune_nerfstudio.model": "nerfstudio",
@@ -64,10 +66,11 @@ def test_the_outer_rooms_import_without_torch(python):
     core = (
         "adapting constants errors types hosts.adapter hosts.choosing hosts.graphdeco hosts.seams "
         "hosts.source injection.launch injection.patching learning.pressure learning.schedule "
-        "plugins.hookspecs plugins.loading storage.atomic"
+        "plugins.hookspecs plugins.loading files.atomic"
     )
     light = [
-        *(m for m in MODULES if m.startswith("fragprune_plugins.workbench.commands")),
+        *(m for m in MODULES if m.startswith("fragprune_plugins.workbench.commands.")),
+        *(point.module for point in entry_points(group="fragprune.commands")),
         *(f"fragprune_plugins.{name}" for name in core.split(" ")),
         *ADAPTERS,
     ]

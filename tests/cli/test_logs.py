@@ -1,4 +1,4 @@
-"""--log, --config and completion."""
+"""--log, --config and what a shell completes."""
 
 from __future__ import annotations
 
@@ -164,13 +164,6 @@ def test_a_config_file_that_is_missing_is_a_usage_error(tmp_path):
     result = run("run", "--config", tmp_path / "a.toml", "--", "python", "train.py")
     assert result.exit_code == 2
     assert "no such file" in result.stderr
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_prints_a_script_for_the_shell(shell):
-    result = run("completion", shell)
-    assert result.exit_code == 0
-    assert "_FRAGPRUNE_COMPLETE" in result.stdout
 
 
 def test_bash_completes_commands():

@@ -79,7 +79,7 @@ def test_modules_of_an_installed_host_are_forgotten_and_its_compiled_ones_kept(
 
 def test_modules_of_a_host_within_an_environment_are_forgotten(tmp_path, monkeypatch):
     """The demo's host is one, where fragprune is installed from a wheel."""
-    root = tmp_path / "site-packages" / "fragprune_plugins" / "demo" / "host"
+    root = tmp_path / "site-packages" / "fragprune_plugins" / "workbench" / "demo" / "host"
     files = {
         "toy_scene": root / "toy_scene.py",
         "toy_library": root / ".venv/lib/python3/site-packages/toy_library.py",

@@ -22,7 +22,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, evaluate
 from fragprune_plugins.workbench.finetune.loop import finetune
 
 CUT_ALL = 0.999999
-HOST = fragprune_plugins.__path__[0] + "/demo/host/train.py"
+HOST = fragprune_plugins.__path__[0] + "/workbench/demo/host/train.py"
 
 
 class Fixed:
