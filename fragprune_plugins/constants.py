@@ -14,6 +14,9 @@ ALPHA_MAX: Final = 0.99
 TRANSMITTANCE_MIN: Final = 1e-4
 """A pixel stops before the fragment that would leave less light than (1 - ALPHA_MAX)^2."""
 
+STOPPED_ALPHA_MAX: Final = 0.999
+"""Highest cap on alpha with a stop, whose last fragment is drawn: 1 - alpha divides backwards."""
+
 NEAR: Final = 0.2
 """View-space depth at or below which a Gaussian is culled; the host's only frustum test."""
 

@@ -18,6 +18,8 @@ from fragprune_plugins.constants import (
     NEAR,
     ROTATION_TOLERANCE,
     SIDE_MAX,
+    STOPPED_ALPHA_MAX,
+    TRANSMITTANCE_MIN,
 )
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.reprs import one_line
@@ -605,6 +607,9 @@ class RasterInputs:
         scores: also give each Gaussian's weights and wins, and the pixels' winners.
         alpha_max: alpha is capped here; 1/255 to 1.
         cap_gradient: the gradient passes through the cap; else it is 0 where alpha was capped.
+        stop: a share of a pixel's light, 1e-4 to 1; ``alpha_max`` is then at most 0.999. The pixel
+            draws the fragment that leaves less of its light, and stops behind it. None for the
+            hosts' rule: it stops before the fragment that would leave less than 1e-4.
         planes: those beside the image that somebody will look at, by their names in
             ``RasterOutputs``. An engine may spare itself the others, or draw them all the same.
     """
@@ -622,6 +627,7 @@ class RasterInputs:
     scores: bool = False
     alpha_max: float = ALPHA_MAX
     cap_gradient: bool = True
+    stop: float | None = None
     planes: tuple[Plane, ...] = get_args(Plane)
 
     __repr__ = one_line
@@ -630,10 +636,12 @@ class RasterInputs:
         _check("RasterInputs.means2d_hook", self.means2d_hook, len(self.splats), None)
         size = self.view.height, self.view.width
         _check("RasterInputs.sample_offsets", self.sample_offsets, *size, 2)
+        stop, highest = self.stop, 1 if self.stop is None else STOPPED_ALPHA_MAX
         checks = (
             ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),
             ("near", self.near >= 0, "0 or more"),
-            ("alpha_max", ALPHA_MIN <= self.alpha_max <= 1, "1/255 to 1"),
+            ("stop", stop is None or TRANSMITTANCE_MIN <= stop <= 1, "None, or 1e-4 to 1"),
+            ("alpha_max", ALPHA_MIN <= self.alpha_max <= highest, f"1/255 to {highest}"),
             ("planes", set(self.planes) <= set(get_args(Plane)), f"of {get_args(Plane)}"),
         )
         for name, holds, expected in checks:

@@ -11,15 +11,18 @@ def transmittances(alpha: Tensor) -> Tensor:
     return torch.cat([alpha.new_ones(1, alpha.shape[1]), 1 - alpha]).cumprod(0)
 
 
-def alive(alpha: Tensor, transmittance_min: float) -> Tensor:
+def alive(alpha: Tensor, transmittance_min: float, stop: float | None = None) -> Tensor:
     """(K, P) bool: the pixel has not stopped at or before this fragment.
 
-    A pixel stops at the first fragment that would leave less than transmittance_min. That fragment
-    and all later ones are not blended. A fragment of alpha 0 stops nothing.
+    Without a stop, a pixel stops at the first fragment that would leave less than
+    transmittance_min. That fragment and all later ones are not blended. With a stop, the first
+    fragment that leaves less than the stop is blended, and all later ones are not. A fragment of
+    alpha 0 stops nothing.
     """
-    hard = alpha.detach()
-    stops = transmittances(hard)[1:] < transmittance_min
-    return stops.cumsum(0) == 0
+    light = transmittances(alpha.detach())
+    if stop is not None:
+        return light[:-1] >= stop
+    return (light[1:] < transmittance_min).cumsum(0) == 0
 
 
 def weights_of(alpha: Tensor) -> Tensor:

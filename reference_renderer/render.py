@@ -150,7 +150,7 @@ def blended(
         here = footprints.take(block.rows)
         points = sample_points(block, options, here.mean2d)
         found = fragments(here, points, None if tau is None else tau[block.rows], options)
-        live = alive(found.alpha, options.transmittance_min)
+        live = alive(found.alpha, options.transmittance_min, options.stop)
         yield Blended(
             front[block.rows], found.alpha * live, found.drawn & live, here.opacity, here.color
         )
@@ -293,7 +293,7 @@ def draw(
     here = footprints.take(block.rows)
     tau = None if thresholds is None else thresholds[block.rows]
     found = fragments(here, sample_points(block, options, here.mean2d), tau, options)
-    live = alive(found.alpha, options.transmittance_min)
+    live = alive(found.alpha, options.transmittance_min, options.stop)
     more = [] if here.features is None else [here.features]
     channels = torch.cat([here.color, 1 / here.depth[:, None], *more], dim=1)
     alpha = found.alpha * live

@@ -103,6 +103,8 @@ class Options:
         alpha_max: alpha is capped here.
         cap_gradient: the gradient passes through the cap; else it is 0 where alpha was capped.
         transmittance_min: a pixel stops before a fragment that would leave less; 0 for no stop.
+        stop: a pixel draws the fragment that leaves less than this, and stops behind it; None for
+            the rule of transmittance_min, which is ignored otherwise.
         tiles: draw a Gaussian only in the 16x16 tiles of its 3-sigma square; else everywhere.
         sample_offsets: (H, W, 2) pixels, added to where each pixel is sampled; or None.
         absolute_gradient: the hook's third column receives the sum over pixels of the absolute
@@ -119,6 +121,7 @@ class Options:
     alpha_max: float = 0.99
     cap_gradient: bool = True
     transmittance_min: float = 1e-4
+    stop: float | None = None
     tiles: bool = True
     sample_offsets: Tensor | None = None
     absolute_gradient: bool = False

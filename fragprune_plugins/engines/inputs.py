@@ -66,6 +66,7 @@ def native_inputs(
         dilation=inputs.dilation,
         near=inputs.near,
         alpha_max=inputs.alpha_max,
+        stop=inputs.stop or 0.0,
         compensation=_COMPENSATIONS.index(inputs.compensation),
         cap_gradient=inputs.cap_gradient,
         absolute_gradient=inputs.absolute_gradient,

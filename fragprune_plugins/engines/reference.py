@@ -154,6 +154,7 @@ def options_of(inputs: RasterInputs) -> Options:
         compensation=inputs.compensation,
         near=inputs.near,
         alpha_max=inputs.alpha_max,
+        stop=inputs.stop,
         cap_gradient=inputs.cap_gradient,
         sample_offsets=inputs.sample_offsets,
         absolute_gradient=inputs.absolute_gradient,

@@ -36,6 +36,7 @@ def random_scene(
     offsets: bool = False,
     compensation: Compensation = "none",
     scale_modifier: float = 1.0,
+    stop: float | None = None,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> RasterInputs:
@@ -58,6 +59,7 @@ def random_scene(
         offsets: give sample offsets of up to half a pixel.
         compensation: as in ``RasterInputs``.
         scale_modifier: as in ``RasterInputs``.
+        stop: as in ``RasterInputs``.
         dtype: of every tensor.
         device: of every tensor.
     """
@@ -88,6 +90,7 @@ def random_scene(
         splats=splats,
         compensation=compensation,
         scale_modifier=scale_modifier,
+        stop=stop,
         sample_offsets=_uniform(generator, -0.5, 0.5, height, width, 2) if offsets else None,
     )
     return cast(inputs, dtype, device)

@@ -463,7 +463,7 @@ def native_interface(options: Options) -> Result:
     wild = (0, 1, -1, 2, 39, 41, 1 << 16, (1 << 31) - 1, 1 << 31, 1 << 40, 1 << 62)
     whole = ("count", "width", "height", "threads", "sh_degree", "sh_coefficients")
     whole += ("feature_count", "compensation", "size", "widen", "cap_gradient")
-    real = ("tan_fov_x", "tan_fov_y", "scale_modifier", "dilation", "near", "alpha_max")
+    real = ("tan_fov_x", "tan_fov_y", "scale_modifier", "dilation", "near", "alpha_max", "stop")
 
     def batch() -> Outcome:
         counts = Result()

@@ -53,7 +53,8 @@ def draw(engine, tensors, index):
     """Draw a view, and go backward from all that is differentiable."""
     given = dict(tensors)
     cut = given.pop("thresholds", None)
-    inputs = RasterInputs(tiny.cameras()[index].view(), Splats(**given, sh_degree=3))
+    stop = None if cut is None else 0.1  # a pruned model has both
+    inputs = RasterInputs(tiny.cameras()[index].view(), Splats(**given, sh_degree=3), stop=stop)
     outputs = engine.rasterize(inputs, cut)
     weights = torch.rand(outputs.image.shape, generator=torch.Generator().manual_seed(index))
     loss = (outputs.image * weights).sum() + outputs.invdepth.sum() + 2 * outputs.alpha.mean()

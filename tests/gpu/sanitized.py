@@ -50,7 +50,7 @@ DIALECTS = (
     {},
     {"sh_degree": 3, "compensation": "antialiasing", "width": 17, "height": 33},
     {"features": 3, "colors": True, "offsets": True, "absolute_gradient": True},
-    {"cov3d": True, "compensation": "mip", "alpha_max": 0.6, "cap_gradient": False},
+    {"cov3d": True, "compensation": "mip", "alpha_max": 0.6, "cap_gradient": False, "stop": 0.1},
 )
 
 

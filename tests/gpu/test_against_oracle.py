@@ -37,6 +37,7 @@ KINDS = {
     },
     "near, low cap": {"near": 2.5, "alpha_max": 0.6, "cap_gradient": False},
     "features, colours": {"features": 3, "colors": True, "scale_modifier": 0.7},
+    "stopped": {"stop": 0.2},
 }
 
 
@@ -74,8 +75,10 @@ def test_tiles_of_footprints_may_be_any_integers(engine: CudaEngine) -> None:
     assert torch.equal(*drawn)
 
 
-def test_tall_stacks_stop_where_the_oracle_does(engine: CudaEngine) -> None:
+@pytest.mark.parametrize("stop", [None, 1e-4, 0.011, 1.0])
+def test_tall_stacks_stop_where_the_oracle_does(engine: CudaEngine, stop: float | None) -> None:
     inputs = scenes.stack([0.3, 0.9, 0.999, 0.5] * 90)  # more than is staged at once
+    inputs = replace(inputs, stop=stop)
     thresholds = torch.linspace(0.01, 0.6, 360)
     truth, ours, same = draw_pair(engine, inputs, thresholds)
     check_images(truth, ours, same)

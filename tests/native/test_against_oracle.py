@@ -33,7 +33,9 @@ KINDS = {
     "cov3d, antialiasing": {"cov3d": True, "compensation": "antialiasing", "sh_degree": 0},
     "colours, modifier": {"colors": True, "scale_modifier": 0.7},
     "odd size, sh 2": {"width": 33, "height": 17, "sh_degree": 2},
+    "stopped": {"stop": 0.3},
     "surfels": {"flat": True},
+    "surfels, stopped": {"flat": True, "stop": 0.3},
     "surfels, sh 3, modifier": {"flat": True, "sh_degree": 3, "scale_modifier": 0.7, "width": 33},
     "surfels, colours": {"flat": True, "colors": True},
 }
@@ -141,8 +143,9 @@ def test_images_and_gradients_equal_the_oracle(
     check_gradients(engine, inputs, thresholds, same)
 
 
-def test_tall_stacks_stop_where_the_oracle_does(engine: CpuEngine) -> None:
-    inputs = scenes.stack([0.3, 0.9, 0.999, 0.5] * 30)
+@pytest.mark.parametrize("stop", [None, 1e-4, 0.011, 1.0])
+def test_tall_stacks_stop_where_the_oracle_does(engine: CpuEngine, stop: float | None) -> None:
+    inputs = replace(scenes.stack([0.3, 0.9, 0.999, 0.5] * 30), stop=stop)
     thresholds = torch.linspace(0.01, 0.6, 120)
     truth, ours, same = draw_pair(engine, inputs, thresholds)
     check_images(truth, ours, same)

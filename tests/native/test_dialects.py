@@ -33,13 +33,14 @@ ALONE = {
     "no cap": {"alpha_max": 1.0, "cap_gradient": False},
     "1 feature": {"features": 1},
     "8 features": {"features": 8},
+    "stopped, with features and scores": {"stop": 0.2, "features": 2, "scores": True},
     "features, colours, offsets": {"features": 3, "colors": True, "offsets": True},
 }
 
 
 def dialect(seed: int, n: int = 60, width: int = 41, height: int = 29, **kind) -> RasterInputs:
     """A random scene; what is not one of its own options is set on the inputs."""
-    of_scene = {"features", "offsets", "compensation", "colors", "cov3d", "sh_degree"}
+    of_scene = {"features", "offsets", "compensation", "colors", "cov3d", "sh_degree", "stop"}
     made = scenes.random_scene(
         seed, n, width, height, **{k: v for k, v in kind.items() if k in of_scene}
     )
@@ -74,6 +75,7 @@ def dialects(draw: st.DrawFn) -> Case:
         "dilation": one_of(0.05, 0.1, 0.3),
         "near": one_of(0.05, 0.2, 2.0),
         "alpha_max": one_of(0.7, 0.99, 0.999),
+        "stop": one_of(None, 0.01, 0.5),
     }
     switches = ("offsets", "cap_gradient", "absolute_gradient", "scores", "colors", "cov3d")
     return draw(cases(kind | {name: draw(st.booleans()) for name in switches}))

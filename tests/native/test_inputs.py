@@ -20,7 +20,7 @@ from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
 
 N = 20
-WORLD = scenes.random_scene(0, N, features=2)
+WORLD = scenes.random_scene(0, N, features=2, stop=0.3)
 GIVEN = {
     "world": WORLD,
     "colours and covariances": scenes.random_scene(0, N, cov3d=True, colors=True),
@@ -116,6 +116,27 @@ def draw(library: binding.Library, inputs: binding.Inputs) -> tuple[int, str]:
         ctypes.byref(inputs), ctypes.byref(outputs), None, ctypes.byref(error)
     )
     return status, error.message.decode()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"stop": 0.5e-4}, "stop must be"),
+        ({"stop": -0.1}, "stop must be"),
+        ({"stop": float("nan")}, "stop must be"),
+        ({"stop": 0.1, "alpha_max": 1.0}, "alpha_max must be"),
+    ],
+)
+def test_a_stop_that_cannot_be_is_refused(
+    library: binding.Library, given: dict[str, float], said: str
+) -> None:
+    inputs = native_inputs(WORLD, arrays := native_arrays(WORLD, None), widen=False)
+    assert len(arrays) > 5  # alive while they are read
+    for name, value in given.items():
+        setattr(inputs, name, value)
+    status, message = draw(library, inputs)
+    assert status != binding.OK
+    assert message.startswith(said)
 
 
 @pytest.fixture(params=binding.usable_builds(), scope="module")

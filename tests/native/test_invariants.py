@@ -14,7 +14,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.testing import scenes
-from fragprune_plugins.types import Compensation, RasterInputs
+from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs
 
 # Enough Gaussians and tiles for several pieces of work per thread, in sorting and binning too.
 LARGE = {"n": 20_000, "width": 150, "height": 100, "scale_modifier": 0.3}
@@ -92,6 +92,41 @@ def test_raising_a_threshold_never_adds_an_eligible_fragment(
     assert (after.fragments <= before.fragments).all()
     assert (after.fragments_per_gaussian <= before.fragments_per_gaussian).all()
     assert torch.equal(after.radii, before.radii)
+
+
+def drawn_at(engine: CpuEngine, inputs: RasterInputs, stop: float | None) -> RasterOutputs:
+    with torch.no_grad():
+        return engine.rasterize(replace(inputs, stop=stop, counts=True), None)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    flat=st.booleans(),
+    lines=st.lists(st.floats(1e-4, 1.0), min_size=2, max_size=2).map(sorted),
+)
+def test_a_higher_stop_draws_no_more_and_loses_no_more_than_its_share_of_light(
+    engine: CpuEngine, seed: int, flat: bool, lines: list[float]
+) -> None:
+    inputs = scenes.random_scene(seed, 60, 21, 19, colors=True, flat=flat)
+    lower, higher = (drawn_at(engine, inputs, stop) for stop in lines)
+    assert (higher.fragments <= lower.fragments).all()
+    assert (higher.fragments_per_gaussian <= lower.fragments_per_gaussian).all()
+    shades = torch.cat([inputs.splats.colors, inputs.view.background[None]])
+    contrast = (shades.amax(0) - shades.amin(0))[:, None, None]
+    away = (higher.image - lower.image).abs()
+    assert (away <= lines[1] * contrast + 1e-5).all()
+    fewer = higher.fragments < lower.fragments
+    assert (higher.alpha[0][fewer] > 1 - lines[1] - 1e-6).all()
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_stop_that_no_pixel_reaches_changes_no_bit(engine: CpuEngine, flat: bool) -> None:
+    inputs = scenes.random_scene(4, 60, flat=flat)
+    faint = replace(inputs.splats, opacities=inputs.splats.opacities * 0.05)
+    inputs, tau = replace(inputs, splats=faint), scenes.random_thresholds(4, 60)
+    without = everything(engine, inputs, tau)
+    assert without["alpha"].max() < 1 - 1e-4
+    assert_identical(without, everything(engine, replace(inputs, stop=1e-4), tau))
 
 
 def test_truncated_fragments_pass_on_no_gradient_but_the_rim(engine: CpuEngine) -> None:

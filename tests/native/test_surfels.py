@@ -28,6 +28,7 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs
 DIALECTS = {
     "near": {"near": 2.5},
     "scores": {"scores": True},
+    "stopped": {"stop": 0.2, "scores": True},
     "low cap": {"alpha_max": 0.5},
     "capped gradient": {"alpha_max": 0.6, "cap_gradient": False},
 }

@@ -156,7 +156,7 @@ def splats_of(inputs: RasterInputs, thresholds=None) -> list[Splat]:
 
 
 def records_at(
-    splats: list[Splat], x: int, y: int, offset=(0.0, 0.0)
+    splats: list[Splat], x: int, y: int, offset=(0.0, 0.0), stop=None
 ) -> tuple[list[Record], float]:
     """The pairs visited at a pixel, in order, and the final transmittance."""
     records, light = [], 1.0
@@ -170,7 +170,9 @@ def records_at(
         alpha = min(0.99, s.opacity * g)
         visible = s.opacity > 0 and q <= 2 * math.log(255 * s.opacity)
         drawn = visible and (s.tau is None or q <= -2 * math.log(s.tau))
-        if drawn and light * (1 - alpha) < 1e-4:
+        if stop is None and drawn and light * (1 - alpha) < 1e-4:
+            break
+        if stop is not None and light < stop:
             break
         slope, rim = 0.0, False
         if s.tau is not None:

@@ -81,6 +81,29 @@ def test_every_input_has_the_derivative_of_finite_differences(kind, truncated):
     assert torch.autograd.gradcheck(drawn, (*leaves.values(), tau), eps=1e-6, atol=1e-5, rtol=1e-4)
 
 
+def test_behind_a_stop_derivatives_are_those_of_finite_differences():
+    scene, leaves = scenes.leaves(replace(smooth_scene(colors=True), stop=0.52))
+    hook = leaves.pop("means2d_hook")
+    names, options = list(leaves), uncut(scene)
+
+    def drawn(*tensors):
+        given = dict(zip(names, tensors, strict=True))
+        camera = replace(camera_of(scene), background=given.pop("background"))
+        return render(
+            camera, replace(gaussians_of(scene.splats), **given), means2d_hook=hook, options=options
+        )
+
+    found = drawn(*leaves.values()).fragments
+    assert {1, 2, 3} <= set(found.flatten().tolist())
+    assert torch.autograd.gradcheck(
+        lambda *tensors: outputs(drawn(*tensors))[:3],
+        tuple(leaves.values()),
+        eps=1e-6,
+        atol=1e-5,
+        rtol=1e-4,
+    )
+
+
 @pytest.mark.parametrize("features", [0, 2])
 def test_every_number_of_a_footprint_has_the_derivative_of_finite_differences(features):
     made = footprints_of(smooth_scene(colors=True, features=features))

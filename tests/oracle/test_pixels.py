@@ -71,6 +71,7 @@ CASES = {
     "mip": {"compensation": "mip"},
     "offsets, features": {"offsets": True, "features": 2},
     "scaled": {"scale_modifier": 1.7},
+    "stopped": {"stop": 0.3},
 }
 
 
@@ -85,7 +86,7 @@ def test_every_output_equals_that_of_loops_over_floats(name, truncated):
     for y in range(20):
         for x in range(34):
             offset = (0, 0) if scene.sample_offsets is None else scene.sample_offsets[y, x].tolist()
-            records, light = naive.records_at(splats, x, y, offset)
+            records, light = naive.records_at(splats, x, y, offset, scene.stop)
             winner, most = -1, 0.0
             for record in records:
                 per_row[record.row] += record.drawn

@@ -186,6 +186,31 @@ def test_a_pixel_goes_on_while_enough_light_is_left():
     assert drawn.alpha[0, 8, 8].item() == pytest.approx(1 - 1.1e-4)
 
 
+@pytest.mark.parametrize(
+    ("stop", "drawn", "left"),
+    [(1.0, 1, 0.5), (0.26, 2, 0.25), (0.25, 3, 0.0125), (0.0124, 4, 0.00625), (1e-4, 4, 0.00625)],
+)
+def test_with_a_stop_a_pixel_draws_the_fragment_that_crosses_it_and_none_behind(stop, drawn, left):
+    inputs = replace(scenes.stack([0.5, 0.5, 0.95, 0.5], dtype=F64), stop=stop)
+    found = draw(inputs)
+    assert found.fragments[8, 8] == drawn
+    assert found.alpha[0, 8, 8].item() == pytest.approx(1 - left)
+    alone = replace(inputs, stop=None, splats=gaussians_first(inputs.splats, drawn))
+    assert torch.equal(draw(alone).image[:, 8, 8], found.image[:, 8, 8])
+
+
+def test_with_a_stop_only_fragments_behind_it_get_no_gradient():
+    scene = replace(scenes.stack([0.5, 0.9, 0.5, 0.5], dtype=F64), stop=0.1)
+    inputs, leaves = scenes.leaves(scene)
+    tau = torch.full((4,), 0.99, dtype=F64, requires_grad=True)  # the rim is at the mean
+    drawn = draw(inputs, tau)
+    (drawn.image[:, 8, 8].sum() + drawn.invdepth[0, 8, 8]).backward()
+    grads = {name: leaves[name].grad for name in ("means", "opacities", "colors")}
+    for name, grad in {**grads, "thresholds": tau.grad}.items():
+        assert grad[:2].flatten(1 if grad.ndim > 1 else 0).any(), name
+        assert not grad[2:].any(), name
+
+
 def test_a_negative_squared_distance_is_skipped_and_overflows_nothing():
     inputs = scenes.one_splat(dtype=F64)
     prints = project.project(camera_of(inputs), gaussians_of(inputs.splats), Options())
@@ -317,6 +342,10 @@ def test_footprints_that_cannot_be_drawn_are_culled():
         {"near": -1.0},
         {"near": math.nan},
         {"alpha_max": 1.1},
+        {"stop": 0.0},
+        {"stop": 1.5},
+        {"stop": math.nan},
+        {"stop": 0.01, "alpha_max": 1.0},
         {"compensation": "some"},
         {"sample_offsets": torch.zeros(17, 16, 2)},
         {"absolute_gradient": True, "means2d_hook": torch.zeros(1, 2)},

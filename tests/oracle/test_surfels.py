@@ -119,7 +119,7 @@ def blend(inputs, thresholds):
                 tau = 0.0 if thresholds is None else thresholds[disc.row].item()
                 if not disc.inside[y, x] or a < 1 / 255 or falloff < tau:
                     continue
-                if light * (1 - a) < 1e-4:
+                if light < (inputs.stop or 0) or (not inputs.stop and light * (1 - a) < 1e-4):
                     break
                 if light > 0.5:
                     surface[4, y, x] = disc.z[y, x]
@@ -151,7 +151,7 @@ def in_front(seed, n, width, height, **kind):
 
 @pytest.mark.parametrize("truncated", [False, True], ids=["whole", "truncated"])
 @pytest.mark.parametrize(
-    "kind", [{}, {"sh_degree": 3}, {"colors": True, "scale_modifier": 1.4}], ids=str
+    "kind", [{}, {"sh_degree": 3}, {"colors": True, "scale_modifier": 1.4}, {"stop": 0.3}], ids=str
 )
 def test_every_output_is_that_of_rays_and_planes(kind, truncated):
     scene = in_front(3, 30, 34, 12, **kind)

@@ -148,7 +148,7 @@ def explicit_gradients(inputs, tau, pressure):
     splats, weight = naive.splats_of(inputs, tau), weights().tolist()
     for y in range(HEIGHT):
         for x in range(WIDTH):
-            records, light = naive.records_at(splats, x, y)
+            records, light = naive.records_at(splats, x, y, stop=inputs.stop)
             behind = [light * b for b in background]  # what all later fragments add
             for r in reversed(records):
                 feature = [*r.color, 1 / r.depth]
@@ -166,9 +166,11 @@ def explicit_gradients(inputs, tau, pressure):
 
 @pytest.mark.parametrize("pressure", [0.0, 300.0])
 @pytest.mark.parametrize("seed", [11, 12])
-@pytest.mark.parametrize("compensation", ["none", "antialiasing", "mip"])
-def test_the_threshold_gradient_is_the_explicit_rim_sum(seed, pressure, compensation):
-    inputs = scene_of(seed, compensation=compensation)
+@pytest.mark.parametrize(
+    "kind", [{}, {"compensation": "antialiasing"}, {"compensation": "mip"}, {"stop": 0.3}], ids=str
+)
+def test_the_threshold_gradient_is_the_explicit_rim_sum(seed, pressure, kind):
+    inputs = scene_of(seed, **kind)
     tau = scenes.random_thresholds(seed, N, dtype=F64).requires_grad_()
     drawn = draw(inputs, tau)
     (loss_of(drawn) + pressure * drawn.fragments_per_pixel).backward()

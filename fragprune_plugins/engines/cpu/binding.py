@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from fragprune_plugins import native
 
-API_VERSION: Final = 7
+API_VERSION: Final = 8
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -88,6 +88,7 @@ class Inputs(_Sized):
         ("dilation", ctypes.c_float),
         ("near", ctypes.c_float),
         ("alpha_max", ctypes.c_float),
+        ("stop", ctypes.c_float),
         ("compensation", ctypes.c_int32),
         ("cap_gradient", ctypes.c_int32),
         ("absolute_gradient", ctypes.c_int32),

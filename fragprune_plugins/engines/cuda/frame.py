@@ -115,7 +115,12 @@ MACROS: Final = {
 
 
 def blend_macros(
-    features: int = 0, *, counts: bool = False, scores: bool = False, packed: bool = False
+    features: int = 0,
+    *,
+    counts: bool = False,
+    scores: bool = False,
+    packed: bool = False,
+    stop: bool = False,
 ) -> dict[str, int]:
     """The macros with which native/cuda/blend.cu is compiled."""
     return {
@@ -123,6 +128,7 @@ def blend_macros(
         "FP_COUNTS": int(counts),
         "FP_SCORES": int(scores),
         "FP_PACKED": int(packed),
+        "FP_STOP": int(stop),
     }
 
 
@@ -164,6 +170,7 @@ VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
     ("slice", {}),
     ("blend", blend_macros()),
     ("blend", blend_macros(counts=True)),
+    ("blend", blend_macros(stop=True)),
     *(
         ("unblend", unblend_macros(frozenset(wanted), sh_turns=True, invdepth=invdepth))
         for wanted in (_TRAINED, _TRAINED | {"thresholds"}, {"opacities", "thresholds"})
@@ -447,7 +454,11 @@ class Drawing:
             frame.entry_keys, frame.entry_values = keys[passes % 2], values[passes % 2]
             self._launch("scene", scene, "fp_ranges", _blocks(capacity), frame)
         macros = blend_macros(
-            self._channels, counts=inputs.counts, scores=inputs.scores, packed=packed
+            self._channels,
+            counts=inputs.counts,
+            scores=inputs.scores,
+            packed=packed,
+            stop=inputs.stop is not None,
         )
         self._launch("blend", macros, "fp_blend", tiles, frame)
         found = cleared.tensor("counters", 4, torch.int64)

@@ -153,7 +153,7 @@ inline void transpose_bits(const Blocks* reached, int count, uint64_t (*words)[k
 // ---- forward ---------------------------------------------------------------------------------
 
 struct BlockPixels {
-  Lanes light;  // transmittance; stays what it was where the pixel stopped
+  Lanes light;  // transmittance; stays what it is once the pixel stopped
   Lanes r, g, b, inv_z;
   IntLanes drawn, stop;
   Mask alive;  // has not stopped, and lies in the image
@@ -246,11 +246,11 @@ struct ExtraTile {
 // from `first` to `end`. Each is handed to `also(j, weight, drawn)`, too. Returns how many it met.
 // (Local copies of the pixels, one by one: a struct would be copied in small pieces, which stalls
 // the loads that follow.)
-template <bool kKeep, bool kDepth, class Also>
+template <bool kKeep, bool kDepth, bool kStop, class Also>
 inline int blend_block(const Batch& batch, const int32_t* which, int count, int first, int end,
-                       Lanes px, Lanes py, float alpha_max, const BlockPixels& before,
+                       Lanes px, Lanes py, float alpha_max, float line, const BlockPixels& before,
                        BlockPixels& pixels, Also also) {
-  const Lanes floor = broadcast<Lanes>(kTransmittanceMin);
+  const Lanes floor = broadcast<Lanes>(kStop ? line : kTransmittanceMin);
   Lanes light = before.light;
   Lanes r = before.r, g = before.g, blue = before.b, inv_z = before.inv_z;
   IntLanes drawn_count = before.drawn, stop = before.stop;
@@ -269,11 +269,12 @@ inline int blend_block(const Batch& batch, const int32_t* which, int count, int 
     for (int k = 0; k < kSome; k++) {
       const int j = who[k];
       const Lanes after = fnma(light, alpha[k], light);
-      alive = both(alive, ge(after, floor));
-      const Lanes weight = where(alive, alpha[k] * light);
-      light = select(alive, after, light);
-      if (kKeep) stop = select(alive, broadcast_int(std::min(first + j + 1, end)), stop);
-      const Mask drawn = both(inside[k], alive);
+      const Mask goes_on = both(alive, ge(after, floor)), draws = kStop ? alive : goes_on;
+      alive = goes_on;
+      const Lanes weight = where(draws, alpha[k] * light);
+      light = select(draws, after, light);
+      if (kKeep) stop = select(draws, broadcast_int(std::min(first + j + 1, end)), stop);
+      const Mask drawn = both(inside[k], draws);
       drawn_count = increment(drawn, drawn_count);
       r = fma(weight, broadcast<Lanes>(batch.r[j]), r);
       g = fma(weight, broadcast<Lanes>(batch.g[j]), g);
@@ -299,7 +300,7 @@ inline int blend_block(const Batch& batch, const int32_t* which, int count, int 
 struct Canvas {
   int width, height;
   float background[3];
-  float spread, alpha_max;
+  float spread, alpha_max, stop;
   float *image, *invdepth, *alpha, *features;
   int32_t *fragments, *winners;
 };
@@ -415,7 +416,7 @@ struct OpenTile {
 };
 
 // Blends what waits; returns lanes spent. A `list` grows by it; `extra` is NULL, unless kExtra.
-template <bool kKeep, bool kExtra, bool kDepth>
+template <bool kKeep, bool kExtra, bool kDepth, bool kStop>
 inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const Canvas& canvas,
                              OpenTile& tile, TileList* list, ExtraTile* extra) {
   const int count = tile.waiting, first = tile.blended, end = first + count;
@@ -456,12 +457,13 @@ inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const 
         const float* row = extra->row(splats[tile.splat[j]]);
         extra->blocks[b].blend(extra->extras, row, first + j, weight, drawn, extra->each);
       };
-      met += blend_block<kKeep, true>(batch, which, reached, first, end, extra->samples.x[b],
-                                      extra->samples.y[b], canvas.alpha_max, before, pixels, also);
+      met += blend_block<kKeep, true, kStop>(batch, which, reached, first, end,
+                                             extra->samples.x[b], extra->samples.y[b],
+                                             canvas.alpha_max, canvas.stop, before, pixels, also);
     } else {
-      met += blend_block<kKeep, kDepth>(batch, which, reached, first, end, centres.x(b),
-                                        centres.y(b), canvas.alpha_max, before, pixels,
-                                        [](int, Lanes, Mask) {});
+      met += blend_block<kKeep, kDepth, kStop>(batch, which, reached, first, end, centres.x(b),
+                                               centres.y(b), canvas.alpha_max, canvas.stop, before,
+                                               pixels, [](int, Lanes, Mask) {});
     }
     if (!bits(pixels.alive)) tile.alive &= ~(Blocks{1} << b);
   }

@@ -169,6 +169,12 @@ class Cell {
   }
 
  private:
+  template <bool kStop>
+  static constexpr decltype(&fp::blend_waiting<false, false, false, kStop>) kBlend[] = {
+      fp::blend_waiting<false, false, false, kStop>, fp::blend_waiting<false, false, true, kStop>,
+      fp::blend_waiting<true, false, false, kStop>,  fp::blend_waiting<true, false, true, kStop>,
+      fp::blend_waiting<false, true, true, kStop>,   fp::blend_waiting<true, true, true, kStop>};
+
   void hand_out(const CellEntry* entry, const CellEntry* end) {
     constexpr int kSome = 4 * kLanes;
     const float x = static_cast<float>(left_ * kTile), y = static_cast<float>(row_ * kTile);
@@ -206,11 +212,8 @@ class Cell {
   }
 
   void blend_waiting(int x) {
-    static constexpr decltype(&fp::blend_waiting<false, false, false>) kinds[] = {
-        fp::blend_waiting<false, false, false>, fp::blend_waiting<false, false, true>,
-        fp::blend_waiting<true, false, false>,  fp::blend_waiting<true, false, true>,
-        fp::blend_waiting<false, true, true>,   fp::blend_waiting<true, true, true>};
     const bool keep = p_.keep != nullptr, depth = p_.canvas.invdepth != nullptr;
+    const auto& kinds = p_.canvas.stop > 0 ? kBlend<true> : kBlend<false>;
     const auto blend = kinds[p_.extras.any() ? 4 + keep : 2 * keep + depth];
     spent_.entries += tiles_[x].waiting;
     spent_.evaluated += blend(splats_, p_.colours, p_.canvas, tiles_[x],
@@ -250,9 +253,9 @@ FP_STAGE void draw(Team& team, const Memory& memory, const Camera<float>& c, con
           fragprune_state* keep) {
   const float* back = in.background;
   const Canvas canvas{in.width,     in.height,    {back[0], back[1], back[2]},
-                      c.spread,     in.alpha_max, out.image,
-                      out.invdepth, out.alpha,    out.features,
-                      out.fragments, out.winners};
+                      c.spread,     in.alpha_max, in.stop,
+                      out.image,    out.invdepth, out.alpha,
+                      out.features, out.fragments, out.winners};
   const size_t n = static_cast<size_t>(in.count);
   std::optional<Weights> weights;
   if (out.weights_per_gaussian) weights.emplace(memory, in);
@@ -754,6 +757,10 @@ const char* fault_of(const fragprune_inputs* in, const fragprune_outputs* out) {
   if (!(in->near >= 0)) return "near must be 0 or more";
   if (!(in->alpha_max >= static_cast<float>(FRAGPRUNE_ALPHA_MIN) && in->alpha_max <= 1))
     return "alpha_max must be 1/255 to 1";
+  if (in->stop != 0 && !(in->stop >= kTransmittanceMin && in->stop <= 1))
+    return "stop must be 0, or 1e-4 to 1";
+  if (in->stop != 0 && in->alpha_max > static_cast<float>(FRAGPRUNE_STOPPED_ALPHA_MAX))
+    return "alpha_max must be at most 0.999 with a stop";
   if (in->compensation < FRAGPRUNE_NO_COMPENSATION || in->compensation > FRAGPRUNE_MIP)
     return "compensation must be one of enum fragprune_compensation";
   if (in->feature_count < 0 || in->feature_count > FRAGPRUNE_FEATURES_MAX)

@@ -88,6 +88,7 @@ struct SurfelSpent {
   int64_t drawn = 0, evaluated = 0, entries = 0;
 };
 
+template <bool kStop>
 inline SurfelSpent draw_surfel_tile(SurfelScene& scene, size_t t, const fragprune_outputs& out,
                                     SurfelFound& found) {
   const fragprune_inputs& in = scene.in;
@@ -105,6 +106,7 @@ inline SurfelSpent draw_surfel_tile(SurfelScene& scene, size_t t, const fragprun
   for (int y = 0; y < high; y++)
     for (int x = 0; x < wide; x++) kept.stop[place_of(x, y)] = kNever;
   const auto all = [](float x) { return broadcast<Lanes>(x); };
+  const Lanes floor = all(kStop ? in.stop : kTransmittanceMin);
   const bool surface = out.surface != nullptr, scores = out.winners || out.wins_per_gaussian;
   SurfelSpent spent;
   const uint32_t begin = scene.first[t], end = scene.first[t + 1];
@@ -125,15 +127,16 @@ inline SurfelSpent draw_surfel_tile(SurfelScene& scene, size_t t, const fragprun
       if (!bits(inside)) return;
       const Lanes alpha = where(inside, capped(all(s.opacity) * surfel_falloff(m.q), in.alpha_max));
       const Lanes light = load(kept.light + at), after = fnma(light, alpha, light);
-      const Mask goes_on = both(alive, ge(after, all(kTransmittanceMin)));
-      const Mask drawn = both(inside, goes_on);
+      const Mask goes_on = both(alive, ge(after, floor)), draws = kStop ? alive : goes_on;
+      const Mask drawn = both(inside, draws);
       const uint32_t ends = bits(alive) & ~bits(goes_on);
       if (ends) {
-        store(kept.stop + at, select(goes_on, stop, select(alive, broadcast_int(place), stop)));
+        const IntLanes here = broadcast_int(place + kStop);
+        store(kept.stop + at, select(goes_on, stop, select(alive, here, stop)));
         stopped += __builtin_popcount(ends);
       }
       const Lanes weight = where(drawn, alpha * light);
-      store(kept.light + at, select(goes_on, after, light));
+      store(kept.light + at, select(draws, after, light));
       store(drawn_count + at, increment(drawn, load(drawn_count + at)));
       const auto add = [&](int k, Lanes value) {
         store(sums[k] + at, fma(weight, value, load(sums[k] + at)));
@@ -211,7 +214,8 @@ FP_STAGE inline std::unique_ptr<SurfelScene> draw_surfels(const fragprune_inputs
   if (out.wins_per_gaussian) std::fill_n(out.wins_per_gaussian, n, 0);
   std::atomic<int64_t> drawn{0}, evaluated{0}, entries{0};
   team.each(tiles, 1, [&](size_t t, size_t) {
-    const SurfelSpent spent = draw_surfel_tile(*scene, t, out, found);
+    const SurfelSpent spent = in.stop > 0 ? draw_surfel_tile<true>(*scene, t, out, found)
+                                          : draw_surfel_tile<false>(*scene, t, out, found);
     drawn += spent.drawn, evaluated += spent.evaluated, entries += spent.entries;
   });
   for (const Surfel& s : scene->surfels)

@@ -9,6 +9,9 @@
 #ifndef FP_SCORES  // also the Gaussians' weights, and who wins which pixel
 #define FP_SCORES 0
 #endif
+#ifndef FP_STOP  // the fragment that crosses the line is drawn
+#define FP_STOP 0
+#endif
 
 namespace fp {
 
@@ -52,7 +55,7 @@ FP_KERNEL(fp_blend, Frame, 2) {
         if (draws) {
           const float alpha = min(exp2(exponent), f.in.alpha_max);
           const float after = fnma(light, alpha, light);
-          if (after >= kTransmittanceMin) {
+          if (FP_STOP || after >= kTransmittanceMin) {
             weight = alpha * light;
             light = after;
             r = fma(weight, b.r, r);
@@ -72,6 +75,12 @@ FP_KERNEL(fp_blend, Frame, 2) {
             alive = draws = false;
             stop = static_cast<int32_t>(first - range.first) + j;
           }
+#if FP_STOP
+          if (after < f.in.stop) {
+            alive = false;
+            stop = static_cast<int32_t>(first - range.first) + j + 1;
+          }
+#endif
         }
 #if FP_COUNTS
         const uint32_t each = __popc(__ballot_sync(kAll, draws));

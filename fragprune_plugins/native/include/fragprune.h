@@ -10,12 +10,13 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 7
+#define FRAGPRUNE_API_VERSION 8
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
 #define FRAGPRUNE_ALPHA_MAX 0.99
 #define FRAGPRUNE_TRANSMITTANCE_MIN 1e-4
+#define FRAGPRUNE_STOPPED_ALPHA_MAX 0.999
 #define FRAGPRUNE_NEAR 0.2
 #define FRAGPRUNE_TILE 16
 #define FRAGPRUNE_DILATION 0.3
@@ -112,7 +113,9 @@ typedef struct fragprune_inputs {
   float scale_modifier;    /* factor on scales; does not apply to cov3d */
   float dilation;          /* pixels^2 added to the 2D covariance's diagonal */
   float near;              /* Gaussians at this view depth or less are culled; 0 or more */
-  float alpha_max;         /* alpha is capped here; 1/255 to 1 */
+  float alpha_max;         /* alpha is capped here; 1/255 to 1, or to 0.999 with a stop */
+  float stop;              /* 1e-4 to 1: a pixel draws the fragment that leaves less of its light, and
+                              stops behind it; 0: it stops before one that would leave less than 1e-4 */
   int32_t compensation;    /* enum fragprune_compensation */
   int32_t cap_gradient;    /* the gradient passes through the cap; else it is 0 where capped */
   int32_t absolute_gradient; /* fill the hook's third column, see fragprune_input_grads */

@@ -53,6 +53,8 @@ calls::Scene scene_of(calls::Source& from) {
   in.scale_modifier = numbers[2], in.dilation = numbers[3];
   in.near = numbers[4] >= 0 ? numbers[4] : 0.2f;
   in.alpha_max = numbers[5] >= 0.01f && numbers[5] <= 1 ? numbers[5] : 0.99f;
+  in.stop = options >> 23 & 1 ? 0.3f : 0;
+  if (in.stop > 0) in.alpha_max = std::min(in.alpha_max, (float)FRAGPRUNE_STOPPED_ALPHA_MAX);
   take(s.viewmatrix, 16, from, raw);
   take(s.projmatrix, 16, from, raw);
   take(s.campos, 3, from, raw);

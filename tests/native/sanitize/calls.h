@@ -326,6 +326,8 @@ inline Scene make_scene(Source& from, Limits limits) {
   in.compensation = from.below(3);
   in.near = from.one_in(3) ? from.uniform(0, 2) : 0.2f;
   in.alpha_max = from.one_in(3) ? from.uniform(0.1f, 1) : 0.99f;
+  in.stop = from.one_in(3) ? from.log_uniform(1e-4f, 1) : 0;
+  if (in.stop > 0) in.alpha_max = std::min(in.alpha_max, (float)FRAGPRUNE_STOPPED_ALPHA_MAX);
   in.cap_gradient = from.below(2);
   in.absolute_gradient = from.below(2);
   in.widen = from.below(2);
@@ -424,8 +426,10 @@ inline void check(const Scene& s, const Picture& p) {
   for (size_t i = 0; i < p.wins.size(); i++) wins += p.wins[i];
   if (p.wins.get() && p.winners.get()) CALLS_CHECK(wins == won);
   for (size_t i = 0; i < p.weights.size(); i++) CALLS_CHECK(p.weights[i] >= 0);
+  const float least = s.in.stop > 0 ? s.in.stop * (1 - s.in.alpha_max)
+                                    : (float)FRAGPRUNE_TRANSMITTANCE_MIN;  // light left
   for (size_t i = 0; i < p.alpha.size(); i++)
-    CALLS_CHECK(p.alpha[i] >= 0 && p.alpha[i] <= 1 - 0.99f * (float)FRAGPRUNE_TRANSMITTANCE_MIN);
+    CALLS_CHECK(p.alpha[i] >= 0 && p.alpha[i] <= 1 - 0.99f * least);
 }
 
 struct Loss {
