@@ -136,7 +136,6 @@ class MovingGaussians(GraphdecoAdapter):
             },
         ),
         Seam(Role.STILL, graphdeco.MODEL, "GaussianModel.prune"),
-        Seam(Role.ALSO, graphdeco.MODEL, "GaussianModel.save_deformation", ("path",)),
     )
 
     # -- its command line ------------------------------------------------------------------------

@@ -61,7 +61,6 @@ class Role(Enum):
         "instead: the return value of the skipped call (None)",
     )
     SAVE = "write the sidecar beside the model's file", "after: the file (the path as passed)"
-    ALSO = "save another file of the model; does nothing where a killed stage 2 goes on"
     LOAD = "read the sidecar beside the model's file", "after: the file (the path as passed)"
     PACK = (
         "write the sidecar of a file with the model's Gaussians in another order",

@@ -8,7 +8,6 @@ for more iterations, and thresholds learn.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import sys
 import tempfile
@@ -18,18 +17,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import (
-    CheckpointError,
     HostFailed,
     Interrupted,
     NotComparedError,
     SidecarError,
     Terminated,
     UsageError,
-    printable,
 )
-from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import MethodAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import choose, locate
@@ -43,9 +38,6 @@ from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupt
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import installed
-
-UNFINISHED = "stage2.fragprune-unfinished"
-"""The file of an unfinished stage 2, in the host's output folder."""
 
 log = logging.getLogger("fragprune")
 
@@ -64,27 +56,21 @@ class RunOptions:
         settings: settings of the fine-tuning.
         from_iter: iteration after which learning begins inside one run. "finetune" also freezes the
             model from there on. None: "joint" learns once the host's densification is over.
-        alternate: with "joint", learn for this many iterations, hold for as many, and so on.
         engine: "auto", "reference", "cpu", "cuda", or the name of a plugin's engine.
         device: the host's device. "cpu" runs a CUDA-only host without a GPU, "cuda" and "cuda:N"
             require a GPU, "auto" takes a GPU if torch sees one.
-        again: False leaves a finished stage 2 alone: if "finetune" finds the result of the same
-            start, settings and host, it runs nothing. An unfinished one goes on.
-        checkpoint_every: seconds after which an unfinished stage 2 is kept again; 0 keeps none.
-        resuming: options of the two above that a user wrote. A host that keeps its own checkpoints
-            refuses them.
+        again: False leaves finished stages alone. If the stage 2 that "finetune" asks for has its
+            result already, nothing runs. If an earlier run of the same command finished stage 1
+            and not stage 2, "auto" begins with stage 2.
     """
 
     adapter: str | None = None
     stage: Stage = "auto"
     settings: Settings = field(default_factory=Settings)
     from_iter: int | None = None
-    alternate: int | None = None
     engine: str = "auto"
     device: str = "auto"
     again: bool = True
-    checkpoint_every: float = 300.0
-    resuming: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -254,13 +240,6 @@ def _run_method(
     script, arguments, module = command
     started, ear, plugins = time.perf_counter(), _Ear(), installed()
     ranks.expect_one()
-    if options.resuming:
-        raise UsageError(
-            " and ".join(options.resuming),
-            f"{adapter.info.title}, which keeps and resumes its own checkpoints",
-            "the host's own options for them",
-            "Drop it. Stage 2 begins anew unless the host's command names a checkpoint.",
-        )
     device = process.host_device(options.device, options.engine)
     words = adapter.rewritten(
         arguments,
@@ -336,7 +315,7 @@ class _Runner:
         self.options, self.device, self.scratch = options, device, scratch
         self.output = host.output
         self.around: Path | None = None  # stage 1's folder, if stage 2 has its own
-        self.trained: Start | None = None  # the end of stage 1, after stage 1
+        self.start: Start | None = None  # of stage 2
         self.before: Path | None = None
         self.after: Path | None = None
         self.learned: Summary | None = None
@@ -356,7 +335,7 @@ class _Runner:
         log.info("thresholds learn in iterations %d to %d", start + 1, total)
         steps = total - resumed - self.host.line.skipped
         settings = replace(self.options.settings, iterations=steps)
-        schedule = JointSchedule(settings, start - resumed + 1, self.options.alternate)
+        schedule = JointSchedule(settings, start - resumed + 1)
         self._execute(
             self.host.saving(self.scratch, total),
             learn=True,
@@ -374,6 +353,17 @@ class _Runner:
         if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
             return self.finetune()
         self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
+        if not self.options.again:
+            self.start = starting.finished(self.adapter, self.host, self.repo.commit)
+        if self.start is None:
+            self.start = self._train()
+            starting.remember(self.start, self.host, self.repo.commit)
+        command = self.host
+        self.finetune()
+        starting.forget(command)
+
+    def _train(self) -> Start:
+        """Run stage 1; returns its end."""
         total = self.host.iterations
         log.info("stage 1: the host's own training, %d iterations", total)
         written = self.host.checkpoints(total)
@@ -393,8 +383,7 @@ class _Runner:
                 "a training that runs to its end",
                 "Read the host's own message above.",
             )
-        self.trained = Start(total, max(ends)[1], "the end of stage 1")
-        self.finetune()
+        return Start(total, max(ends)[1], "the end of stage 1")
 
     def one_run(self) -> None:
         """Run a host that cannot resume once, longer; stage 2 begins where it would have ended."""
@@ -432,7 +421,7 @@ class _Runner:
             )
         self.host = self.host.of(*self.adapter.resumed_by(self.host.script, self.host.arguments))
         self.output = self.output or self.host.output
-        start = self.trained or starting.find(self.adapter, self.host, self.output)
+        start = self.start = self.start or starting.find(self.adapter, self.host, self.output)
         log.info("stage 2: %d iterations from iteration %d, %s: %s", settings.iterations, *start)
         line = self.host.line
         with starting.resumable(self.adapter, line, start) as checkpoint:
@@ -446,64 +435,12 @@ class _Runner:
                 self.around, self.output = self.output, self.output / own
             if self.output is not None and str(self.output) != self.host.flags.output:
                 extra["output"] = str(self.output)
-            going_on = self._going_on(start)
             if not self.options.again and self._is_finished(start, self._model(total)):
                 self.after, self.already_finished = self._model(total), True
-                if going_on:
-                    going_on["kept"].clear()  # the run before ended between its result and this
                 return
-            if kept := going_on.get("kept"):
-                done = first + (going_on["unfinished"] or ({}, {"step": 0}))[1]["step"]
-                if any(each <= done for each in self.host.flags.save_checkpoints or ()):
-                    later = [each for each in self.host.checkpoints(total) if each > done]
-                    extra["save_checkpoints"] = later  # earlier ones were written by the run before
             arguments = self.host.saving(self.scratch, total, **extra)
-            self._execute(arguments, learn=True, start=first, **going_on)
-            if kept:
-                kept.clear()
+            self._execute(arguments, learn=True, start=first)
             self.after = self._model(total)
-
-    def _going_on(self, start: Start) -> dict[str, Any]:
-        """Options of a session that keeps an unfinished stage 2, and goes on from a kept one."""
-        from fragprune_plugins.files import checkpoints
-        from fragprune_plugins.plugins.hooks import schedule_for
-        from fragprune_plugins.workbench.finetune.resuming import Checkpoints, deciding, differences
-
-        options, seconds = self.options, self.options.checkpoint_every
-        if self.output is None or not seconds:
-            return {}
-        asked = {
-            "version": VERSION,
-            "start": digest(start.path),
-            "adapter": [self.adapter.name, self.repo.commit],
-            "command": hashlib.sha256("\0".join(self.host.arguments).encode()).hexdigest(),
-            "engine": [options.engine, self.device],
-            "plugins": deciding(),
-            "schedule": schedule_for(options.settings, self.plugins).as_dict(),
-            **options.settings.as_dict(),
-        }
-        kept = Checkpoints(self.output / UNFINISHED, seconds, tell=log.warning)
-        unfinished = None
-        if not options.again and kept.path.exists():
-            tensors, values = checkpoints.load(kept.path)
-            if differ := ", ".join(differences(values.get("configuration", {}), asked)):
-                said = printable(differ)
-                log.warning("the unfinished stage 2 had other %s; it begins anew", said)
-            elif values.get("step") not in range(1, options.settings.iterations + 1):
-                raise CheckpointError(
-                    str(kept.path),
-                    f"step {values.get('step')!r:.40}",
-                    "what a stage 2 of this host wrote",
-                    "Begin anew with --again.",
-                )
-            else:
-                unfinished = tensors, values
-                log.info(
-                    "an unfinished stage 2 goes on: %d steps of the host are repeated without "
-                    "drawing; what the host prints of them does not count",
-                    values["step"],
-                )
-        return {"kept": kept, "asked": asked, "unfinished": unfinished}
 
     def _execute(
         self,
@@ -569,23 +506,26 @@ class _Runner:
         return (info.settings, info.adapter, info.host_commit) == asked
 
     def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
-        """The error that reports Ctrl-C or SIGTERM and names the saved model, if there is one."""
+        """The error that reports Ctrl-C or SIGTERM, names the saved model, and says how to go on.
+
+        Stage 2 begins anew from the end of stage 1; no stage 1 is repeated.
+        """
         by_signal = isinstance(error, Terminate)
         stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
-        again = "Run the command again."
+        remedy = "Run the command again."
+        line = self.host.line
+        if self.start is not None:
+            named = self.host.output is not None
+            added = "" if named else f" with --stage finetune and {line.output[-1]} {self.output}"
+            remedy = f"Run the command again{added}: stage 2 begins anew from {self.start.path}."
         if saved:
-            learned = "model" if self.options.settings.portable else "thresholds"
-            where = "is" if self.options.settings.portable else "are beside"
+            portable = self.options.settings.portable
+            learned, where = ("model", "is") if portable else ("thresholds", "are beside")
             found += f"; the {learned} learned so far {where} {saved}"
-            if not self.host.line.one_run:
-                again = (
-                    "To continue from there, run fragprune run --stage finetune with "
-                    f"{self.host.line.spellings('resume')[-1]} {saved} in the host's command. "
-                    "Without that flag, stage 2 starts again."
-                )
-                if self.output is not None and (self.output / UNFINISHED).exists():
-                    again = "With --stage finetune, stage 2 goes on from its last checkpoint."
-        return stated(self.host.script.name, found, "a run that reaches its end", again)
+            if not line.one_run:
+                flag = f"{line.spellings('resume')[-1]} {saved}"
+                remedy += f" To continue from the learned model, add --stage finetune and {flag}."
+        return stated(self.host.script.name, found, "a run that reaches its end", remedy)
 
     def summary(self, seconds: float) -> RunSummary:
         """The summary, after all stages have ended.

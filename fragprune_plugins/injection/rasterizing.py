@@ -17,7 +17,6 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.adapter import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
-from fragprune_plugins.injection.resuming import draw_nothing
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.injection.stepping import (
@@ -110,8 +109,8 @@ def expect_adopted(session: SessionState, call: SeamCall) -> None:
 
 
 def learns(state: ModelState) -> bool:
-    """Whether the model is in stage 2, or on its way back to a step of it."""
-    return state.stage is not None and (state.stage.plan is not None or state.replaying)
+    """Whether the model is in stage 2."""
+    return state.stage is not None and state.stage.plan is not None
 
 
 def warn_unknown(session: SessionState, seam: Seam) -> None:
@@ -156,9 +155,6 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
             f"{expected} of {len(state.store)}, one per drawn threshold",
             "Report this with the host's commit.",
         )
-    if state.replaying:
-        inputs, engine = unpack(session, drawn)
-        return session.dialect.answer(drawn, inputs, partial(draw_nothing, engine))
     stage = state.stage
     presses = stage is not None and stage.learning and session.settings.portable
     if state.store.neutral and not presses:
@@ -227,7 +223,7 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
     state = session.last_state
     if state is not None and call.instance.numel() == 1:
         state.begun = False
-        if state.stage is not None and not state.replaying:
+        if state.stage is not None:
             state.stage.lost(call.instance)
     return call.run()
 

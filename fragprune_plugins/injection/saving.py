@@ -29,8 +29,6 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
     """
     check_learned(session, call.model)
     state = session.models.get(call.model)
-    if state is not None and state.replaying:  # the run before saved it
-        return None
     if state is None or call.first is None:
         return call.run()
     path, given = Path(call.how(call.first)), Path(call.first)
@@ -42,12 +40,6 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
                 other.replace(path.with_name(other.name))
         session.save(call.model, path, folder / path.name)
     return result
-
-
-def on_also(session: SessionState, call: SeamCall) -> Any:
-    """Save, unless the host repeats steps: the run before saved it, and nothing has trained."""
-    state = session.models.get(call.model)
-    return None if state is not None and state.replaying else call.run()
 
 
 def check_learned(session: SessionState, model: Any) -> None:
@@ -154,7 +146,7 @@ def on_restore(session: SessionState, call: SeamCall) -> Any:
     model, capture = call.model, call.how(call.first)
     saved = session.adapter.checkpoint_state(capture).pop(CHECKPOINT_KEY, None)
     result = call.run(**{call.seam.needs[0]: capture})
-    revive(session, model)
+    restore_rates(session, model)
     state = session.models.get(model)
     if saved is not None:
         if state is None:
@@ -165,30 +157,15 @@ def on_restore(session: SessionState, call: SeamCall) -> Any:
     return result
 
 
-def revive(session: SessionState, model: Any) -> None:
-    """Restore learning rates and gradients that a checkpoint lacks, as the host set them up.
+def restore_rates(session: SessionState, model: Any) -> None:
+    """Give groups the learning rates that the host set up, if a checkpoint has none.
 
-    Version 0.1 wrote checkpoints with frozen parameters and the rates of stage 2. A checkpoint made
-    from a PLY has no rates.
+    A checkpoint made from a PLY has none.
     """
     groups = [(name, group) for name, group in session.groups(model) if name]
-    names, adapter = {name for name, _ in groups}, session.adapter
-    asleep = {n for n, g in groups if not any(each.requires_grad for each in g["params"])}
-    trained = [adapter.trained_groups(train) for train in ("opacity", "appearance")]
-    frozen = bool(asleep) and asleep in [names - each for each in trained if each is not None]
-    if not frozen and any(group["lr"] for _, group in groups):
-        return
-    for name, group in groups:
-        group["lr"] = session.rates[model].get(name, group["lr"])
-        for parameter in group["params"] if frozen else ():
-            parameter.requires_grad_(True)
-    if frozen:
-        log.warning(
-            "%s: fragprune 0.1 wrote the checkpoint in stage 2 and left %s unable to train; "
-            "they train again",
-            adapter.name,
-            ", ".join(sorted(asleep)),
-        )
+    if not any(group["lr"] for _, group in groups):
+        for name, group in groups:
+            group["lr"] = session.rates[model].get(name, group["lr"])
 
 
 def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
@@ -219,7 +196,6 @@ OF_CALLS: dict[Role, Callable[..., Any]] = {
 
 OF_MODELS: dict[Role, Callable[..., Any]] = {
     Role.SAVE: on_save,
-    Role.ALSO: on_also,
     Role.LOAD: on_load,
     Role.CAPTURE: on_capture,
     Role.RESTORE: on_restore,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fragprune_plugins.errors import ModelFileError, UsageError
-from fragprune_plugins.files import records
+from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import Door
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, CommandLine, ScriptAdapter
 from fragprune_plugins.injection.command import HostCommand
@@ -23,6 +24,10 @@ _DOOR = Door(
     "(capture, iteration), as hosts save it",
     "The file is cut off, or is no checkpoint. Remove it, or name another file.",
 )
+
+
+FINISHED = "stage1.fragprune-finished"
+"""The mark of a finished stage 1 in the host's output folder, until stage 2 is finished too."""
 
 
 class Start(NamedTuple):
@@ -88,6 +93,51 @@ def files(adapter: ScriptAdapter, output: Path | None) -> list[tuple[int, Path]]
     return adapter.saved_iterations(output) if output else []
 
 
+def remember(start: Start, host: HostCommand, commit: str) -> None:
+    """Mark stage 1 as finished, so that the same command need not repeat it; see ``finished``.
+
+    Args:
+        start: its end.
+        host: its command. Without an output folder in it there is no mark.
+        commit: the host's revision.
+
+    Raises:
+        OutputError: the mark cannot be written.
+    """
+    if host.output is not None and host.output.is_dir():
+        with replacing(host.output / FINISHED) as mark:
+            mark.write_text(_identity(start.path, host, commit))
+
+
+def finished(adapter: ScriptAdapter, host: HostCommand, commit: str) -> Start | None:
+    """The end of stage 1, if an earlier run of the same command finished it and not stage 2.
+
+    None if the command, the host or the file is another one by now.
+    """
+    mark = host.output / FINISHED if host.output else None
+    if mark is None or not mark.is_file():
+        return None
+    known = mark.read_text(errors="replace")
+    for iteration, path in files(adapter, host.output):
+        if iteration == host.iterations and _identity(path, host, commit) == known:
+            log.info("stage 1 was finished by the same command; --again repeats it")
+            return Start(iteration, path, "the end of stage 1")
+    return None
+
+
+def forget(host: HostCommand) -> None:
+    """Remove the mark: stage 2 is finished too, and the same command trains anew."""
+    if host.output is not None:
+        (host.output / FINISHED).unlink(missing_ok=True)
+
+
+def _identity(path: Path, host: HostCommand, commit: str) -> str:
+    """A digest of a file's name, time and size, and of the command and host that wrote it."""
+    state = path.stat()
+    parts = (path.name, state.st_mtime_ns, state.st_size, commit, host.script, *host.arguments)
+    return hashlib.sha256("\0".join(map(str, parts)).encode(errors="surrogatepass")).hexdigest()
+
+
 def resumed_at(line: CommandLine, checkpoint: Path) -> int:
     """The iteration after which a run from this checkpoint continues.
 
@@ -118,9 +168,6 @@ def _learned(adapter: ScriptAdapter, path: Path) -> bool:
     """Whether stage 2 or a control wrote the file, and not stage 1."""
     from fragprune_plugins.files import sidecar
 
-    record = records.beside(path)  # the only mark of a control of version 0.1
-    if record is not None and record.command == "run":
-        return True
     if path.suffix == ".ply":
         return sidecar.belongs(path)
     return CHECKPOINT_KEY in adapter.checkpoint_state(_read_checkpoint(path)[0])

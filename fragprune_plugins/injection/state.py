@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,9 +34,6 @@ from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import RasterInputs
 
-if TYPE_CHECKING:
-    from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-
 log = logging.getLogger("fragprune")
 
 
@@ -56,7 +53,6 @@ class ModelState:
         loaded: the means with which a sidecar's thresholds were loaded.
         hooked: the optimizers that carry our hooks.
         hooks: handles that remove these hooks.
-        replayed: steps at the beginning that are only counted; see ``resuming``.
         stepped: value of ``steps`` at the last step of the store.
         lent: per running optimizer step, (param group, the host's rate) to restore.
     """
@@ -72,16 +68,10 @@ class ModelState:
     loaded: weakref.ReferenceType[Any] | None = None
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
-    replayed: int = 0
     stepped: int = -1
     lent: list[list[tuple[dict[str, Any], float]]] = field(default_factory=list)
 
     __repr__ = one_line
-
-    @property
-    def replaying(self) -> bool:
-        """Whether the host's present step was made before, by a run that was killed."""
-        return 0 < self.steps <= self.replayed
 
 
 class SessionState:
@@ -103,9 +93,6 @@ class SessionState:
             cannot be imported.
         output: the host's output folder, if it is known.
         origin: stage 1's output folder, if stage 2 has its own.
-        kept: where an unfinished stage 2 is kept; None keeps none.
-        asked: what decides its result, which is written there.
-        unfinished: what was read there, to go on from.
     """
 
     def __init__(
@@ -124,9 +111,6 @@ class SessionState:
         drop_in: bool | None = None,
         output: Path | None = None,
         origin: Path | None = None,
-        kept: Checkpoints | None = None,
-        asked: dict[str, Any] | None = None,
-        unfinished: tuple[dict[str, Tensor], dict[str, Any]] | None = None,
     ) -> None:
         self.adapter, self.repo, self.plugins = adapter, repo, plugins
         self.settings = settings or Settings()
@@ -134,7 +118,6 @@ class SessionState:
         self.start = start
         self.schedule = schedule or schedule_for(self.settings, plugins)
         self.output, self.origin = output, origin
-        self.kept, self.asked, self.unfinished = kept, asked or {}, unfinished
         self.curves: list[dict[str, float]] = []
         self.engine_name = engine
         self.engines: dict[torch.device, Engine] = {}

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.hosts.seams import Role, SeamCall
-from fragprune_plugins.injection import ranks, resuming
+from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.stage2 import Stage2
@@ -58,8 +58,6 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
         state = session.models[model] = ModelState(store)
     if state.stage is None:
         state.stage = stage2(session, model, state)
-    if session.unfinished is not None:
-        state.replayed = session.unfinished[1]["step"]
     session.follow(model, state)
     hook_optimizers(session, model, state)
     session.plugins.tell(hookspecs.fragprune_attached, model=model, store=state.store)
@@ -127,11 +125,6 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
         return
     lent: list[tuple[dict[str, Any], float]] = []
     state.lent.append(lent)
-    if state.replaying:
-        for group in optimizer.param_groups:
-            for parameter in group["params"]:
-                parameter.grad = None
-        return
     if not session.standing_still(model):
         expect_sound(session, model, state)
         return
@@ -181,7 +174,7 @@ def after_step(session: SessionState, reference: Any, *_: Any) -> None:
     if state.stepped == state.steps:
         return
     state.stepped = state.steps
-    if state.stage is not None and not state.replaying:
+    if state.stage is not None:
         state.stage.end()
 
 
@@ -200,7 +193,6 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
     """Count a step of the host, and begin a step of stage 2."""
     if state.stage is not None:
         state.stage.close()  # before the count, because an observer may end the run here
-    resuming.between_steps(session, model, state)
     state.begun = True
     state.steps += 1
     if session.standing_still(model):
@@ -210,7 +202,7 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
             session.adapter.prepare_stage2(model, output)
             state.prepared = True
         fill_gradients_read(session, model)
-    if state.stage is not None and state.steps > session.from_step and not state.replaying:
+    if state.stage is not None and state.steps > session.from_step:
         state.stage.begin(lambda: session.adapter.opacities(model))
 
 

@@ -227,13 +227,10 @@ class Schedule:
         settings: of the run.
         warmup: steps without truncation; ``Settings.warmup`` when None, which is none in a run of
             2,000 steps or less.
-        every: when set, learning alternates: ``every`` steps on, ``every`` steps held.
     """
 
-    def __init__(
-        self, settings: Settings, warmup: int | None = None, every: int | None = None
-    ) -> None:
-        self.settings, self.every = settings, every
+    def __init__(self, settings: Settings, warmup: int | None = None) -> None:
+        self.settings = settings
         self.warmup = settings.warmup if warmup is None else warmup
 
     def at(self, step: int) -> StepPlan:
@@ -242,7 +239,7 @@ class Schedule:
         decay = _DECAY ** _share(step - 1, settings.iterations - 1)
         over = _share(step - 1 - self.warmup, settings.iterations - 1 - self.warmup)
         return StepPlan(
-            learn=_on(step - 1 - self.warmup, self.every),
+            learn=step > self.warmup,
             threshold_lr=settings.threshold_lr * settings.rate * _DECAY**over,
             opacity_lr=settings.opacity_lr * settings.rate * decay,
             progress=over,
@@ -263,11 +260,6 @@ class Schedule:
         }
 
 
-def _on(over: int, every: int | None) -> bool:
-    """Whether thresholds learn in a step, after so many steps that could have learned."""
-    return over >= 0 and (every is None or (over // every) % 2 == 0)
-
-
 def _share(steps: int, of: int) -> float:
     """Steps over all steps, 0 to 1."""
     return min(1.0, max(0.0, steps / max(1, of)))
@@ -279,17 +271,16 @@ class JointSchedule(Schedule):
     Args:
         settings: ``iterations`` is the host's whole run.
         from_step: first step that learns.
-        every: when set, learning alternates: ``every`` steps on, ``every`` steps held.
     """
 
-    def __init__(self, settings: Settings, from_step: int, every: int | None = None) -> None:
-        super().__init__(settings, every=every)
+    def __init__(self, settings: Settings, from_step: int) -> None:
+        super().__init__(settings)
         self.from_step = from_step
 
     def at(self, step: int) -> StepPlan:
         """Neutral before ``from_step``; the opacity rate stays the host's."""
         progress = _share(step - self.from_step, self.settings.iterations - self.from_step)
-        on = _on(step - self.from_step, self.every)
+        on = step >= self.from_step
         rate = self.settings.threshold_lr * _DECAY**progress
         return StepPlan(on, rate, None, progress, counted=on)
 

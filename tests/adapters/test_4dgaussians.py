@@ -18,11 +18,9 @@ from PIL import Image
 
 from fragprune_4dgaussians import MovingGaussians
 from fragprune_4dgaussians.config import PythonFile
-from fragprune_plugins.errors import HostFailed, Interrupted, ModelFileError, UsageError
+from fragprune_plugins.errors import HostFailed, ModelFileError, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection import stepping
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -322,52 +320,6 @@ def test_no_command_of_ours_draws_the_ply_as_if_it_were_the_model(output, read):
     with pytest.raises(ModelFileError, match="network beside them") as caught:
         models.load(ply, truncation=read == "truncated")
     assert "render.py" in caught.value.remedy
-
-
-def test_repeated_steps_of_a_killed_run_save_no_network(mini, tmp_path):
-    with running(**of(mini)) as host:
-        model = host.model(16)
-        state = host.models[model]
-        state.steps = state.replayed = 2
-        model.save_deformation(str(tmp_path))
-        assert not list(tmp_path.iterdir())
-        state.steps = 3
-        model.save_deformation(str(tmp_path))
-        assert (tmp_path / "deformation.pth").exists()
-
-
-def test_an_interrupted_stage_2_goes_on_and_keeps_what_it_had_saved(
-    mini, photographs, trained, tmp_path, monkeypatch
-):
-    options = replace(EVERYTHING, stage="finetune", again=False, checkpoint_every=1e-9)
-    results, between = [], []
-    for interrupted in (False, True):
-        out = Path(shutil.copytree(trained, tmp_path / str(interrupted) / "out"))
-        words = command(mini, photographs, out, "--save_iterations", LAST + 3)
-        file = out / "point_cloud" / f"iteration_{LAST + 3}" / "deformation.pth"
-        if interrupted:
-            with monkeypatch.context() as patched:
-                patched.setattr(stepping, "report", at_step(5))
-                with pytest.raises(Interrupted):
-                    run(words, options)
-            between.append(file.read_bytes())
-        results.append(run(words, options).model_after)
-        between.append(file.read_bytes())
-    assert between[1] == between[2]
-    (one, other), (first, second) = map(sidecar.load, results), map(read_ply, results)
-    assert torch.equal(one[0].logits, other[0].logits)
-    assert torch.equal(first.xyz, second.xyz)
-    assert same(*map(network, results))
-
-
-def at_step(step):
-    """Ctrl-C when a step is reported."""
-
-    def report(session, stats):
-        if stats.step == step:
-            raise KeyboardInterrupt
-
-    return report
 
 
 def test_ctrl_c_leaves_a_ply_and_its_network(mini, tmp_path):

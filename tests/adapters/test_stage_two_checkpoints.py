@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import runpy
 import shutil
 import sys
@@ -97,40 +96,3 @@ def test_so_does_one_of_a_stage_two_that_began_from_a_ply(photographs, trained, 
     run(words, replace(OPTIONS, stage="finetune"))
     assert all(p.requires_grad for p in parameters(tmp_path / "chkpnt16.pth").values())
     assert rates(tmp_path / "chkpnt16.pth") == rates(trained / "chkpnt12.pth")
-
-
-def frozen(checkpoint, target, asleep):
-    """A checkpoint as version 0.1 left it in stage 2, or as some host does."""
-    capture, iteration = torch.load(checkpoint, weights_only=False)
-    for name, parameter in zip(NAMES, capture[1:7], strict=True):
-        parameter.requires_grad_(name not in asleep)
-    for group in capture[10]["param_groups"]:
-        group["lr"] = 0.0 if group["name"] in asleep else 1e-4
-    torch.save((capture, iteration), target)
-    return target
-
-
-def resumed(photographs, start, out, caplog):
-    words = command(photographs, out, 20, "--start_checkpoint", start, "--densify_until_iter", 0)
-    with caplog.at_level(logging.WARNING, logger="fragprune"):
-        run([*words, "--checkpoint_iterations", "19"], replace(OPTIONS, stage="off"))
-    return out / "chkpnt19.pth"
-
-
-def test_one_that_version_0_1_left_frozen_is_revived_and_it_is_said(
-    photographs, trained, tmp_path, caplog
-):
-    asleep = {"xyz", "f_dc", "f_rest", "scaling", "rotation"}
-    start = frozen(trained / "chkpnt12.pth", tmp_path / "chkpnt12.pth", asleep)
-    end = resumed(photographs, start, tmp_path / "out", caplog)
-    assert moved(start, end) == EVERYTHING
-    assert rates(end) == rates(trained / "chkpnt12.pth")
-    (warning,) = [r.getMessage() for r in caplog.records if "unable to train" in r.getMessage()]
-    assert "f_dc, f_rest, rotation, scaling, xyz" in warning
-
-
-def test_what_a_host_froze_itself_stays_frozen(photographs, trained, tmp_path, caplog):
-    start = frozen(trained / "chkpnt12.pth", tmp_path / "chkpnt12.pth", {"scaling", "rotation"})
-    end = resumed(photographs, start, tmp_path / "out", caplog)
-    assert moved(start, end) == {"xyz", "f_dc", "opacity"}
-    assert not [r for r in caplog.records if "unable to train" in r.getMessage()]

@@ -13,7 +13,7 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
-from fragprune_plugins.files import records, sidecar
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 
@@ -87,12 +87,6 @@ def test_what_a_control_wrote_is_no_starting_point_in_its_own_folder(photographs
     assert (out / "control" / "chkpnt13.pth").exists()
     with pytest.raises(UsageError, match="only results of stage 2 or of a control"):
         run(command(photographs, out / "control", 10), FINETUNE)
-
-
-def test_a_control_of_version_0_1_is_known_by_its_record(out, started):
-    sidecar.path_beside(out / ply(17)).unlink()  # it wrote none
-    records.leave(out / ply(17), "run", {})
-    assert f"{out / 'chkpnt10.pth'}:" in started(out, 10)
 
 
 def test_checkpoints_of_stage_two_are_no_starting_points(out, started):

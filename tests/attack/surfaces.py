@@ -23,7 +23,7 @@ from attack.hostile import GOOD
 from attack.running import Outcome, Result, command, in_child, judged, raised
 from finetune import tiny
 
-from fragprune_plugins.files import checkpoints
+from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.view.server import open_server
 

@@ -53,7 +53,6 @@ def test_values_out_of_range_are_usage(command, options):
         (("--max-drop", 0.1), "fragprune finetune"),
         (("--from-iter", 5), "--stage finetune or joint"),
         (("--from-iter", 5, "--stage", "off"), "--stage finetune or joint"),
-        (("--alternate", 5, "--stage", "finetune"), "--stage joint"),
     ],
 )
 def test_run_refuses_what_it_cannot_do_honestly_and_says_what_to_use(options, instead):

@@ -110,14 +110,6 @@ def test_a_control_is_called_one():
     assert "3 iterations of the control" in done.stdout
 
 
-@pytest.mark.parametrize("option", [["--again"], ["--checkpoint-every", "300"]])
-def test_options_of_our_checkpoints_are_refused_because_it_has_its_own(option):
-    done = commands.run(*RUN, *option, *THEIRS)
-    assert done.exit_code == 2
-    assert option[0] in done.stderr
-    assert "its own checkpoints" in done.stderr
-
-
 @pytest.mark.parametrize(("how", "code"), [("Interrupted", 130), ("Terminated", 143)])
 def test_a_method_that_was_interrupted_says_so(how, code):
     done = commands.run(*RUN, *THEIRS, how)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -293,6 +295,69 @@ def test_stage_one_is_asked_for_a_checkpoint_and_stage_two_resumes_it(host, tmp_
     (out / "log").unlink()
     run([host(STAGES), "-m", str(out), "--start_checkpoint", str(checkpoint)], options)
     assert (out / "log").read_text().splitlines() == [f"12446 [] {checkpoint}"]
+
+
+AUTO = RunOptions(device="cpu", again=False)
+INTERRUPTED = """
+if args.start_checkpoint and not (out / "no").exists():
+    raise KeyboardInterrupt
+"""
+SCENE = """
+class Scene:
+    def __init__(self, args, gaussians):
+        self.model_path = args.m
+"""
+
+
+@pytest.fixture
+def interrupted(host, tmp_path):
+    """A command that got Ctrl-C in stage 2, and the error; later runs of it read its log."""
+    out = tmp_path / "out"
+    words = [host(STAGES + INTERRUPTED), "-m", str(out)]
+    with pytest.raises(Interrupted) as caught:
+        run(words, AUTO)
+    (out / "no").touch()
+    (out / "log").unlink()
+    return words, out, caught.value
+
+
+def test_after_ctrl_c_in_stage_two_the_same_command_does_not_repeat_stage_one(interrupted):
+    words, out, error = interrupted
+    checkpoint = out / "chkpnt12345.pth"
+    assert error.remedy == f"Run the command again: stage 2 begins anew from {checkpoint}."
+    stage_two = f"17346 [] {checkpoint}"
+    run(words, AUTO)
+    assert (out / "log").read_text().splitlines() == [stage_two]
+    run(words, AUTO)  # both stages are finished by now
+    assert (out / "log").read_text().splitlines() == [stage_two, "12345 [12345] None", stage_two]
+
+
+@pytest.mark.parametrize("changed", ["the command", "the script", "the checkpoint", "a wish"])
+def test_stage_one_is_repeated_where_it_is_not_known_to_be_the_same(
+    interrupted, monkeypatch, changed
+):
+    words, out, _ = interrupted
+    options = replace(AUTO, again=changed == "a wish")
+    if changed == "the command":
+        words = [*words, "--iterations", "12345"]
+    elif changed == "the script":
+        words[0] = shutil.copy(words[0], words[0].replace("train.py", "train2.py"))
+        monkeypatch.setattr(Vanilla3DGS, "scripts", ("train.py", "train2.py"))
+    elif changed == "the checkpoint":
+        os.utime(out / "chkpnt12345.pth", ns=(1, 1))
+    run(words, options)
+    first, _ = (out / "log").read_text().splitlines()
+    assert first.endswith("[12345] None")
+
+
+def test_after_ctrl_c_a_folder_that_only_the_host_named_is_named(host, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    host(SCENE, "scene/__init__.py")
+    named = STAGES.replace('"-m"', '"-m", "--model_path", dest="m", default="named"')
+    words = [host(f"{named}\nimport scene\nscene.Scene(args, 0)\n{INTERRUPTED}")]
+    with pytest.raises(Interrupted) as caught:
+        run(words, AUTO)
+    assert "with --stage finetune and --model_path named: stage 2" in caught.value.remedy
 
 
 def test_insisting_on_a_gpu_that_is_not_there_is_a_usage_error(host):

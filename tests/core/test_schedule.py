@@ -52,12 +52,6 @@ def test_joint_learning_begins_at_its_step_and_leaves_the_opacity_rate_alone(ste
     assert 0 <= plan.progress <= 1
 
 
-def test_alternating_learning_is_on_and_off_in_equal_turns():
-    schedule = JointSchedule(Settings(iterations=100), 10, every=3)
-    on = [step for step in range(1, 25) if schedule.at(step).learn]
-    assert on == [10, 11, 12, 16, 17, 18, 22, 23, 24]
-
-
 @pytest.mark.parametrize(
     "wrong",
     [

@@ -11,9 +11,9 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
-from fragprune_plugins.files import checkpoints as files
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.finetune import checkpoints as files
 from fragprune_plugins.workbench.finetune import loop, resuming, timing
 from fragprune_plugins.workbench.finetune.loop import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints

@@ -17,7 +17,7 @@ from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files import checkpoints, records, sidecar
+from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.graphdeco.output import trained_on
 from fragprune_plugins.hosts.preflight import missing_imports
@@ -26,6 +26,7 @@ from fragprune_plugins.injection.starting import resumed_at
 from fragprune_plugins.types import RasterInputs, View
 from fragprune_plugins.workbench import finetune, report
 from fragprune_plugins.workbench.figures.recorded import recorded
+from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.prices.cost import UNITS, Cost
 from fragprune_plugins.workbench.scenes import colmap

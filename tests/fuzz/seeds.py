@@ -21,9 +21,10 @@ from finetune import tiny
 from PIL import Image
 from plyfile import PlyData
 
-from fragprune_plugins.files import checkpoints, records, sidecar
+from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.spz import zstd
 from fragprune_plugins.workbench.prices.cost import UNITS, Cost

@@ -15,7 +15,7 @@ from fragprune_plugins.errors import Interrupted, Terminated
 from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.files.ply import SplatFile
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times, measure
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
@@ -167,11 +167,31 @@ def _outcome(
     return {"before": before, "after": after, "train_seconds": result.train_seconds}
 
 
+class InTurns(Schedule):
+    """Thresholds learn and are held in turns.
+
+    Args:
+        settings: of the training.
+        warmup: steps without truncation; None for the settings' own.
+        every: steps that learn, and then as many that hold; None where all learn.
+    """
+
+    def __init__(self, settings: Settings, warmup: int | None, every: int | None) -> None:
+        super().__init__(settings, warmup)
+        self.every = every
+
+    def at(self, step: int) -> StepPlan:
+        """The plan of a step, counted from 1."""
+        plan, over = super().at(step), step - 1 - self.warmup
+        held = self.every is not None and over // self.every % 2 == 1
+        return replace(plan, learn=plan.learn and not held)
+
+
 def _schedule(arm: Arm, settings: Settings) -> Schedule:
     """A plugin's, or the default one, unless the arm has its own."""
     if arm.warmup is None:
         return schedule_for(settings)
-    return Schedule(settings, arm.warmup, arm.every)
+    return InTurns(settings, arm.warmup, arm.every)
 
 
 def _measure(

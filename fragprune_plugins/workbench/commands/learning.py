@@ -181,9 +181,10 @@ def resuming_options(kept: str) -> Callable[[Callable[..., Any]], Callable[..., 
             metavar="SECONDS",
             help=kept,
         ),
-        click.option(
-            "--again",
-            is_flag=True,
-            help="Begin stage 2 anew, though it is finished or there is a checkpoint.",
-        ),
+        again_option("Begin stage 2 anew, though it is finished or there is a checkpoint."),
     )
+
+
+def again_option(text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The option ``--again``, with its help."""
+    return click.option("--again", is_flag=True, help=text)

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, CheckpointError, UsageError
-from fragprune_plugins.files.checkpoints import UNFIT
 from fragprune_plugins.files.ply import SplatFile
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
@@ -32,6 +31,7 @@ from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.workbench.finetune.checkpoints import UNFIT
 from fragprune_plugins.workbench.finetune.processes import expect_divisible, processes_of
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
 from fragprune_plugins.workbench.finetune.timing import require_reach, times_faster

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import CheckpointError, OutputError
-from fragprune_plugins.files import checkpoints
 from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.files.ply import SplatFile
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -23,6 +22,7 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph, Shot
 from fragprune_plugins.workbench.scenes.images import DOOR
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from fragprune_plugins.errors import FragpruneError, UsageError
 from fragprune_plugins.files import records
@@ -26,7 +25,7 @@ from fragprune_plugins.workbench.commands.common import (
     open_engine,
     threads_option,
 )
-from fragprune_plugins.workbench.commands.learning import learning_options, resuming_options
+from fragprune_plugins.workbench.commands.learning import again_option, learning_options
 
 if TYPE_CHECKING:
     from fragprune_plugins.injection.launch import RunSummary
@@ -61,9 +60,6 @@ _CONTROL = (
     help="finetune, joint: learn after this iteration; joint's default is the end of densification "
     "by the host's own arguments.",
 )
-@click.option(
-    "--alternate", type=click.IntRange(min=1), help="joint: learn N iterations, hold N, and so on."
-)
 @learning_options
 @log_option
 @config_option
@@ -76,9 +72,7 @@ _CONTROL = (
     show_default=True,
     help="Compare before and after on the views that the host holds out (--eval).",
 )
-@resuming_options(
-    "Keep an unfinished stage 2 in stage2.fragprune-unfinished in the output folder; 0 keeps none."
-)
+@again_option("Train, or learn, anew, though that is finished.")
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -86,7 +80,6 @@ def command(
     adapter: str | None,
     stage: Any,
     from_iter: int | None,
-    alternate: int | None,
     settings: Settings,
     max_drop: float | None,
     engine: str,
@@ -94,7 +87,6 @@ def command(
     threads: int | None,
     evaluate: bool,
     again: bool,
-    every: float,
 ) -> Report:
     """Train with a host's own command, then learn truncation thresholds.
 
@@ -102,8 +94,8 @@ def command(
     a few thousand iterations, in which no Gaussian is added or removed. All parameters learn with
     the thresholds (but see --train). The host saves its model as usual, and the thresholds go
     beside it as a sidecar. In stage 2, Ctrl-C (exit code 130) and SIGTERM (143) save the thresholds
-    learned so far. A stage 2 that was killed goes on with the same command and --stage finetune;
-    where it is finished already, that command says so and runs nothing.
+    learned so far. If stage 2 was interrupted or killed, the same command begins it anew and does
+    not repeat stage 1.
 
     \b
     Examples:
@@ -113,8 +105,6 @@ def command(
       fragprune run --stage joint -- python train.py -s scene -m out   (no added iterations)
       fragprune run -- python render.py -m out                       (renders with thresholds)
     """
-    if alternate is not None and stage != "joint":
-        raise UsageError("--alternate", f"--stage {stage}", "--stage joint", "Change one of them.")
     if from_iter is not None and stage not in ("finetune", "joint"):
         raise UsageError(
             "--from-iter",
@@ -143,19 +133,14 @@ def command(
 
     bound_threads(threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
-    flags = {"again": "--again", "every": "--checkpoint-every"}
-    source = ctx.get_parameter_source
     options = RunOptions(
         adapter=adapter,
         stage=stage,
         settings=settings,
         from_iter=from_iter,
-        alternate=alternate,
         engine=engine,
         device=device,
         again=again,
-        checkpoint_every=every,
-        resuming=tuple(f for n, f in flags.items() if source(n) is not ParameterSource.DEFAULT),
     )
     # A host prints to stdout; with --json, stdout gets only our object.
     to_stderr = contextlib.redirect_stdout(sys.stderr) if ctx.meta[JSON] else None
