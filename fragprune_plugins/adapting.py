@@ -1,7 +1,6 @@
 """Everything that an adapter imports: ``from fragprune_plugins.adapting import ...``.
 
-a host      HostAdapter, or ScriptAdapter where it has training scripts, or MethodAdapter where
-            stage 2 is one of its own methods; HostInfo, HostRepo, Finding
+a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo, Finding
 its seams   Seam, Role, SeamCall, RowTrace, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs, slice_at
 its script  CommandLine, ConfigFile, Photographs
@@ -41,7 +40,6 @@ from fragprune_plugins.hosts.adapter import (
     HostAdapter,
     HostCall,
     HostInfo,
-    MethodAdapter,
     ScriptAdapter,
 )
 from fragprune_plugins.hosts.findings import Finding
@@ -92,7 +90,6 @@ __all__ = [
     "HostRepo",
     "InputError",
     "Interrupted",
-    "MethodAdapter",
     "ModelFileError",
     "Moment",
     "NotComparedError",

@@ -217,7 +217,7 @@ class Gsplat(HostAdapter):
         projects = repo.parameters(f"{PACKAGE}.cuda._wrapper", "fully_fused_projection") or ()
         return GsplatDialect(alpha_max=0.999, floor=0.0, tight="opacities" in projects)
 
-    def trainer(self, script: Path) -> ScriptAdapter | None:
+    def trainer(self, repo: HostRepo, script: Path) -> ScriptAdapter | None:
         """The adapter of gsplat's own training script, if this is it."""
         from fragprune_gsplat import trainer
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,6 @@ from fragprune_plugins.adapting import (
     HostAdapter,
     HostInfo,
     HostRepo,
-    MethodAdapter,
     Role,
     Seam,
     SeamCall,
@@ -31,8 +31,6 @@ from fragprune_plugins.adapting import (
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from fragprune_plugins import Settings
 
 PACKAGE = "nerfstudio"
 METHOD = "fragprune-splatfacto"
@@ -78,7 +76,7 @@ def exported(call: SeamCall) -> tuple[Path, Tensor]:
         raise
 
 
-class Nerfstudio(MethodAdapter):
+class Nerfstudio(HostAdapter):
     """The adapter of nerfstudio's splatfacto."""
 
     name = "nerfstudio"
@@ -92,9 +90,9 @@ class Nerfstudio(MethodAdapter):
             "`ns-render` and `ns-viewer` draw with thresholds; other exports than gaussian-splat "
             "and other viewers know none.",
         ),
+        usage=f"ns-train {METHOD} ...",
     )
     installed = (PACKAGE,)
-    scripts = (f"{PACKAGE}/scripts/train.py",)
     seams = (
         # of ours: called where the iteration comes at which stage 2 begins
         Seam(
@@ -155,19 +153,14 @@ class Nerfstudio(MethodAdapter):
         gsplat = Gsplat().dialect(HostRepo.installed("gsplat") or repo)
         return NerfstudioDialect(**vars(gsplat))
 
-    def use(self, repo: HostRepo) -> str:
-        """The command that a user of this host types, as text for people."""
-        return f"ns-train {METHOD} ..."
+    def trainer(self, repo: HostRepo, script: Path) -> Callable[..., Any] | None:
+        """What runs our method in place of splatfacto, for ns-train."""
+        from fragprune_nerfstudio import command, running
 
-    def rewritten(self, arguments: list[str], settings: Settings, **options: Any) -> list[str]:
-        """The arguments of ns-train for our method, which trains as splatfacto does."""
-        from fragprune_nerfstudio.command import rewritten
-
-        return rewritten(METHOD, arguments, settings, **options)
-
-    def evaluated(self) -> str:
-        """The command that measures held-out views, as text for people."""
-        return "ns-eval --load-config CONFIG"
+        if script != repo.root / PACKAGE / "scripts" / "train.py":
+            return None
+        rewritten = partial(command.rewritten, METHOD)
+        return partial(running.run, self.name, repo, rewritten, "ns-eval --load-config CONFIG")
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
         """By the parameter; None for cameras and bilateral grids."""

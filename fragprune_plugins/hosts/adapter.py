@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from fragprune_plugins.engines import Engine
-    from fragprune_plugins.learning.schedule import Settings
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 CHECKPOINT_KEY = "fragprune"
@@ -40,12 +39,14 @@ class HostInfo:
         repo: owner/name of its public repository.
         states: the revisions this adapter was written for.
         limits: things that do not work with this host or are refused, one sentence each.
+        usage: the command that a user types, if it is another than ``fragprune run``.
     """
 
     title: str
     repo: str
     states: str = ""
     limits: tuple[str, ...] = ()
+    usage: str = ""
 
 
 @dataclass(frozen=True)
@@ -369,17 +370,15 @@ class HostAdapter(ABC):
     def dialect(self, repo: HostRepo) -> Dialect:
         """The dialect of this revision's rasterizer call."""
 
-    def use(self, repo: HostRepo) -> str:
-        """The command that a user of this host types, as text for people."""
-        package = self.installed[0] if self.installed else "the host"
-        call = f'fragprune_plugins.activate("{self.name}")'
-        return f"{call} above the import of {package} in your own script"
+    def trainer(self, repo: HostRepo, script: Path) -> ScriptAdapter | Callable[..., Any] | None:
+        """What runs a training script of this host under ``fragprune run``; None if nothing does.
 
-    def trainer(self, script: Path) -> ScriptAdapter | None:
-        """The adapter of a script that trains with this library; None if it is not known.
+        A ``ScriptAdapter``, or a function that runs the command itself: it gets the script, its
+        arguments, the module's name and the ``RunOptions``, and returns a ``RunSummary``.
 
         Args:
-            script: a file outside the library, which imports it.
+            repo: the host.
+            script: the file, which may be outside the host and import it.
         """
         return None
 
@@ -451,13 +450,9 @@ class ScriptAdapter(HostAdapter):
     def command_line(self, repo: HostRepo) -> CommandLine:
         """The flags of the host's training script."""
 
-    def use(self, repo: HostRepo) -> str:
-        """The command that a user of this host types, as text for people."""
-        script = self.command_line(repo).scripts[0]
-        if not repo.package:
-            return f"fragprune run -- python {repo.root / script} ..."
-        module = script.removesuffix(".py").replace("/", ".")
-        return f"fragprune run -- python -m {module} ..."
+    def trainer(self, repo: HostRepo, script: Path) -> ScriptAdapter | Callable[..., Any] | None:
+        """This adapter."""
+        return self
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command that can resume a training script's result; by default the same command."""
@@ -539,37 +534,3 @@ class ScriptAdapter(HostAdapter):
     @abstractmethod
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
         """Make a checkpoint from a PLY of the host, from which the host can resume."""
-
-
-class MethodAdapter(HostAdapter):
-    """An adapter of a host in which stage 2 is a training method of its own.
-
-    ``fragprune run`` asks for the command of that method, and runs it. The method activates a
-    session itself, also without ``fragprune run``.
-
-    Attributes:
-        scripts: modules of the host's package that train, as paths.
-    """
-
-    scripts: tuple[str, ...]
-
-    @abstractmethod
-    def rewritten(
-        self,
-        arguments: list[str],
-        settings: Settings,
-        *,
-        stage: str,
-        from_iter: int | None,
-        engine: str,
-        device: str,
-    ) -> list[str]:
-        """The method's arguments for a training command's; other values are options of a run.
-
-        Raises:
-            UsageError: the method cannot do what they ask for.
-        """
-
-    def evaluated(self) -> str:
-        """The command that measures held-out views, as text for people."""
-        return "the host's own evaluation"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fragprune_plugins.errors import UnknownHostError
-from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.source import HostRepo, SeamState, look_up
 
@@ -185,3 +185,18 @@ def closest(fitting: Sequence[HostAdapter], adapters: Sequence[HostAdapter]) -> 
             ancestors |= new
             new = {name for each in new for name in parents.get(each, ())}
     return [adapter for adapter in fitting if adapter.name not in ancestors] or list(fitting)
+
+
+def usage(adapter: HostAdapter, repo: HostRepo) -> str:
+    """The command that a user of a host types, as text for people."""
+    if adapter.info.usage:
+        return adapter.info.usage
+    if not isinstance(adapter, ScriptAdapter):
+        package = adapter.installed[0] if adapter.installed else "the host"
+        call = f'fragprune_plugins.activate("{adapter.name}")'
+        return f"{call} above the import of {package} in your own script"
+    script = adapter.command_line(repo).scripts[0]
+    if not repo.package:
+        return f"fragprune run -- python {repo.root / script} ..."
+    module = script.removesuffix(".py").replace("/", ".")
+    return f"fragprune run -- python -m {module} ..."

@@ -1,126 +1,29 @@
-"""Runs a host's command in this process, inside a session.
-
-A training run has two stages. Stage 1 is the host's own training; fragprune only adds the flag that
-saves a checkpoint at the end. Stage 2 runs the host's script again. It resumes from that checkpoint
-for more iterations, and thresholds learn.
-"""
+"""Runs a host's command in this process: finds the host and its adapter, and runs the stages."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
 
-from fragprune_plugins.errors import (
-    HostFailed,
-    Interrupted,
-    NotComparedError,
-    SidecarError,
-    Terminated,
-    UsageError,
-)
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts import preflight
-from fragprune_plugins.hosts.adapter import MethodAdapter, ScriptAdapter
-from fragprune_plugins.hosts.choosing import choose, locate
-from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
+from fragprune_plugins.hosts.choosing import choose, locate, usage
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection import process, ranks, starting
+from fragprune_plugins.injection import process, ranks
 from fragprune_plugins.injection.command import HostCommand, split
-from fragprune_plugins.injection.starting import Start
-from fragprune_plugins.learning.events import StepStats, Summary
-from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
-from fragprune_plugins.learning.schedule import JointSchedule, Settings
-from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.injection.options import RunOptions, RunSummary, Stage
+from fragprune_plugins.injection.stages import Stages
+from fragprune_plugins.plugins.hooks import engine_for, select_adapter
+from fragprune_plugins.plugins.loading import Plugins, installed
 
 log = logging.getLogger("fragprune")
 
-Stage = Literal["auto", "finetune", "joint", "off"]
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of a run.
-
-    Attributes:
-        adapter: the adapter's name, or None to detect it from the host's source.
-        stage: "auto" trains and then fine-tunes. "finetune" resumes from a model in the output
-            folder, or from the file that the host's resume flag names. "joint" learns inside the
-            host's training. "off" only applies thresholds of sidecars and checkpoints.
-        settings: settings of the fine-tuning.
-        from_iter: iteration after which learning begins inside one run. "finetune" also freezes the
-            model from there on. None: "joint" learns once the host's densification is over.
-        engine: "auto", "reference", "cpu", "cuda", or the name of a plugin's engine.
-        device: the host's device. "cpu" runs a CUDA-only host without a GPU, "cuda" and "cuda:N"
-            require a GPU, "auto" takes a GPU if torch sees one.
-        again: False leaves finished stages alone. If the stage 2 that "finetune" asks for has its
-            result already, nothing runs. If an earlier run of the same command finished stage 1
-            and not stage 2, "auto" begins with stage 2.
-    """
-
-    adapter: str | None = None
-    stage: Stage = "auto"
-    settings: Settings = field(default_factory=Settings)
-    from_iter: int | None = None
-    engine: str = "auto"
-    device: str = "auto"
-    again: bool = True
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """The result of a run.
-
-    Attributes:
-        adapter: the adapter's name.
-        engine: name of the engine that drew stage 2; "" if none drew.
-        device: "cpu", "cuda" or "cuda:N".
-        stage: the stage of ``RunOptions``.
-        iterations: number of learned iterations.
-        gaussians: number of Gaussians in the trained model.
-        fragments_before: fragments per pixel over training views, untruncated.
-        fragments_after: fragments per pixel over training views, at each view's last visit.
-        model_before: the host's PLY of stage 1, if there is one.
-        model_after: the host's PLY after stage 2; its sidecar lies beside it.
-        train_seconds: wall time of both stages.
-        target_reached: whether training views met a target speed-up within 5%; None without a
-            target.
-        curves: one dict per learned step: step, loss, fragments_per_pixel, pressure,
-            threshold_median.
-        settings: settings of the fine-tuning.
-        output: the host's output folder; stage 1's, if stage 2 has its own.
-        photographs: the data set whose held-out views can measure the models; None if they cannot
-            be measured.
-        drawing: fields of ``RasterInputs`` with which the host draws its models.
-        not_compared: the reason why learned models cannot be compared; otherwise None.
-        already_finished: ``model_after`` was there before, and nothing was run.
-    """
-
-    adapter: str
-    engine: str
-    device: str
-    stage: str
-    iterations: int
-    gaussians: int
-    fragments_before: float | None
-    fragments_after: float | None
-    model_before: Path | None
-    model_after: Path | None
-    train_seconds: float
-    target_reached: bool | None
-    curves: list[dict[str, float]]
-    settings: dict[str, Any]
-    output: Path | None = None
-    photographs: Photographs | None = None
-    drawing: dict[str, Any] = field(default_factory=dict)
-    not_compared: NotComparedError | None = None
-    already_finished: bool = False
+__all__ = ["RunOptions", "RunSummary", "run"]
 
 
 def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
@@ -142,34 +45,65 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         DivergedError: NaN or infinity in stage 2. Nothing of it was saved.
         SessionError: steps were counted as learned, and no view was drawn with thresholds.
     """
-    from fragprune_plugins.plugins.hooks import engine_for, select_adapter
-
     options = options or RunOptions()
     ranks.expect_no_launcher(command)
     script, arguments, module = split(command)
     plugins = installed()
-    tie = partial(select_adapter, plugins=plugins)
-    top = module.split(".")[0]
-    package = HostRepo.installed(top) if module else None
-    if package is not None and script.is_relative_to(package.root / top):
-        repo, adapter = package, choose(package, plugins.adapters, options.adapter, select=tie)
-    else:
-        repo, adapter = locate(script.parent, plugins.adapters, options.adapter, select=tie)
-    if isinstance(adapter, MethodAdapter) and script in map(repo.root.joinpath, adapter.scripts):
-        return _run_method(adapter, repo, (script, arguments, module), options)
-    driven = adapter if isinstance(adapter, ScriptAdapter) else adapter.trainer(script)
-    if driven is None:
+    repo, adapter = _host(script, module, options.adapter, plugins)
+    trainer = adapter.trainer(repo, script)
+    if trainer is None:
         raise UsageError(
             "fragprune run",
             f"{adapter.info.title}, a library without a training command",
-            adapter.use(repo),
+            usage(adapter, repo),
             f"See the how-to page of {adapter.name}.",
         )
-    adapter = driven
-    host = HostCommand.read(script, arguments, adapter.command_line(repo), module)
+    if not isinstance(trainer, ScriptAdapter):
+        summary: RunSummary = trainer(script, arguments, module, options)
+        return summary
+    host = HostCommand.read(script, arguments, trainer.command_line(repo), module)
     device = process.host_device(options.device, options.engine)
+    _expect_engine(trainer, options, device, plugins)
+    started = time.perf_counter()
+    trains = _expect_trainable(host, repo, trainer, options.stage, device)
+    with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
+        stages = Stages(host, repo, trainer, plugins, options, device, Path(scratch))
+        if not trains or options.stage == "off":
+            stages.observe()
+        elif options.stage == "joint":
+            stages.joint()
+        elif options.stage == "finetune":
+            stages.finetune()
+        else:
+            stages.train_then_finetune()
+    return stages.summary(time.perf_counter() - started)
+
+
+def _host(
+    script: Path, module: str, name: str | None, plugins: Plugins
+) -> tuple[HostRepo, HostAdapter]:
+    """The host of a script, a checkout or an installed package, and its adapter.
+
+    Args:
+        script: the file.
+        module: the module's name in ``python -m module``; "" for a script.
+        name: the adapter's; None to detect it.
+        plugins: offer the adapters.
+    """
+    select = partial(select_adapter, plugins=plugins)
+    top = module.split(".")[0]
+    package = HostRepo.installed(top) if module else None
+    if package is not None and script.is_relative_to(package.root / top):
+        return package, choose(package, plugins.adapters, name, select=select)
+    return locate(script.parent, plugins.adapters, name, select=select)
+
+
+def _expect_engine(
+    adapter: ScriptAdapter, options: RunOptions, device: str, plugins: Plugins
+) -> None:
+    """Refuse, before stage 1, an engine that cannot draw this host on this device."""
     if options.engine != "auto":
-        engine_for(options.engine, device, plugins)  # refuse before stage 1
+        engine_for(options.engine, device, plugins)
     elif device != "cpu" and options.stage != "off" and not adapter.on_gpu:
         raise UsageError(
             f"--device {device}",
@@ -177,450 +111,22 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
             "--device cpu, or --engine reference, which is slow",
             "Train with --stage off on the GPU; then learn with --stage finetune --device cpu.",
         )
-    started = time.perf_counter()
-    trains = script in (repo.root / name for name in host.line.scripts)
-    if host.line.one_run and host.flags.resume:
-        from fragprune_plugins.files import sidecar
 
+
+def _expect_trainable(
+    host: HostCommand, repo: HostRepo, adapter: ScriptAdapter, stage: Stage, device: str
+) -> bool:
+    """Whether the command trains; refuse, before stage 1, what cannot run or be followed."""
+    trains = host.script in (repo.root / name for name in host.line.scripts)
+    if host.line.one_run and host.flags.resume:
         trains = False  # it only evaluates
         if not sidecar.find(Path(host.flags.resume)):
             log.warning("%s has no thresholds beside it: drawn without", host.flags.resume)
-    if trains and options.stage != "off":
-        ranks.expect_one()  # refuse before stage 1
-        adapter.refuse(repo, arguments, stage=options.stage, device=device)
+    if trains and stage != "off":
+        ranks.expect_one()
+        adapter.refuse(repo, host.arguments, stage=stage, device=device)
     dialect = adapter.dialect(repo)
     answered = {*dialect.names(), *(dialect.spares() if device == "cpu" else ())}
     data = Path(host.flags.source) if trains and host.flags.source else None
-    preflight.expect(repo, script, answered, data)
-    with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
-        runner = _Runner(host, repo, adapter, plugins, options, device, Path(scratch))
-        if not trains or options.stage == "off":
-            runner.observe()
-        elif options.stage == "joint":
-            runner.joint()
-        elif options.stage == "finetune":
-            runner.finetune()
-        else:
-            runner.train_then_finetune()
-    return runner.summary(time.perf_counter() - started)
-
-
-class _Ear:
-    """Hears the summary of a session that a host activates itself, and its learning curves."""
-
-    def __init__(self) -> None:
-        self.summary: Summary | None = None
-        self.curves: list[dict[str, float]] = []
-
-    @hookimpl
-    def fragprune_step(self, stats: StepStats) -> None:
-        self.curves.append(asdict(stats))
-
-    @hookimpl
-    def fragprune_finished(self, summary: Summary) -> None:
-        self.summary = summary
-
-
-def _run_method(
-    adapter: MethodAdapter,
-    repo: HostRepo,
-    command: tuple[Path, list[str], str],
-    options: RunOptions,
-) -> RunSummary:
-    """Run the host's own method that has stage 2 in it, in place of the method that was named.
-
-    Args:
-        adapter: knows the method's command.
-        repo: the host's package.
-        command: its script, arguments and module.
-        options: of the run.
-    """
-    from fragprune_plugins.injection.session import active_session
-
-    script, arguments, module = command
-    started, ear, plugins = time.perf_counter(), _Ear(), installed()
-    ranks.expect_one()
-    device = process.host_device(options.device, options.engine)
-    words = adapter.rewritten(
-        arguments,
-        options.settings,
-        stage=options.stage,
-        from_iter=options.from_iter,
-        engine=options.engine,
-        device=device,
-    )
-    log.info("runs %s %s", script.stem, " ".join(words))
-    plugins.register(ear, "run")
-    try:
-        with (
-            process.telling(script, repo.root),
-            process.host_process(script, words, device, Path.cwd()),
-            sigterm_interrupts(),
-        ):
-            process.run_main(script, module)
-    finally:
-        plugins.remove("run")
-        session = active_session()
-        output = session.output if session is not None else None
-        if session is not None:
-            session.deactivate()
-    if ear.summary is None:
-        raise HostFailed(
-            script.name,
-            "ended before the end of stage 2",
-            "a training that runs to its end",
-            "Read the host's own message above.",
-        )
-    learned = ear.summary
-    not_compared = NotComparedError(
-        adapter.name,
-        "photographs and cameras in the host's own frame",
-        "its own evaluation",
-        f"Run: {adapter.evaluated()}",
-    )
-    return RunSummary(
-        adapter=adapter.name,
-        engine=learned.engine,
-        device=device,
-        stage=options.stage,
-        iterations=learned.steps,
-        gaussians=learned.gaussians,
-        fragments_before=learned.fragments_before,
-        fragments_after=learned.fragments_after,
-        model_before=None,
-        model_after=None,
-        train_seconds=time.perf_counter() - started,
-        target_reached=learned.target_reached,
-        curves=ear.curves,
-        settings=learned.settings,
-        output=output,
-        not_compared=not_compared,
-    )
-
-
-class _Runner:
-    """Runs the stages of one command and keeps the figures for the summary."""
-
-    def __init__(
-        self,
-        host: HostCommand,
-        repo: HostRepo,
-        adapter: ScriptAdapter,
-        plugins: Any,
-        options: RunOptions,
-        device: str,
-        scratch: Path,
-    ) -> None:
-        self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
-        self.options, self.device, self.scratch = options, device, scratch
-        self.output = host.output
-        self.around: Path | None = None  # stage 1's folder, if stage 2 has its own
-        self.start: Start | None = None  # of stage 2
-        self.before: Path | None = None
-        self.after: Path | None = None
-        self.learned: Summary | None = None
-        self.curves: list[dict[str, float]] = []
-        self.already_finished = False
-
-    def observe(self) -> None:
-        """Run the command unchanged; thresholds of sidecars apply, and nothing learns."""
-        self._execute(self.host.arguments, learn=False)
-
-    def joint(self) -> None:
-        """Run the command once; thresholds learn while the whole model trains."""
-        from_iter = self.options.from_iter
-        resumed, start, total = self._learning(
-            self._densified() if from_iter is None else from_iter
-        )
-        log.info("thresholds learn in iterations %d to %d", start + 1, total)
-        steps = total - resumed - self.host.line.skipped
-        settings = replace(self.options.settings, iterations=steps)
-        schedule = JointSchedule(settings, start - resumed + 1)
-        self._execute(
-            self.host.saving(self.scratch, total),
-            learn=True,
-            freeze=False,
-            start=resumed,
-            schedule=schedule,
-            settings=settings,
-        )
-        self.after = self._model(total)
-
-    def train_then_finetune(self) -> None:
-        """Run stage 1 with a checkpoint at its end, then stage 2 from that checkpoint."""
-        if self.host.line.one_run:
-            return self.one_run()
-        if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
-            return self.finetune()
-        self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
-        if not self.options.again:
-            self.start = starting.finished(self.adapter, self.host, self.repo.commit)
-        if self.start is None:
-            self.start = self._train()
-            starting.remember(self.start, self.host, self.repo.commit)
-        command = self.host
-        self.finetune()
-        starting.forget(command)
-
-    def _train(self) -> Start:
-        """Run stage 1; returns its end."""
-        total = self.host.iterations
-        log.info("stage 1: the host's own training, %d iterations", total)
-        written = self.host.checkpoints(total)
-        arguments = self.host.with_flags(self.scratch, save_checkpoints=written)
-        files = starting.files(self.adapter, self.output)
-        earlier = {path: path.stat().st_mtime_ns for _, path in files}
-        self._execute(arguments, learn=False)
-        ends = [
-            (path.suffix != ".ply", path)
-            for iteration, path in starting.files(self.adapter, self.output)
-            if iteration == total and earlier.get(path) != path.stat().st_mtime_ns
-        ]
-        if not ends:  # some hosts refuse a command with exit code 0
-            raise HostFailed(
-                self.host.script.name,
-                f"ended without a checkpoint of iteration {total}",
-                "a training that runs to its end",
-                "Read the host's own message above.",
-            )
-        return Start(total, max(ends)[1], "the end of stage 1")
-
-    def one_run(self) -> None:
-        """Run a host that cannot resume once, longer; stage 2 begins where it would have ended."""
-        settings, total = self.options.settings, self.host.iterations
-        last = total + settings.iterations
-        log.info("one run of %d iterations; stage 2 begins after %d", last, total)
-        arguments = self.adapter.lengthened(self.host.arguments, total, last)
-        if not settings.truncate and self.output is not None:  # keeps a learned result in its place
-            self.output /= "control"
-            arguments += [self.host.line.output[-1], str(self.output)]
-        self._execute(arguments, learn=True, from_step=total, settings=settings)
-        self.before, self.after = self._model(total), self._model(last)
-
-    def finetune(self) -> None:
-        """Run stage 2: resume a model, or begin at ``from_iter`` of one run."""
-        settings = self.options.settings
-        if self.options.from_iter is not None:
-            resumed, begins, total = self._learning(self.options.from_iter)
-            steps = total - begins - self.host.line.skipped
-            self._execute(
-                self.host.saving(self.scratch, total),
-                learn=True,
-                from_step=begins - resumed,
-                start=resumed,
-                settings=replace(settings, iterations=steps),
-            )
-            self.after = self._model(total)
-            return
-        if self.host.line.one_run:
-            raise UsageError(
-                "--stage finetune",
-                f"{self.host.script.name}, which cannot resume a training",
-                "--from-iter, the iteration of one run after which stage 2 begins",
-                "Add it, or give the trained PLY to fragprune finetune.",
-            )
-        self.host = self.host.of(*self.adapter.resumed_by(self.host.script, self.host.arguments))
-        self.output = self.output or self.host.output
-        start = self.start = self.start or starting.find(self.adapter, self.host, self.output)
-        log.info("stage 2: %d iterations from iteration %d, %s: %s", settings.iterations, *start)
-        line = self.host.line
-        with starting.resumable(self.adapter, line, start) as checkpoint:
-            self.before = self._model(start.iteration)
-            first = 0 if line.restarts else start.iteration
-            total = first + settings.iterations + line.skipped
-            extra = {"iterations": total, "resume": str(checkpoint)}
-            own = "finetuned" if line.restarts else ""
-            own = own if settings.truncate else "control"  # keeps a learned result in its place
-            if own and self.output is not None:
-                self.around, self.output = self.output, self.output / own
-            if self.output is not None and str(self.output) != self.host.flags.output:
-                extra["output"] = str(self.output)
-            if not self.options.again and self._is_finished(start, self._model(total)):
-                self.after, self.already_finished = self._model(total), True
-                return
-            arguments = self.host.saving(self.scratch, total, **extra)
-            self._execute(arguments, learn=True, start=first)
-            self.after = self._model(total)
-
-    def _execute(
-        self,
-        arguments: list[str],
-        *,
-        learn: bool,
-        settings: Settings | None = None,
-        **options: Any,
-    ) -> None:
-        """Run the host's script with these arguments, in a session with these options."""
-        from fragprune_plugins.injection import workers
-        from fragprune_plugins.injection.session import Session
-
-        session = Session(
-            self.adapter,
-            self.repo,
-            self.plugins,
-            settings or self.options.settings,
-            learn=learn,
-            engine=self.options.engine,
-            drop_in=True if self.device == "cpu" else None,
-            output=self.output,
-            origin=self.around,
-            **options,
-        )
-        known = set(sys.modules)
-        host = self.host
-        try:
-            with contextlib.ExitStack() as stack:
-                stack.enter_context(process.telling(host.script, self.repo.root))
-                stack.enter_context(session)
-                folder = Path.cwd() if host.module else host.script.parent
-                stack.enter_context(
-                    process.host_process(host.script, arguments, self.device, folder)
-                )
-                stack.enter_context(workers.prepared(session, self.device))
-                if learn:
-                    stack.enter_context(sigterm_interrupts())
-                try:
-                    process.run_main(host.script, host.module)
-                except KeyboardInterrupt as error:  # the session still writes sidecars
-                    saved = session.save_interrupted() if learn else None
-                    raise self._interrupted(error, saved) from error
-            session.expect_drawn()
-        finally:
-            self.output = session.output or self.output
-            process.forget_modules(self.repo.root, known, self.adapter.installed)
-            if learn:
-                self.learned = session.finish()
-                self.curves = session.curves
-
-    def _is_finished(self, start: Start, result: Path | None) -> bool:
-        """Whether stage 2 from this start wrote this file, with these settings."""
-        from fragprune_plugins.files import sidecar
-
-        if result is None or start.path.stat().st_mtime_ns > result.stat().st_mtime_ns:
-            return False
-        try:
-            _, info = sidecar.load(result)
-        except SidecarError:
-            return False
-        asked = self.options.settings.as_dict(), self.adapter.name, self.repo.commit
-        return (info.settings, info.adapter, info.host_commit) == asked
-
-    def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
-        """The error that reports Ctrl-C or SIGTERM, names the saved model, and says how to go on.
-
-        Stage 2 begins anew from the end of stage 1; no stage 1 is repeated.
-        """
-        by_signal = isinstance(error, Terminate)
-        stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
-        remedy = "Run the command again."
-        line = self.host.line
-        if self.start is not None:
-            named = self.host.output is not None
-            added = "" if named else f" with --stage finetune and {line.output[-1]} {self.output}"
-            remedy = f"Run the command again{added}: stage 2 begins anew from {self.start.path}."
-        if saved:
-            portable = self.options.settings.portable
-            learned, where = ("model", "is") if portable else ("thresholds", "are beside")
-            found += f"; the {learned} learned so far {where} {saved}"
-            if not line.one_run:
-                flag = f"{line.spellings('resume')[-1]} {saved}"
-                remedy += f" To continue from the learned model, add --stage finetune and {flag}."
-        return stated(self.host.script.name, found, "a run that reaches its end", remedy)
-
-    def summary(self, seconds: float) -> RunSummary:
-        """The summary, after all stages have ended.
-
-        Args:
-            seconds: wall time of all stages.
-        """
-        learned = self.learned
-        photographs, drawing, not_compared = self._comparison()
-        return RunSummary(
-            adapter=self.adapter.name,
-            engine=learned.engine if learned else "",
-            device=self.device,
-            stage=self.options.stage,
-            iterations=learned.steps if learned else 0,
-            gaussians=learned.gaussians if learned else 0,
-            fragments_before=learned.fragments_before if learned else None,
-            fragments_after=learned.fragments_after if learned else None,
-            model_before=self.before,
-            model_after=self.after,
-            train_seconds=seconds,
-            target_reached=learned.target_reached if learned else None,
-            curves=self.curves,
-            settings=self.options.settings.as_dict(),
-            output=self.around or self.output,
-            photographs=photographs,
-            drawing=drawing,
-            not_compared=not_compared,
-            already_finished=self.already_finished,
-        )
-
-    def _comparison(self) -> tuple[Photographs | None, dict[str, Any], NotComparedError | None]:
-        """(photographs, drawing, None) to measure the models, or (None, {}, the reason)."""
-        if not self.learned:
-            return None, {}, None
-        try:
-            drawing = self.adapter.drawing(self.repo, self.host.arguments)
-            joint = self.options.stage == "joint"  # the model of before is another training's
-            if not self.after or not (self.before or joint):
-                raise NotComparedError(
-                    f"--stage {self.options.stage}",
-                    f"no model from {'before' if self.after else 'after'} the learning",
-                    "a model that the host saved",
-                    "Name two models to fragprune compare.",
-                )
-            return self.adapter.photographs(self.repo, self.host.arguments), drawing, None
-        except NotComparedError as error:
-            return None, {}, error
-
-    def _densified(self) -> int:
-        """The iteration after which the host's densification is over.
-
-        Raises:
-            UsageError: the host does not tell.
-        """
-        host = self.host
-        end = self.adapter.densified(self.repo, host.script, host.arguments)
-        if end is None:
-            raise UsageError(
-                "--stage joint",
-                f"{self.adapter.info.title}, which does not tell when its densification is over",
-                "the iteration after which thresholds learn",
-                "Add --from-iter.",
-            )
-        return end
-
-    def _learning(self, from_iter: int) -> tuple[int, int, int]:
-        """(resumed, start, last): three iterations of the host.
-
-        The run resumes after iteration ``resumed``, learns after ``start`` and ends with ``last``.
-
-        Args:
-            from_iter: the option, or the end of the host's densification.
-
-        Raises:
-            UsageError: nothing would be learned.
-        """
-        total, file = self.host.iterations, self.host.flags.resume
-        if file:
-            self.adapter.expect_resumable(Path(file))
-        resumed = starting.resumed_at(self.host.line, Path(file)) if file else 0
-        start = max(resumed, from_iter)
-        if start < total - self.host.line.skipped:
-            return resumed, start, total
-        at_end = self.options.from_iter is None and start > resumed
-        where = "densification ends" if at_end else "learning begins"
-        flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
-        raise UsageError(
-            f"--stage {self.options.stage}",
-            f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
-            f"iterations after {start}, where {where}",
-            f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
-        )
-
-    def _model(self, iteration: int) -> Path | None:
-        """The host's PLY of an iteration, or None if the host saved none."""
-        path = self.adapter.model_file(self.output, iteration) if self.output else None
-        return path if path and path.exists() else None
+    preflight.expect(repo, host.script, answered, data)
+    return trains

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 from cli import commands
 
-from fragprune_plugins.adapting import Finding, HostInfo, MethodAdapter, hookimpl
+from fragprune_nerfstudio import running
+from fragprune_plugins.adapting import Finding, HostAdapter, HostInfo, hookimpl
 from fragprune_plugins.errors import HostFailed, UsageError
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
@@ -38,16 +40,18 @@ if "stops" not in rest:
 """
 
 
-class Studio(MethodAdapter):
+class Studio(HostAdapter):
     name = "studio"
     info = HostInfo("Studio", repo="me/studio")
     seams = ()
     installed = (PACKAGE,)
-    scripts = (f"{PACKAGE}/train.py",)
 
     def fingerprint(self, repo):
         ours = repo.package == PACKAGE
         return [] if ours else [Finding("error", "other-host", str(repo.root), "a folder")]
+
+    def trainer(self, repo, script):
+        return partial(running.run, self.name, repo, self.rewritten, "the host's own evaluation")
 
     def rewritten(self, arguments, settings, *, stage, from_iter, engine, device):
         if stage == "joint":

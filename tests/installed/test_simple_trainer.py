@@ -188,9 +188,9 @@ def test_several_gpus_would_be_processes_without_thresholds(train, monkeypatch):
 def test_another_script_with_gsplat_is_told_what_to_do(tmp_path):
     script = tmp_path / "mine.py"
     script.write_text("from gsplat import rasterization\n")
-    assert Gsplat().trainer(script) is None
+    assert Gsplat().trainer(HostRepo(script.parent), script) is None
     surfels = SCRIPT.read_text().replace("rasterization", "rasterization_2dgs")
     script.write_text(surfels)
-    assert Gsplat().trainer(script) is None
+    assert Gsplat().trainer(HostRepo(script.parent), script) is None
     with pytest.raises(UsageError, match="activate"):
         run([str(script)], RunOptions(device="cpu"))

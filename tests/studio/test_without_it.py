@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -17,6 +18,7 @@ from fragprune_nerfstudio.exporting import COLUMNS, rows_among, rows_exported
 from fragprune_plugins import Settings
 from fragprune_plugins.errors import AlignmentError, UsageError
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.hosts.choosing import usage
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import command, saving, session
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -244,16 +246,10 @@ def test_an_export_without_thresholds_leaves_none_of_an_earlier_one(tmp_path):
     assert not sidecar.path_beside(path).exists()
 
 
-def test_an_adapter_of_a_method_can_be_asked_for_before_its_host_is_there(monkeypatch):
+def test_only_ns_train_is_a_training_and_without_its_host_it_can_be_asked_for(monkeypatch):
     monkeypatch.setitem(sys.modules, "nerfstudio", None)
-    adapter = Nerfstudio()
-    words = adapter.rewritten(
-        ["splatfacto"],
-        Settings(),
-        stage="auto",
-        from_iter=None,
-        engine="auto",
-        device="cpu",
-    )
-    assert words[0] == METHOD
-    assert METHOD in adapter.use(HostRepo.__new__(HostRepo))
+    adapter, repo = Nerfstudio(), HostRepo(Path("lib"), "nerfstudio")
+    scripts = repo.root / "nerfstudio" / "scripts"
+    assert adapter.trainer(repo, scripts / "train.py") is not None
+    assert adapter.trainer(repo, scripts / "eval.py") is None
+    assert METHOD in usage(adapter, repo)

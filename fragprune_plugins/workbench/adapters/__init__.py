@@ -58,7 +58,6 @@ def command(table: bool) -> Report:
 def support(adapters: Sequence[HostAdapter]) -> str:
     """The support page in Markdown, made from the adapters alone."""
     from fragprune_plugins.engines import ENGINES
-    from fragprune_plugins.hosts.adapter import MethodAdapter
 
     head = ["host", "adapter", "states", "scripts that train"]
     rows = [head, ["---"] * len(head)]
@@ -73,10 +72,8 @@ def support(adapters: Sequence[HostAdapter]) -> str:
     return _SUPPORT.substitute(
         table=table,
         engines=", ".join(f"`{name}`" for name in ENGINES),
-        installed=" and ".join(
-            f"`{a.name}`" for a in adapters if a.installed and not isinstance(a, MethodAdapter)
-        ),
-        methods=" and ".join(f"`{a.name}`" for a in adapters if isinstance(a, MethodAdapter)),
+        installed=" and ".join(f"`{a.name}`" for a in adapters if a.installed and not a.info.usage),
+        methods=" and ".join(f"`{a.name}`" for a in adapters if a.info.usage),
         limits="\n".join(limits),
     )
 
@@ -86,13 +83,11 @@ def _scripts(adapter: HostAdapter) -> tuple[str, ...]:
 
     They are the same for all revisions.
     """
-    from fragprune_plugins.hosts.adapter import MethodAdapter, ScriptAdapter
+    from fragprune_plugins.hosts.adapter import ScriptAdapter
     from fragprune_plugins.hosts.source import HostRepo
 
-    if isinstance(adapter, MethodAdapter):
-        return adapter.scripts
     if not isinstance(adapter, ScriptAdapter):
-        return ()
+        return (adapter.info.usage,) if adapter.info.usage else ()
     return adapter.command_line(HostRepo(Path("/nonexistent"))).scripts
 
 

@@ -172,8 +172,10 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
 
 
 def _conclusion(repo: HostRepo, fitting: list[Tried]) -> str:
+    from fragprune_plugins.hosts.choosing import usage
+
     if len(fitting) == 1:
-        return f"Use: {fitting[0].adapter.use(repo)}"
+        return f"Use: {usage(fitting[0].adapter, repo)}"
     if fitting:
         names = ", ".join(each.adapter.name for each in fitting)
         return f"Several adapters fit: {names}. Name one with fragprune run --adapter."

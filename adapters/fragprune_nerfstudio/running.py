@@ -1,0 +1,128 @@
+"""``fragprune run`` with a host in which stage 2 is a training method of its own.
+
+The host runs that method in place of the one that the command names. The method activates a session
+itself, also without ``fragprune run``.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+from fragprune_plugins.adapting import HostRepo, NotComparedError, hookimpl
+from fragprune_plugins.errors import HostFailed
+from fragprune_plugins.injection import process, ranks
+from fragprune_plugins.injection.options import RunOptions, RunSummary
+from fragprune_plugins.injection.session import active_session
+from fragprune_plugins.learning.events import StepStats, Summary
+from fragprune_plugins.learning.interruption import sigterm_interrupts
+from fragprune_plugins.plugins.loading import installed
+
+log = logging.getLogger("fragprune")
+
+
+class Recorder:
+    """A plugin that records the curves and the summary of a session."""
+
+    def __init__(self) -> None:
+        self.summary: Summary | None = None
+        self.curves: list[dict[str, float]] = []
+
+    @hookimpl
+    def fragprune_step(self, stats: StepStats) -> None:
+        """Record a step."""
+        self.curves.append(asdict(stats))
+
+    @hookimpl
+    def fragprune_finished(self, summary: Summary) -> None:
+        """Record the summary."""
+        self.summary = summary
+
+
+def run(
+    name: str,
+    repo: HostRepo,
+    rewritten: Callable[..., list[str]],
+    evaluation: str,
+    script: Path,
+    arguments: list[str],
+    module: str,
+    options: RunOptions,
+) -> RunSummary:
+    """Run the method that has stage 2 in it.
+
+    Args:
+        name: the adapter's.
+        repo: the host's package.
+        rewritten: gives the method's arguments for those of the command; see ``command.rewritten``.
+        evaluation: the command that measures held-out views, as text for people.
+        script: the host's training script.
+        arguments: of the command.
+        module: the module's name in ``python -m module``; "" for a script.
+        options: of the run.
+
+    Raises:
+        UsageError: the method cannot do what the command or the options ask for.
+        HostFailed: the host failed, or ended before the end of stage 2.
+        RanksError: several processes train the model together.
+    """
+    started, recorder, plugins = time.perf_counter(), Recorder(), installed()
+    ranks.expect_one()
+    device = process.host_device(options.device, options.engine)
+    words = rewritten(
+        arguments,
+        options.settings,
+        stage=options.stage,
+        from_iter=options.from_iter,
+        engine=options.engine,
+        device=device,
+    )
+    log.info("runs %s %s", script.stem, " ".join(words))
+    plugins.register(recorder, "run")
+    try:
+        with (
+            process.telling(script, repo.root),
+            process.host_process(script, words, device, Path.cwd()),
+            sigterm_interrupts(),
+        ):
+            process.run_main(script, module)
+    finally:
+        plugins.remove("run")
+        session = active_session()
+        output = session.output if session is not None else None
+        if session is not None:
+            session.deactivate()
+    learned = recorder.summary
+    if learned is None:
+        raise HostFailed(
+            script.name,
+            "ended before the end of stage 2",
+            "a training that runs to its end",
+            "Read the host's own message above.",
+        )
+    return RunSummary(
+        adapter=name,
+        engine=learned.engine,
+        device=device,
+        stage=options.stage,
+        iterations=learned.steps,
+        gaussians=learned.gaussians,
+        fragments_before=learned.fragments_before,
+        fragments_after=learned.fragments_after,
+        model_before=None,
+        model_after=None,
+        train_seconds=time.perf_counter() - started,
+        target_reached=learned.target_reached,
+        curves=recorder.curves,
+        settings=learned.settings,
+        output=output,
+        not_compared=NotComparedError(
+            name,
+            "photographs and cameras in the host's own frame",
+            "its own evaluation",
+            f"Run: {evaluation}",
+        ),
+    )

@@ -1,0 +1,92 @@
+"""What a run is asked for, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from fragprune_plugins.errors import NotComparedError
+from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.learning.schedule import Settings
+
+Stage = Literal["auto", "finetune", "joint", "off"]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of a run.
+
+    Attributes:
+        adapter: the adapter's name, or None to detect it from the host's source.
+        stage: "auto" trains and then fine-tunes. "finetune" resumes from a model in the output
+            folder, or from the file that the host's resume flag names. "joint" learns inside the
+            host's training. "off" only applies thresholds of sidecars and checkpoints.
+        settings: settings of the fine-tuning.
+        from_iter: iteration after which learning begins inside one run. "finetune" also freezes the
+            model from there on. None: "joint" learns once the host's densification is over.
+        engine: "auto", "reference", "cpu", "cuda", or the name of a plugin's engine.
+        device: the host's device. "cpu" runs a CUDA-only host without a GPU, "cuda" and "cuda:N"
+            require a GPU, "auto" takes a GPU if torch sees one.
+        again: False leaves finished stages alone. If the stage 2 that "finetune" asks for has its
+            result already, nothing runs. If an earlier run of the same command finished stage 1
+            and not stage 2, "auto" begins with stage 2.
+    """
+
+    adapter: str | None = None
+    stage: Stage = "auto"
+    settings: Settings = field(default_factory=Settings)
+    from_iter: int | None = None
+    engine: str = "auto"
+    device: str = "auto"
+    again: bool = True
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """The result of a run.
+
+    Attributes:
+        adapter: the adapter's name.
+        engine: name of the engine that drew stage 2; "" if none drew.
+        device: "cpu", "cuda" or "cuda:N".
+        stage: the stage of ``RunOptions``.
+        iterations: number of learned iterations.
+        gaussians: number of Gaussians in the trained model.
+        fragments_before: fragments per pixel over training views, untruncated.
+        fragments_after: fragments per pixel over training views, at each view's last visit.
+        model_before: the host's PLY of stage 1, if there is one.
+        model_after: the host's PLY after stage 2; its sidecar lies beside it.
+        train_seconds: wall time of both stages.
+        target_reached: whether training views met a target speed-up within 5%; None without a
+            target.
+        curves: one dict per learned step: step, loss, fragments_per_pixel, pressure,
+            threshold_median.
+        settings: settings of the fine-tuning.
+        output: the host's output folder; stage 1's, if stage 2 has its own.
+        photographs: the data set whose held-out views can measure the models; None if they cannot
+            be measured.
+        drawing: fields of ``RasterInputs`` with which the host draws its models.
+        not_compared: the reason why learned models cannot be compared; otherwise None.
+        already_finished: ``model_after`` was there before, and nothing was run.
+    """
+
+    adapter: str
+    engine: str
+    device: str
+    stage: str
+    iterations: int
+    gaussians: int
+    fragments_before: float | None
+    fragments_after: float | None
+    model_before: Path | None
+    model_after: Path | None
+    train_seconds: float
+    target_reached: bool | None
+    curves: list[dict[str, float]]
+    settings: dict[str, Any]
+    output: Path | None = None
+    photographs: Photographs | None = None
+    drawing: dict[str, Any] = field(default_factory=dict)
+    not_compared: NotComparedError | None = None
+    already_finished: bool = False

@@ -1,0 +1,361 @@
+"""The stages of a run.
+
+A training run has two stages. Stage 1 is the host's own training; fragprune only adds the flag that
+saves a checkpoint at the end. Stage 2 runs the host's script again. It resumes from that checkpoint
+for more iterations, and thresholds learn.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.errors import (
+    HostFailed,
+    Interrupted,
+    NotComparedError,
+    SidecarError,
+    Terminated,
+    UsageError,
+)
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.hosts.adapter import ScriptAdapter
+from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection import process, starting, workers
+from fragprune_plugins.injection.command import HostCommand
+from fragprune_plugins.injection.options import RunOptions, RunSummary
+from fragprune_plugins.injection.session import Session
+from fragprune_plugins.injection.starting import Start
+from fragprune_plugins.learning.events import Summary
+from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
+from fragprune_plugins.learning.schedule import JointSchedule, Settings
+
+log = logging.getLogger("fragprune")
+
+
+class Stages:
+    """Runs the stages of one command and keeps the figures for the summary."""
+
+    def __init__(
+        self,
+        host: HostCommand,
+        repo: HostRepo,
+        adapter: ScriptAdapter,
+        plugins: Any,
+        options: RunOptions,
+        device: str,
+        scratch: Path,
+    ) -> None:
+        self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
+        self.options, self.device, self.scratch = options, device, scratch
+        self.output = host.output
+        self.around: Path | None = None  # stage 1's folder, if stage 2 has its own
+        self.start: Start | None = None  # of stage 2
+        self.before: Path | None = None
+        self.after: Path | None = None
+        self.learned: Summary | None = None
+        self.curves: list[dict[str, float]] = []
+        self.already_finished = False
+
+    def observe(self) -> None:
+        """Run the command unchanged; thresholds of sidecars apply, and nothing learns."""
+        self._execute(self.host.arguments, learn=False)
+
+    def joint(self) -> None:
+        """Run the command once; thresholds learn while the whole model trains."""
+        from_iter = self.options.from_iter
+        resumed, start, total = self._learning(
+            self._densified() if from_iter is None else from_iter
+        )
+        log.info("thresholds learn in iterations %d to %d", start + 1, total)
+        steps = total - resumed - self.host.line.skipped
+        settings = replace(self.options.settings, iterations=steps)
+        schedule = JointSchedule(settings, start - resumed + 1)
+        self._execute(
+            self.host.saving(self.scratch, total),
+            learn=True,
+            freeze=False,
+            start=resumed,
+            schedule=schedule,
+            settings=settings,
+        )
+        self.after = self._model(total)
+
+    def train_then_finetune(self) -> None:
+        """Run stage 1 with a checkpoint at its end, then stage 2 from that checkpoint."""
+        if self.host.line.one_run:
+            return self.one_run()
+        if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
+            return self.finetune()
+        self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
+        if not self.options.again:
+            self.start = starting.finished(self.adapter, self.host, self.repo.commit)
+        if self.start is None:
+            self.start = self._train()
+            starting.remember(self.start, self.host, self.repo.commit)
+        command = self.host
+        self.finetune()
+        starting.forget(command)
+
+    def _train(self) -> Start:
+        """Run stage 1; returns its end."""
+        total = self.host.iterations
+        log.info("stage 1: the host's own training, %d iterations", total)
+        written = self.host.checkpoints(total)
+        arguments = self.host.with_flags(self.scratch, save_checkpoints=written)
+        files = starting.files(self.adapter, self.output)
+        earlier = {path: path.stat().st_mtime_ns for _, path in files}
+        self._execute(arguments, learn=False)
+        ends = [
+            (path.suffix != ".ply", path)
+            for iteration, path in starting.files(self.adapter, self.output)
+            if iteration == total and earlier.get(path) != path.stat().st_mtime_ns
+        ]
+        if not ends:  # some hosts refuse a command with exit code 0
+            raise HostFailed(
+                self.host.script.name,
+                f"ended without a checkpoint of iteration {total}",
+                "a training that runs to its end",
+                "Read the host's own message above.",
+            )
+        return Start(total, max(ends)[1], "the end of stage 1")
+
+    def one_run(self) -> None:
+        """Run a host that cannot resume once, longer; stage 2 begins where it would have ended."""
+        settings, total = self.options.settings, self.host.iterations
+        last = total + settings.iterations
+        log.info("one run of %d iterations; stage 2 begins after %d", last, total)
+        arguments = self.adapter.lengthened(self.host.arguments, total, last)
+        if not settings.truncate and self.output is not None:  # keeps a learned result in its place
+            self.output /= "control"
+            arguments += [self.host.line.output[-1], str(self.output)]
+        self._execute(arguments, learn=True, from_step=total, settings=settings)
+        self.before, self.after = self._model(total), self._model(last)
+
+    def finetune(self) -> None:
+        """Run stage 2: resume a model, or begin at ``from_iter`` of one run."""
+        settings = self.options.settings
+        if self.options.from_iter is not None:
+            resumed, begins, total = self._learning(self.options.from_iter)
+            steps = total - begins - self.host.line.skipped
+            self._execute(
+                self.host.saving(self.scratch, total),
+                learn=True,
+                from_step=begins - resumed,
+                start=resumed,
+                settings=replace(settings, iterations=steps),
+            )
+            self.after = self._model(total)
+            return
+        if self.host.line.one_run:
+            raise UsageError(
+                "--stage finetune",
+                f"{self.host.script.name}, which cannot resume a training",
+                "--from-iter, the iteration of one run after which stage 2 begins",
+                "Add it, or give the trained PLY to fragprune finetune.",
+            )
+        self.host = self.host.of(*self.adapter.resumed_by(self.host.script, self.host.arguments))
+        self.output = self.output or self.host.output
+        start = self.start = self.start or starting.find(self.adapter, self.host, self.output)
+        log.info("stage 2: %d iterations from iteration %d, %s: %s", settings.iterations, *start)
+        line = self.host.line
+        with starting.resumable(self.adapter, line, start) as checkpoint:
+            self.before = self._model(start.iteration)
+            first = 0 if line.restarts else start.iteration
+            total = first + settings.iterations + line.skipped
+            extra = {"iterations": total, "resume": str(checkpoint)}
+            own = "finetuned" if line.restarts else ""
+            own = own if settings.truncate else "control"  # keeps a learned result in its place
+            if own and self.output is not None:
+                self.around, self.output = self.output, self.output / own
+            if self.output is not None and str(self.output) != self.host.flags.output:
+                extra["output"] = str(self.output)
+            if not self.options.again and self._is_finished(start, self._model(total)):
+                self.after, self.already_finished = self._model(total), True
+                return
+            arguments = self.host.saving(self.scratch, total, **extra)
+            self._execute(arguments, learn=True, start=first)
+            self.after = self._model(total)
+
+    def _execute(
+        self,
+        arguments: list[str],
+        *,
+        learn: bool,
+        settings: Settings | None = None,
+        **options: Any,
+    ) -> None:
+        """Run the host's script with these arguments, in a session with these options."""
+        session = Session(
+            self.adapter,
+            self.repo,
+            self.plugins,
+            settings or self.options.settings,
+            learn=learn,
+            engine=self.options.engine,
+            drop_in=True if self.device == "cpu" else None,
+            output=self.output,
+            origin=self.around,
+            **options,
+        )
+        known = set(sys.modules)
+        host = self.host
+        try:
+            with contextlib.ExitStack() as stack:
+                stack.enter_context(process.telling(host.script, self.repo.root))
+                stack.enter_context(session)
+                folder = Path.cwd() if host.module else host.script.parent
+                stack.enter_context(
+                    process.host_process(host.script, arguments, self.device, folder)
+                )
+                stack.enter_context(workers.prepared(session, self.device))
+                if learn:
+                    stack.enter_context(sigterm_interrupts())
+                try:
+                    process.run_main(host.script, host.module)
+                except KeyboardInterrupt as error:  # the session still writes sidecars
+                    saved = session.save_interrupted() if learn else None
+                    raise self._interrupted(error, saved) from error
+            session.expect_drawn()
+        finally:
+            self.output = session.output or self.output
+            process.forget_modules(self.repo.root, known, self.adapter.installed)
+            if learn:
+                self.learned = session.finish()
+                self.curves = session.curves
+
+    def _is_finished(self, start: Start, result: Path | None) -> bool:
+        """Whether stage 2 from this start wrote this file, with these settings."""
+        if result is None or start.path.stat().st_mtime_ns > result.stat().st_mtime_ns:
+            return False
+        try:
+            _, info = sidecar.load(result)
+        except SidecarError:
+            return False
+        asked = self.options.settings.as_dict(), self.adapter.name, self.repo.commit
+        return (info.settings, info.adapter, info.host_commit) == asked
+
+    def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
+        """The error that reports Ctrl-C or SIGTERM, names the saved model, and says how to go on.
+
+        Stage 2 begins anew from the end of stage 1; no stage 1 is repeated.
+        """
+        by_signal = isinstance(error, Terminate)
+        stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
+        remedy = "Run the command again."
+        line = self.host.line
+        if self.start is not None:
+            named = self.host.output is not None
+            added = "" if named else f" with --stage finetune and {line.output[-1]} {self.output}"
+            remedy = f"Run the command again{added}: stage 2 begins anew from {self.start.path}."
+        if saved:
+            portable = self.options.settings.portable
+            learned, where = ("model", "is") if portable else ("thresholds", "are beside")
+            found += f"; the {learned} learned so far {where} {saved}"
+            if not line.one_run:
+                flag = f"{line.spellings('resume')[-1]} {saved}"
+                remedy += f" To continue from the learned model, add --stage finetune and {flag}."
+        return stated(self.host.script.name, found, "a run that reaches its end", remedy)
+
+    def summary(self, seconds: float) -> RunSummary:
+        """The summary, after all stages have ended.
+
+        Args:
+            seconds: wall time of all stages.
+        """
+        learned = self.learned
+        photographs, drawing, not_compared = self._comparison()
+        return RunSummary(
+            adapter=self.adapter.name,
+            engine=learned.engine if learned else "",
+            device=self.device,
+            stage=self.options.stage,
+            iterations=learned.steps if learned else 0,
+            gaussians=learned.gaussians if learned else 0,
+            fragments_before=learned.fragments_before if learned else None,
+            fragments_after=learned.fragments_after if learned else None,
+            model_before=self.before,
+            model_after=self.after,
+            train_seconds=seconds,
+            target_reached=learned.target_reached if learned else None,
+            curves=self.curves,
+            settings=self.options.settings.as_dict(),
+            output=self.around or self.output,
+            photographs=photographs,
+            drawing=drawing,
+            not_compared=not_compared,
+            already_finished=self.already_finished,
+        )
+
+    def _comparison(self) -> tuple[Photographs | None, dict[str, Any], NotComparedError | None]:
+        """(photographs, drawing, None) to measure the models, or (None, {}, the reason)."""
+        if not self.learned:
+            return None, {}, None
+        try:
+            drawing = self.adapter.drawing(self.repo, self.host.arguments)
+            joint = self.options.stage == "joint"  # the model of before is another training's
+            if not self.after or not (self.before or joint):
+                raise NotComparedError(
+                    f"--stage {self.options.stage}",
+                    f"no model from {'before' if self.after else 'after'} the learning",
+                    "a model that the host saved",
+                    "Name two models to fragprune compare.",
+                )
+            return self.adapter.photographs(self.repo, self.host.arguments), drawing, None
+        except NotComparedError as error:
+            return None, {}, error
+
+    def _densified(self) -> int:
+        """The iteration after which the host's densification is over.
+
+        Raises:
+            UsageError: the host does not tell.
+        """
+        host = self.host
+        end = self.adapter.densified(self.repo, host.script, host.arguments)
+        if end is None:
+            raise UsageError(
+                "--stage joint",
+                f"{self.adapter.info.title}, which does not tell when its densification is over",
+                "the iteration after which thresholds learn",
+                "Add --from-iter.",
+            )
+        return end
+
+    def _learning(self, from_iter: int) -> tuple[int, int, int]:
+        """(resumed, start, last): three iterations of the host.
+
+        The run resumes after iteration ``resumed``, learns after ``start`` and ends with ``last``.
+
+        Args:
+            from_iter: the option, or the end of the host's densification.
+
+        Raises:
+            UsageError: nothing would be learned.
+        """
+        total, file = self.host.iterations, self.host.flags.resume
+        if file:
+            self.adapter.expect_resumable(Path(file))
+        resumed = starting.resumed_at(self.host.line, Path(file)) if file else 0
+        start = max(resumed, from_iter)
+        if start < total - self.host.line.skipped:
+            return resumed, start, total
+        at_end = self.options.from_iter is None and start > resumed
+        where = "densification ends" if at_end else "learning begins"
+        flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
+        raise UsageError(
+            f"--stage {self.options.stage}",
+            f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
+            f"iterations after {start}, where {where}",
+            f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
+        )
+
+    def _model(self, iteration: int) -> Path | None:
+        """The host's PLY of an iteration, or None if the host saved none."""
+        path = self.adapter.model_file(self.output, iteration) if self.output else None
+        return path if path and path.exists() else None
