@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import logging
+import re
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -11,6 +13,12 @@ from typing import Any
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
+
+
+_OPTION = re.compile("-[bBdEiIOPqsSuvx]+|-[WX].*")
+"""Options of the interpreter. Those that name what to run are not among them: ``-c`` and ``-m``."""
+
+log = logging.getLogger("fragprune")
 
 
 @dataclass(frozen=True)
@@ -112,7 +120,7 @@ def split(command: list[str]) -> tuple[Path, list[str], str]:
     """
     words = list(command)
     if words and Path(words[0]).name.startswith("python"):
-        words = words[1:]
+        words = _without_options(words[1:])
     if words[:1] == ["-m"] and len(words) > 1:
         return _script_of(words[1]), words[2:], words[1]
     for entry in entry_points(group="console_scripts", name=words[0]) if words else ():
@@ -130,6 +138,20 @@ def split(command: list[str]) -> tuple[Path, list[str], str]:
             str(script), "no such file", "the host's training script", "Check the path."
         )
     return script, words[1:], ""
+
+
+def _without_options(words: list[str]) -> list[str]:
+    """The words after the interpreter's own options, such as ``-u`` and ``-X dev``."""
+    rest = list(words)
+    while rest and _OPTION.fullmatch(rest[0]):
+        if rest.pop(0) in ("-W", "-X"):
+            rest = rest[1:]
+    if given := words[: len(words) - len(rest)]:
+        log.warning(
+            "python %s: has no effect, because the script runs in the interpreter of fragprune",
+            " ".join(given),
+        )
+    return rest
 
 
 def _script_of(module: str) -> Path:

@@ -46,10 +46,16 @@ def parsed(repo, *arguments):
     return HostCommand.read(Path("train.py"), list(map(str, arguments)), line)
 
 
-@pytest.mark.parametrize("interpreter", [[], ["python"], ["python3.11"], ["/usr/bin/python3"]])
-def test_an_interpreter_in_front_may_be_left_out(host, interpreter):
+@pytest.mark.parametrize(
+    "interpreter",
+    ["", "python", "python3.11", "/usr/bin/python3", "python -u", "python -OO -X dev -Wignore -uB"],
+)
+def test_an_interpreter_in_front_and_its_options_may_be_left_out(host, interpreter, caplog):
     script = host("")
-    assert split([*interpreter, script, "-s", "x"]) == (Path(script), ["-s", "x"], "")
+    assert split([*interpreter.split(), script, "-u", "x"]) == (Path(script), ["-u", "x"], "")
+    options = interpreter.partition(" ")[2]
+    said = [f"python {options}: has no effect" in message for message in caplog.messages]
+    assert said == ([True] if options else [])
 
 
 def test_a_module_is_found_without_importing_its_package(tmp_path, monkeypatch):

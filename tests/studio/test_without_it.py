@@ -108,7 +108,7 @@ def test_what_cannot_be_asked_for_is_refused(words, options, remedy):
 
 
 def test_a_command_that_pip_installed_is_run_as_its_module(monkeypatch):
-    entry = SimpleNamespace(module="fragprune_plugins.workbench.run")
+    entry = SimpleNamespace(module="fragprune_plugins.injection.launch")
     asked = []
 
     def installed(**words):
@@ -117,8 +117,8 @@ def test_a_command_that_pip_installed_is_run_as_its_module(monkeypatch):
 
     monkeypatch.setattr(command, "entry_points", installed)
     script, arguments, module = command.split(["ns-train", "splatfacto", "--x"])
-    assert (arguments, module) == (["splatfacto", "--x"], "fragprune_plugins.workbench.run")
-    assert script.parts[-2:] == ("cli", "run.py")
+    assert (arguments, module) == (["splatfacto", "--x"], "fragprune_plugins.injection.launch")
+    assert script.parts[-2:] == ("injection", "launch.py")
     assert asked == [{"group": "console_scripts", "name": "ns-train"}]
 
 
