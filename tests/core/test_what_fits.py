@@ -35,7 +35,7 @@ def engine(request):
     return create_engine(request.param)
 
 
-@pytest.mark.parametrize("rows", [0, 1, 10, 299, 301])
+@pytest.mark.parametrize("rows", [0, 1, 299, 301])
 def test_thresholds_of_another_model_are_refused_with_both_counts(engine, rows):
     inputs = scenes.random_scene(0, 300)
     with pytest.raises(InputError) as caught:
@@ -44,12 +44,11 @@ def test_thresholds_of_another_model_are_refused_with_both_counts(engine, rows):
     assert "(300,)" in caught.value.expected
 
 
-@pytest.mark.parametrize("how", NONE)
-def test_thresholds_that_are_none_are_refused(engine, how):
-    wrong = NONE[how](scenes.random_thresholds(0, 60))
-    for draw in (engine.rasterize, rasterize):
-        with pytest.raises(InputError, match="thresholds"):
-            draw(scenes.random_scene(0), wrong)
+def test_thresholds_that_are_no_array_are_refused(engine):
+    for how in NONE.values():
+        for draw in (engine.rasterize, rasterize):
+            with pytest.raises(InputError, match="thresholds"):
+                draw(scenes.random_scene(0), how(scenes.random_thresholds(0, 60)))
 
 
 def test_thresholds_may_be_of_any_floating_type(engine):
@@ -77,23 +76,21 @@ FIELDS = [
 ]
 
 
-@pytest.mark.parametrize("how", NONE)
-@pytest.mark.parametrize(("kind", "name"), FIELDS)
-def test_a_field_that_is_no_array_of_its_numbers_is_refused_by_name(kind, name, how):
+@pytest.mark.parametrize("kind", OWNERS)
+def test_a_field_that_is_no_array_of_its_numbers_is_refused_by_name(kind):
     owner = OWNERS[kind]
-    with pytest.raises(InputError, match=name):
-        replace(owner, **{name: NONE[how](getattr(owner, name).detach())})
+    for name in [name for each, name in FIELDS if each == kind]:
+        for how in NONE.values():
+            with pytest.raises(InputError, match=name):
+                replace(owner, **{name: how(getattr(owner, name).detach())})
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [each for each in FIELDS if each[0] not in ("View", "Moment")],
-)
-def test_a_field_of_other_rows_is_refused(kind, name):
+@pytest.mark.parametrize("kind", [kind for kind in OWNERS if kind not in ("View", "Moment")])
+def test_a_field_of_other_rows_is_refused(kind):
     owner = OWNERS[kind]
-    shorter = getattr(owner, name).detach()[:-1]
-    with pytest.raises(InputError, match=r"shape \((19|27),"):
-        replace(owner, **{name: shorter})
+    for name in [name for each, name in FIELDS if each == kind]:
+        with pytest.raises(InputError, match=r"shape \((19|27),"):
+            replace(owner, **{name: getattr(owner, name).detach()[:-1]})
 
 
 def test_tiles_are_whole_numbers():

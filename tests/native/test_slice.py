@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import spacetime
@@ -13,28 +13,27 @@ import fragprune_plugins
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.types import SpacetimeSplats
 
 SIZES = (1, 3, 1024 + 37)
 """Fewer than any register has lanes, and more than one piece of work, the last one odd."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("orders", [None, 0, 1, 2])
-def test_values_and_gradients_are_the_oracles(engine, kind, orders):
-    agree(engine, splats(kind, 200), moment(orders))
+def test_values_and_gradients_are_the_oracles(engine, kind):
+    for orders in (None, 0, 1, 2):
+        agree(engine, splats(kind, 200), moment(orders))
 
 
-@pytest.mark.parametrize("degree", range(3))
-@pytest.mark.parametrize("orders", [None, 2])
-def test_below_degree_3_time_leaves_colours_alone_but_for_one_gradient(engine, degree, orders):
-    given = splats("joint", 100, degree=degree, coefficients=(degree + 1) ** 2)
-    agree(engine, given, moment(orders))
+def test_below_degree_3_time_leaves_colours_alone_but_for_one_gradient(engine):
+    for degree in range(3):
+        given = splats("joint", 100, degree=degree, coefficients=(degree + 1) ** 2)
+        for orders in (None, 2):
+            agree(engine, given, moment(orders))
 
 
-@pytest.mark.parametrize("count", SIZES)
-def test_any_number_of_them(engine, count):
-    agree(engine, splats("joint", count), moment())
+def test_any_number_of_them(engine):
+    for count in SIZES:
+        agree(engine, splats("joint", count), moment())
 
 
 def test_coefficients_that_are_not_in_use_have_no_gradient(engine):
@@ -45,20 +44,20 @@ def test_coefficients_that_are_not_in_use_have_no_gradient(engine):
     assert not by_sh[:, 32:].any()
 
 
-@pytest.mark.parametrize("kind", ["apart", "joint"])
-@pytest.mark.parametrize("prefilter", [0.0, 0.05])
-def test_a_prefilter_widens_the_marginal(engine, kind, prefilter):
-    agree(engine, splats(kind, 60), moment(prefilter_var=prefilter))
+def test_a_prefilter_widens_the_marginal(engine):
+    for kind in ("apart", "joint"):
+        for prefilter in (0.0, 0.05):
+            agree(engine, splats(kind, 60), moment(prefilter_var=prefilter))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_scale_modifier(engine, kind):
-    agree(engine, splats(kind, 60), moment(scale_modifier=0.6))
+def test_the_scale_modifier(engine):
+    for kind in KINDS:
+        agree(engine, splats(kind, 60), moment(scale_modifier=0.6))
 
 
-@pytest.mark.parametrize("output", spacetime.OUTPUTS)
-def test_each_output_has_its_own_gradients(engine, output):
-    agree(engine, splats("joint", 60), moment(), outputs=(output,))
+def test_each_output_has_its_own_gradients(engine):
+    for output in spacetime.OUTPUTS:
+        agree(engine, splats("joint", 60), moment(), outputs=(output,))
 
 
 def test_rotations_are_used_as_given(engine):
@@ -136,13 +135,12 @@ def test_a_fast_gaussian_keeps_its_shape(engine):
     assert ((found.cov3d - expected.cov3d).abs() < 1e-4 * size).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_no_gaussians(engine, kind):
-    given = leaves(splats(kind, 0), torch.float32)
-    cut = engine.slice(given, moment())
-    assert cut.means.shape == (0, 3)
-    assert cut.colors.shape == (0, 3)
-    assert all(len(grad) == 0 for grad in gradients(given, cut).values())
+def test_no_gaussians(engine):
+    for kind in KINDS:
+        given = leaves(splats(kind, 0), torch.float32)
+        cut = engine.slice(given, moment())
+        assert cut.means.shape == cut.colors.shape == (0, 3)
+        assert all(len(grad) == 0 for grad in gradients(given, cut).values())
 
 
 def test_without_harmonics_there_are_no_colours(engine):
@@ -174,19 +172,15 @@ def test_changes_in_place_before_the_way_back_are_noticed(engine):
         cut.cov3d.sum().backward()
 
 
-INPUTS = [f.name for f in fields(SpacetimeSplats) if f.name != "sh_degree"]
-
-
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", INPUTS)
-def test_each_input_alone_has_the_gradient_that_it_has_among_all(engine, kind, name):
+def test_each_input_alone_has_the_gradient_that_it_has_among_all(engine, kind):
     given, when = splats(kind, 40), moment()
-    if getattr(given, name) is None:
-        return
     everything = leaves(given, torch.float32)
-    expected = gradients(everything, engine.slice(everything, when))[name]
-    alone = replace(given, **{name: getattr(everything, name)})
-    assert torch.equal(gradients(alone, engine.slice(alone, when))[name], expected)
+    expected = gradients(everything, engine.slice(everything, when))
+    assert len(expected) >= 5
+    for name in expected:
+        alone = replace(given, **{name: getattr(everything, name)})
+        assert torch.equal(gradients(alone, engine.slice(alone, when))[name], expected[name])
 
 
 def test_the_number_of_threads_changes_no_bit(engine):
