@@ -7,7 +7,7 @@ import pytest
 import torch
 from cli.commands import run as command_line
 from cli.commands import run_json
-from miniatures.runs import OPTIONS, command, edit, frozen_differences, written
+from miniatures.runs import OPTIONS, command, frozen_differences, written
 from miniatures.surfels import SurfelHost
 from miniatures.vanilla_3dgs import joint
 from PIL import Image
@@ -18,7 +18,6 @@ from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError, ModelFileError, UsageError
 from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
@@ -40,14 +39,6 @@ def of(mini, **options):
 
 
 # -- the call ------------------------------------------------------------------------------------
-
-
-def test_a_host_that_draws_no_maps_is_refused(mini, tmp_path):
-    written(SurfelHost, tmp_path)
-    renderer = tmp_path / "gaussian_renderer" / "__init__.py"
-    edit(renderer, "image, radii, allmap = Gauss", "image, radii = Gauss")
-    errors = [f.found for f in SurfelSplatting().match(HostRepo(tmp_path)).findings]
-    assert any("2 values back" in error for error in errors)
 
 
 class Notes:

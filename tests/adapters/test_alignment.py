@@ -6,22 +6,10 @@ from parents to children bit for bit. Thresholds start as a function of that num
 
 from __future__ import annotations
 
-import pytest
 import torch
 from miniatures.vanilla_3dgs import expect_ancestors, joint, label
 
-from fragprune_plugins.errors import AlignmentError
-
 COUNT = 16
-
-
-def test_a_split_in_three_is_followed():
-    with joint() as host:
-        model = host.model(COUNT)
-        label(host, model)
-        model.densify_and_split(torch.ones(COUNT, 1), 0.5, 1e-6, N=3)
-        expect_ancestors(host, model)
-        assert len(model.get_xyz) == 3 * COUNT
 
 
 def test_two_models_have_two_stores():
@@ -34,22 +22,6 @@ def test_two_models_have_two_stores():
         expect_ancestors(host, first)
         expect_ancestors(host, second)
         assert (len(host.store(first)), len(host.store(second))) == (COUNT - 3, 14)
-
-
-def test_children_that_are_not_copies_are_refused_before_the_host_appends(monkeypatch):
-    with joint() as host:
-        model = host.model(COUNT)
-        label(host, model)
-        postfix = type(model).densification_postfix
-
-        def shuffled(self, xyz, features_dc, *rest):
-            return postfix(self, xyz, features_dc.flip(0), *rest)
-
-        monkeypatch.setattr(type(model), "densification_postfix", shuffled)
-        with pytest.raises(AlignmentError, match="not copies of the selected parents"):
-            model.densify_and_clone(torch.ones(COUNT, 1), 0.5, 1e9)
-        expect_ancestors(host, model)
-        assert len(model.get_xyz) == COUNT
 
 
 def test_other_rows_start_over():

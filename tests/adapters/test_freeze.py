@@ -45,16 +45,6 @@ def test_only_what_is_named_moves(train):
         assert host.store(model).steps == 4
 
 
-@pytest.mark.parametrize(("iterations", "warned"), [(2002, True), (2, False)])
-def test_a_model_saved_before_thresholds_open_is_warned_of(iterations, warned, tmp_path, caplog):
-    with running(Settings(iterations=iterations, train="all")) as host:
-        model = host.model(20)
-        model.training_setup(host.arguments)
-        host.step(model, host.camera(), 1)
-        model.save_ply(str(tmp_path / "point_cloud.ply"))
-    assert ("before thresholds open" in caplog.text) == warned
-
-
 def test_before_stage_two_the_host_has_its_way():
     with running(Settings(iterations=9, train="opacity"), from_step=1) as host:
         model, camera = host.model(20), host.camera()

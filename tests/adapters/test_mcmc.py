@@ -10,19 +10,15 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.mcmc import MCMCHost
-from miniatures.runs import OPTIONS, edit, frozen_differences, written
+from miniatures.runs import OPTIONS, frozen_differences, written
 from miniatures.vanilla_3dgs import (
-    expect_ancestors,
-    identity,
     joint,
-    label,
 )
 
 from fragprune_mcmc import MCMC
-from fragprune_plugins.errors import AlignmentError, HostFailed, UsageError
+from fragprune_plugins.errors import HostFailed, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import run
 
 COUNT = 24
@@ -43,42 +39,7 @@ def of(mini, **options):
 MODEL = "scene/gaussian_model.py"
 
 
-@pytest.mark.parametrize(
-    ("file", "old", "new", "code"),
-    [
-        ("utils/reloc_utils.py", "compute_relocation", "another", "other-host"),
-        ("gaussian_renderer/__init__.py", "radii, is_used =", "radii =", "rasterizer-call"),
-        (
-            "gaussian_renderer/__init__.py",
-            "GaussianRasterizationSettings(",
-            "S(",
-            "rasterizer-call",
-        ),
-    ],
-)
-def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, code):
-    edit(written(MCMCHost, tmp_path) / file, old, new)
-    match = MCMC().match(HostRepo(tmp_path))
-    assert [f.code for f in match.findings if f.level == "error"] == [code]
-
-
 # -- rows ----------------------------------------------------------------------------------------
-
-
-def test_relocated_rows_and_their_parents_start_without_moments(mini):
-    """The host empties its parents' moments; ours of the row that is no more go as well."""
-    with joint(**of(mini)) as host:
-        model = host.model(COUNT)
-        host.step(model, host.camera(), 1)
-        label(host, model)
-        dead = torch.arange(COUNT) % 3 == 0
-        with torch.no_grad():
-            model.relocate_gs(dead_mask=dead)
-        touched = torch.isin(torch.arange(COUNT), identity(model)[dead]) | dead
-        moments = host.store(model).state_dict()["exp_avg"]
-        assert (identity(model)[dead] % 3 != 0).all()
-        assert torch.equal(moments != 0, ~touched)
-        assert torch.equal(identity(model)[~dead], torch.arange(COUNT)[~dead])
 
 
 def test_parents_of_a_relocation_are_not_taken_for_those_of_a_later_append(mini):
@@ -93,30 +54,6 @@ def test_parents_of_a_relocation_are_not_taken_for_those_of_a_later_append(mini)
         values = host.store(model).values.detach()
         assert len(values) == COUNT + 2
         assert (values[-2:] < 1e-12).all()  # neutral: nobody's children
-
-
-def test_a_relocation_that_copies_otherwise_is_refused(mini, monkeypatch):
-    with joint(**of(mini)) as host:
-        model = host.model(COUNT)
-        host.step(model, host.camera(), 1)
-        label(host, model)
-        kind = type(model)
-        params = kind._update_params
-
-        def shuffled(self, idxs, ratio):
-            xyz, colours, *rest = params(self, idxs, ratio)
-            return xyz, colours.flip(0), *rest
-
-        monkeypatch.setattr(kind, "_update_params", shuffled)
-        before = host.store(model).state_dict()["logits"]
-        with torch.no_grad(), pytest.raises(AlignmentError, match="its relocation differs"):
-            model.relocate_gs(dead_mask=torch.arange(COUNT) < 9)
-        assert torch.equal(host.store(model).state_dict()["logits"], before)
-        label(host, model)
-        with torch.no_grad():
-            monkeypatch.undo()
-            model.relocate_gs(dead_mask=torch.arange(COUNT) < 9)  # nothing was left pending
-        expect_ancestors(host, model)
 
 
 def test_the_dialect_gives_three_outputs_and_thresholds_leave_radii_and_use_alone(mini):
@@ -168,15 +105,6 @@ def test_joint_learning_through_relocation_and_addition(mini, photographs, tmp_p
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == len(read_ply(summary.model_after).xyz) > 150
     assert not store.neutral
-
-
-def test_frozen_from_an_iteration_on(mini, photographs, tmp_path):
-    options = replace(OPTIONS, stage="finetune", from_iter=12)
-    more = (*CAP, "--checkpoint_iterations", 12, "--densify_until_iter", 99)
-    out = tmp_path / "out"
-    summary = run(command(mini, photographs, out, 20, *more), options)
-    capture, _ = torch.load(out / "chkpnt12.pth", weights_only=False)
-    assert torch.equal(capture[1].detach(), read_ply(summary.model_after).xyz)
 
 
 # -- the host's own refusals, and files over the command line --------------------------------------

@@ -51,13 +51,6 @@ def test_a_scripts_folder_lies_in_its_host(mini):
 RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
 
 
-def test_a_missing_script_is_named(tmp_path):
-    MiniSplattingHost().write(tmp_path)
-    (tmp_path / "ms_d/train.py").unlink()
-    match = MiniSplatting().match(HostRepo(tmp_path))
-    assert "no ms_d/train.py" in str(match.findings[0])
-
-
 # -- scores --------------------------------------------------------------------------------------
 
 

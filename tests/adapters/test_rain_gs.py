@@ -12,11 +12,10 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.rain_gs import RainHost
-from miniatures.runs import OPTIONS, edit, frozen_differences, written
+from miniatures.runs import OPTIONS, frozen_differences, written
 from miniatures.vanilla_3dgs import expect_ancestors, identity, joint, label, running
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
@@ -38,21 +37,6 @@ def of(mini, **options):
 
 
 # -- which host, and its rasterizer ----------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("file", "old", "new", "found"),
-    [
-        ("gaussian_renderer/__init__.py", "low_pass=low_pass,\n", "", "the shared settings alone"),
-        ("scene/gaussian_model.py", "abe_split", "far", "far)"),
-        ("scene/gaussian_model.py", "divide_ratio", "ratio", "no divide_ratio"),
-        ("scene/__init__.py", "args_dict", "options", "no args_dict"),
-    ],
-)
-def test_a_changed_host_is_refused_by_what_changed(tmp_path, file, old, new, found):
-    edit(written(RainHost, tmp_path) / file, old, new)
-    errors = [f.found for f in RainGS().match(HostRepo(tmp_path)).findings]
-    assert any(found in error for error in errors)
 
 
 def test_our_rasterizer_answers_before_anything_is_compiled_and_leaves_again(mini):
@@ -139,15 +123,6 @@ def test_a_far_split_appends_twice_and_every_child_has_its_parents_threshold(min
         assert not torch.isin(identity(model)[: COUNT - split], torch.arange(0, COUNT, 3)).any()
 
 
-def test_a_split_that_forgets_one_of_its_appends_is_refused(mini, monkeypatch):
-    with joint(**of(mini)) as host:
-        model = host.model(COUNT)
-        label(host, model)
-        monkeypatch.setattr(type(model), "_split_near", lambda *_: None)
-        with pytest.raises(AlignmentError, match=f"{2 * COUNT} selected parents without a child"):
-            model.densify_and_split(torch.ones(COUNT, 1), 0.5, 1e-6, abe_split=True)
-
-
 # -- whole runs ----------------------------------------------------------------------------------
 
 
@@ -200,15 +175,6 @@ def test_iterations_are_counted_where_the_host_sets_no_rate(mini, scene, tmp_pat
     assert [c["step"] for c in summary.curves] == list(range(16, 24))
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == len(read_ply(summary.model_after).xyz)
-
-
-def test_frozen_from_an_iteration_on_in_the_newer_mode(mini, scene, tmp_path):
-    options = replace(OPTIONS, stage="finetune", from_iter=18)
-    words = command(mini, scene, tmp_path / "out", 24, "--ours_new", "--checkpoint_iterations", 18)
-    summary = run(words, options)
-    capture, _ = torch.load(tmp_path / "out" / "chkpnt18.pth", weights_only=False)
-    assert torch.equal(capture[1].detach(), read_ply(summary.model_after).xyz)
-    assert summary.iterations == 5  # of 19 to 24: hosts take no step in the last
 
 
 def test_an_experiments_name_is_enough_to_find_its_folder(mini, scene, tmp_path, monkeypatch):

@@ -293,14 +293,6 @@ def test_joint_learning_follows_rows_through_densification(mini, config, tmp_pat
     assert summary.iterations == 12
 
 
-def test_frozen_from_an_iteration_on(mini, config, tmp_path):
-    options = RunOptions(**OPTIONS, stage="finetune", from_iter=8)
-    run(command(mini, config(iterations=14), "--save_iterations", 10), options)
-    ten, last = (load(tmp_path / "out" / f"chkpnt{i}.pth")[0] for i in (10, 14))
-    assert torch.equal(ten[1], last[1])
-    assert not torch.equal(ten[6], last[6])
-
-
 def test_the_sky_comes_back_and_stands_still(mini, config, tmp_path):
     """The loop makes a new environment map after it has restored the old one."""
     summary = run(command(mini, config(sky=1)), RunOptions(**OPTIONS))

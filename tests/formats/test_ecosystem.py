@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from campaigns.fuzz.seeds import spz_parts
 from formats.scenes import apart, random_splat
-from fuzz.seeds import spz_parts
 
 from fragprune_plugins import Model, ThresholdStore, load, save
 from fragprune_plugins.files.ply import write_ply

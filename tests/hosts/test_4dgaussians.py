@@ -15,8 +15,6 @@ import pytest
 from hosts.test_checkouts import each_of
 
 from fragprune_4dgaussians import MovingGaussians
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -61,17 +59,6 @@ with contextlib.redirect_stdout(sys.stderr):
     }
 print(json.dumps(report))
 """
-
-
-@every_moving
-def test_every_seam_is_found_and_vanilla_refuses_it(host):
-    adapter, repo = MovingGaussians(), HostRepo(host)
-    assert adapter.match(repo).fits
-    dialect = adapter.dialect(repo)
-    assert (len(dialect.settings), dialect.outputs) == (12, 3)
-    assert adapter.command_line(repo).default_iterations == 30_000
-    assert adapter.densified(repo, host / "train.py", []) == 15_000
-    assert not Vanilla3DGS().match(repo).fits
 
 
 @every_moving

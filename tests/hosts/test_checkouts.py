@@ -18,6 +18,7 @@ from fragprune_2dgs import SurfelSplatting
 from fragprune_mcmc import MCMC
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.testing.conformance import found_adapter
 from fragprune_rain_gs import RainGS
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -43,27 +44,39 @@ def each_of(*adapters):
 
 
 every_vanilla = each_of(Vanilla3DGS())
-every_mcmc = each_of(MCMC())
-every_mip = each_of(MipSplatting())
-every_rain = each_of(RainGS())
-every_surfel = each_of(SurfelSplatting())
 every_host = each_of(Vanilla3DGS(), MCMC(), MipSplatting(), RainGS(), SurfelSplatting())
 every_renderer = each_of(Vanilla3DGS(), MCMC(), MipSplatting())  # RAIN-GS's fails by itself
 
 
-def flags(host: Path) -> list[str]:
-    """What a host needs, or refuses, beyond the flags that all have."""
-    repo = HostRepo(host)
-    if MCMC().match(repo).fits:
-        return ["--cap_max", "3100", "--init_type", "sfm"]
-    return ["--port", "0", *(["--exp_name", "a"] if RainGS().match(repo).fits else [])]
+DIALECTS = {  # settings, and values that come back
+    "2dgs": (12, 3),
+    "4dgaussians": (12, 3),
+    "light-gaussian": (13, 2),
+    "mcmc": (12, 3),
+    "mini-splatting": (12, 2),
+    "mip-splatting": (14, 2),
+    "rain-gs": (13, 3),
+    "rt-4dgs": (18, 6),
+}
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_every_dialect_is_read_and_vanillas_adapter_keeps_out(name):
+    adapter = found_adapter(name)
+    folders = Path(FOLDER).iterdir() if FOLDER else ()
+    hosts = [repo for each in folders if adapter.match(repo := HostRepo(each)).fits]
+    if not hosts:
+        pytest.skip(f"FRAGPRUNE_HOSTS names no folder with a checkout of {name} in it")
+    for repo in hosts:
+        dialect = adapter.dialect(repo)
+        assert (len(dialect.settings), dialect.outputs) == DIALECTS[name]
+        assert adapter.command_line(repo).default_iterations == 30_000
+        assert not Vanilla3DGS().match(repo).fits
 
 
 @every_vanilla
-def test_every_seam_is_found_and_the_state_is_a_known_one(host):
+def test_the_state_of_vanilla_is_a_known_one(host):
     adapter, repo = Vanilla3DGS(), HostRepo(host)
-    match = adapter.match(repo)
-    assert match.fits, [str(finding) for finding in match.findings]
     state = adapter.revision(repo)
     assert state in STATES
     dialect = adapter.dialect(repo)
@@ -73,41 +86,12 @@ def test_every_seam_is_found_and_the_state_is_a_known_one(host):
     assert adapter.command_line(repo).default_iterations == 30_000
 
 
-@every_mcmc
-def test_mcmcs_dialect_is_read_and_vanillas_adapter_keeps_out(host):
-    adapter, repo = MCMC(), HostRepo(host)
-    dialect = adapter.dialect(repo)
-    assert (len(dialect.settings), dialect.outputs, dialect.sparse_adam) == (12, 3, False)
-    assert adapter.command_line(repo).default_iterations == 30_000
-    assert not Vanilla3DGS().match(repo).fits
-
-
-@every_mip
-def test_mip_splattings_dialect_is_read_and_vanillas_adapter_keeps_out(host):
-    adapter, repo = MipSplatting(), HostRepo(host)
-    dialect = adapter.dialect(repo)
-    assert (len(dialect.settings), dialect.outputs, dialect.sparse_adam) == (14, 2, False)
-    assert adapter.drawing(repo, ["--eval"]) == {"dilation": 0.1, "compensation": "mip"}
-    assert not Vanilla3DGS().match(repo).fits
-
-
-@every_rain
-def test_rain_gss_dialect_is_read_and_vanillas_adapter_keeps_out(host):
-    adapter, repo = RainGS(), HostRepo(host)
-    dialect = adapter.dialect(repo)
-    assert (len(dialect.settings), dialect.outputs, dialect.sparse_adam) == (13, 3, False)
-    assert dialect.settings[-1] == "low_pass"
-    assert not Vanilla3DGS().match(repo).fits
-
-
-@every_surfel
-def test_the_dialect_of_surfels_is_read_and_vanillas_adapter_keeps_out(host):
-    adapter, repo = SurfelSplatting(), HostRepo(host)
-    dialect = adapter.dialect(repo)
-    assert (dialect.package, dialect.outputs) == ("diff_surfel_rasterization", 3)
-    assert len(dialect.settings) == 12
-    assert adapter.densified(repo, repo.root / "train.py", []) == 15_000
-    assert not Vanilla3DGS().match(repo).fits
+def flags(host: Path) -> list[str]:
+    """What a host needs, or refuses, beyond the flags that all have."""
+    repo = HostRepo(host)
+    if MCMC().match(repo).fits:
+        return ["--cap_max", "3100", "--init_type", "sfm"]
+    return ["--port", "0", *(["--exp_name", "a"] if RainGS().match(repo).fits else [])]
 
 
 TORCHVISION = """
@@ -186,132 +170,6 @@ def test_training_then_fine_tuning_moves_only_what_is_named(host, dataset, tmp_p
     assert not report["neutral"]
     before, after = report["fragments"]
     assert after < before
-
-
-PARENTS = """
-import json, sys
-from pathlib import Path
-from types import SimpleNamespace
-from importlib import import_module
-import numpy as np, torch
-torch.set_num_threads(1)
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_rain_gs import RainGS
-from fragprune_plugins.injection.cpu_only import cpu_only
-from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.learning.schedule import JointSchedule, Settings
-from fragprune_plugins.injection.session import Session
-from fragprune_vanilla_3dgs import Vanilla3DGS
-
-root, settings = Path(sys.argv[1]), Settings(iterations=9, train="opacity")
-sys.path.insert(0, str(root))
-session = Session(
-    Vanilla3DGS(), HostRepo(root), load_plugins(), settings,
-    schedule=JointSchedule(settings, 1), freeze=False, drop_in=True,
-)
-checked = 0
-with cpu_only(), session:
-    from argparse import ArgumentParser
-    parser = ArgumentParser()
-    group = import_module("arguments").OptimizationParams(parser)
-    arguments = group.extract(parser.parse_args([]))
-    model = import_module("scene.gaussian_model").GaussianModel(1)
-    rng = np.random.default_rng(0)
-    cloud = SimpleNamespace(points=rng.uniform(-1, 1, (60, 3)), colors=rng.uniform(0, 1, (60, 3)))
-    late = "2024" in session.adapter.revision(session.repo)
-    cameras = [SimpleNamespace(image_name="a")]
-    model.create_from_pcd(cloud, *([cameras] if late else []), 1.0)
-    model.training_setup(arguments)
-    store = session.store(model)
-    with torch.no_grad():
-        numbers = torch.arange(60).float()
-        model._features_dc[:, 0, 0] = numbers
-        store.logits.copy_(-3 + numbers / 16)
-    for round in range(5):
-        n = len(model.get_xyz)
-        generator = torch.Generator().manual_seed(round)
-        model.xyz_gradient_accum = torch.rand(n, 1, generator=generator)
-        model.denom = (torch.rand(n, 1, generator=generator) < 0.8).float()
-        with torch.no_grad():
-            model._opacity[torch.rand(n, generator=generator) < 0.3] = -9.0
-        takes_radii = "radii" in session.repo.parameters(
-            "scene.gaussian_model", "GaussianModel.densify_and_prune"
-        )
-        radii = [torch.ones(n)] if takes_radii else []
-        model.densify_and_prune(0.7, 0.005, 3.0 if round % 2 else 100.0, 20, *radii)
-        identity = model._features_dc.detach()[:, 0, 0].round()
-        assert len(store) == len(model.get_xyz)
-        assert torch.equal(store.logits.detach(), -3 + identity / 16), round
-        checked += len(store) != n
-print(json.dumps(checked))
-"""
-
-
-@every_vanilla
-def test_rows_follow_the_hosts_own_densification(host, python):
-    """With seven arguments to densification_postfix, or six: thresholds are the ancestors'."""
-    assert python(PARENTS, host) >= 3
-
-
-RELOCATION = """
-import json, sys
-from pathlib import Path
-from types import SimpleNamespace
-from importlib import import_module
-import numpy as np, torch
-torch.set_num_threads(1)
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_rain_gs import RainGS
-from fragprune_plugins.injection.cpu_only import cpu_only
-from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.learning.schedule import JointSchedule, Settings
-from fragprune_plugins.injection.session import Session
-from fragprune_mcmc import MCMC
-from fragprune_mip_splatting import MipSplatting
-
-root, settings = Path(sys.argv[1]), Settings(iterations=9, train="opacity")
-sys.path.insert(0, str(root))
-session = Session(
-    MCMC(), HostRepo(root), load_plugins(), settings,
-    schedule=JointSchedule(settings, 1), freeze=False, drop_in=True,
-)
-moved = 0
-with cpu_only(), session:
-    from argparse import ArgumentParser
-    parser = ArgumentParser()
-    group = import_module("arguments").OptimizationParams(parser)
-    model = import_module("scene.gaussian_model").GaussianModel(1)
-    rng = np.random.default_rng(0)
-    cloud = SimpleNamespace(points=rng.uniform(-1, 1, (60, 3)), colors=rng.uniform(0, 1, (60, 3)))
-    model.create_from_pcd(cloud, 1.0)
-    model.training_setup(group.extract(parser.parse_args([])))
-    store = session.store(model)
-    sum(group["params"][0].sum() for group in model.optimizer.param_groups).backward()
-    model.optimizer.step()  # the host's relocation needs moments
-    with torch.no_grad():
-        numbers = torch.arange(60).float()
-        model._features_dc[:, 0, 0] = numbers
-        store.logits.copy_(-3 + numbers / 16)
-        for round in range(6):
-            n = len(model.get_xyz)
-            dead = torch.rand(n, generator=torch.Generator().manual_seed(round)) < 0.3
-            before = model._features_dc[:, 0, 0].clone()
-            model.relocate_gs(dead_mask=dead)
-            moved += int((model._features_dc[:, 0, 0] != before).sum())
-            grown = model.add_new_gs(cap_max=70)
-            identity = model._features_dc[:, 0, 0].round()
-            assert len(store) == len(model.get_xyz) == n + grown
-            assert torch.equal(store.logits.detach(), -3 + identity / 16), round
-    assert len(store) == 70
-    assert all(torch.isfinite(g["params"][0]).all() for g in model.optimizer.param_groups)
-print(json.dumps(moved))
-"""
-
-
-@every_mcmc
-def test_rows_follow_the_hosts_own_relocation_and_addition(host, python):
-    """Parents are the ones it drew at random; relocation leaves the count as it is."""
-    assert python(RELOCATION, host) > 30
 
 
 RENDER = (

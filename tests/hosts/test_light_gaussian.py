@@ -9,7 +9,6 @@ import pytest
 
 from fragprune_light_gaussian import LightGaussian
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -26,15 +25,6 @@ def host(request):
     if request.param is None:
         pytest.skip("FRAGPRUNE_HOSTS names no folder with a checkout of LightGaussian in it")
     return request.param
-
-
-def test_every_seam_is_found_and_vanilla_refuses_it(host):
-    adapter, repo = LightGaussian(), HostRepo(host)
-    assert adapter.match(repo).fits
-    assert adapter.dialect(repo).settings[-1] == "f_count"
-    assert len(adapter.dialect(repo).settings) == 13
-    assert adapter.command_line(repo).default_iterations == 30_000
-    assert not Vanilla3DGS().match(repo).fits
 
 
 RUN = """

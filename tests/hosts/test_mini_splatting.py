@@ -9,7 +9,6 @@ import pytest
 
 from fragprune_mini_splatting import MiniSplatting
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -26,14 +25,6 @@ def host(request):
     if request.param is None:
         pytest.skip("FRAGPRUNE_HOSTS names no folder with a checkout of Mini-Splatting in it")
     return request.param
-
-
-def test_every_seam_is_found_and_vanilla_refuses_it(host):
-    adapter, repo = MiniSplatting(), HostRepo(host)
-    assert adapter.match(repo).fits
-    assert (len(adapter.dialect(repo).settings), adapter.dialect(repo).outputs) == (12, 2)
-    assert adapter.command_line(repo).default_iterations == 30_000
-    assert not Vanilla3DGS().match(repo).fits
 
 
 RUN = """

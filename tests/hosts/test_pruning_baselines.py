@@ -8,15 +8,12 @@ import pytest
 from hosts.test_checkouts import RUN, each_of
 
 from fragprune_lp_3dgs import LP3DGS
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_speedy_splat import SpeedySplat
-from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 every_speedy = each_of(SpeedySplat())
 every_lp = each_of(LP3DGS())
-every_baseline = each_of(SpeedySplat(), LP3DGS())
 draws = pytest.mark.skipif(
     find_spec("torchvision") is None, reason="the host imports torchvision.transforms"
 )
@@ -29,14 +26,6 @@ def expect_opacities_moved_alone(report):
     assert not report["neutral"]
     before, after = report["fragments"]
     assert after < before
-
-
-@every_baseline
-def test_every_seam_is_found_and_vanilla_refuses_it(host):
-    adapter = next(a for a in (SpeedySplat(), LP3DGS()) if a.match(HostRepo(host)).fits)
-    repo = HostRepo(host)
-    assert adapter.command_line(repo).default_iterations == 30_000
-    assert not Vanilla3DGS().match(repo).fits
 
 
 @every_speedy

@@ -11,9 +11,7 @@ from pathlib import Path
 import pytest
 from hosts.test_checkouts import each_of
 
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_rt_4dgs import RT4DGS
-from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -22,15 +20,6 @@ every_rt = each_of(RT4DGS())
 FRAMES = Path(__file__).parents[2] / "docs" / "how-to" / "rt_4dgs_frames.py"
 
 NEEDS = ("omegaconf", "imagesize", "kornia", "torchmetrics", "torchvision")
-
-
-@every_rt
-def test_every_seam_is_found_and_vanilla_refuses_it(host):
-    adapter, repo = RT4DGS(), HostRepo(host)
-    assert adapter.match(repo).fits
-    assert len(adapter.dialect(repo).settings) == 18
-    assert adapter.command_line(repo).default_iterations == 30_000
-    assert not Vanilla3DGS().match(repo).fits
 
 
 YAML = """

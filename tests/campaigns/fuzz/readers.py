@@ -11,8 +11,8 @@ from pathlib import Path
 
 import click
 import torch
+from campaigns.fuzz import seeds
 from finetune import tiny
-from fuzz import seeds
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.engines import create_engine

@@ -1,5 +1,8 @@
-"""``cd tests && python -m fuzz``: feeds broken files to every reader. The exit code is 1 if any
-reader raises what is not ours, gives nonsense, takes more than a minute or a gibibyte, or dies."""
+"""``cd tests && python -m campaigns.fuzz``: feeds broken files to every reader.
+
+The exit code is 1 if any reader raises what is not ours, gives nonsense, takes more than a minute
+or a gibibyte, or dies.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,17 @@ import time
 from pathlib import Path
 
 import torch
-from fuzz.readers import BY_NAME
-from fuzz.running import BAD, Tally, run
+from campaigns.fuzz.readers import BY_NAME
+from campaigns.fuzz.running import BAD, Tally, run
 
 
 def main() -> int:
     """Run, print a table, and keep the inputs that broke something."""
-    parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m campaigns.fuzz", description=__doc__)
     parser.add_argument("readers", nargs="*", help=f"of {', '.join(BY_NAME)}; default: all")
     parser.add_argument("--inputs", type=int, default=2000, help="of each reader (2000)")
     parser.add_argument("--seconds", type=float, default=1e9, help="for each reader")
     parser.add_argument("--seed", type=int, default=int(time.time()), help="default: the clock")
-    parser.add_argument("--guided", action="store_true", help="keep what reaches new lines; slower")
     parser.add_argument("--keep", type=Path, default=Path("fuzz-found"), help="folder for findings")
     words = parser.parse_args()
     if unknown := set(words.readers) - BY_NAME.keys():
@@ -30,7 +32,7 @@ def main() -> int:
     print(f"{'reader':<14}{'inputs':>9}{'read':>9}{'stated':>9}" + "".join(f"{b:>9}" for b in BAD))
     every = Tally()
     for name in words.readers or BY_NAME:
-        how = {"seed": words.seed, "seconds": words.seconds, "guided": words.guided}
+        how = {"seed": words.seed, "seconds": words.seconds}
         tally = run(BY_NAME[name], words.inputs, **how)
         print(row(name, tally), flush=True)
         every.outcomes += tally.outcomes

@@ -17,8 +17,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fuzz.mutate import mutated
-from fuzz.readers import Nonsense, Reader
+from campaigns.fuzz.mutate import mutated
+from campaigns.fuzz.readers import Nonsense, Reader
 
 import fragprune_plugins
 from fragprune_plugins.errors import FragpruneError
@@ -109,16 +109,14 @@ def _place(error: BaseException) -> str:
 
 
 def inputs(pool: list[bytes], name: str, seed: int, first: int) -> Iterator[tuple[int, bytes]]:
-    """Inputs of a seed, from a number on; ``pool`` may grow meanwhile."""
+    """Inputs of a seed, from a number on."""
     number = first
     while True:
         yield number, mutated(random.Random(f"{seed} {name} {number}"), pool)
         number += 1
 
 
-def run(
-    reader: Reader, count: int, *, seed: int = 0, seconds: float = 1e9, guided: bool = False
-) -> Tally:
+def run(reader: Reader, count: int, *, seed: int = 0, seconds: float = 1e9) -> Tally:
     """Feed up to ``count`` inputs to a reader, for up to so many seconds.
 
     Args:
@@ -126,7 +124,6 @@ def run(
         count: inputs.
         seed: of the inputs.
         seconds: wall clock, for all.
-        guided: keep inputs that reach new lines of ours, and change those further. It is slower.
     """
     tally, folder = Tally(), scratch()
     shared = mmap.mmap(-1, _STATE.size)
@@ -134,7 +131,7 @@ def run(
     try:
         first = 0
         while first < count and time.monotonic() < end:
-            first = _child(reader, tally, folder, shared, (first, count, seed, end, guided))
+            first = _child(reader, tally, folder, shared, (first, count, seed, end))
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return tally
@@ -145,7 +142,7 @@ def _child(
     tally: Tally,
     folder: Path,
     shared: mmap.mmap,
-    task: tuple[int, int, int, float, bool],
+    task: tuple[int, int, int, float],
 ) -> int:
     """Let one child go on until it ends; returns the number of the next input."""
     first, count, *_ = task
@@ -189,7 +186,6 @@ def _feed(
     count: int,
     seed: int,
     end: float,
-    guided: bool,
 ) -> None:
     """In the child: one input after the other, until the count or the time is up."""
     import warnings
@@ -201,46 +197,13 @@ def _feed(
         limit = pages * resource.getpagesize() + MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    pool = reader.pool()
-    lines = _Lines() if guided else None
     with (folder / "log").open("w", encoding="utf-8") as log:
-        for number, content in inputs(pool, reader.name, seed, first):
+        for number, content in inputs(reader.pool(), reader.name, seed, first):
             if number >= count or time.monotonic() > end:
                 break
             (folder / "current").write_bytes(content)
             shared[:] = _STATE.pack(number, time.monotonic())
-            if lines is None:
-                kind, words = judge(reader, content, folder / "input")
-            else:
-                with lines:
-                    kind, words = judge(reader, content, folder / "input")
-                if lines.fresh and len(pool) < 5000:
-                    pool.append(content)
+            kind, words = judge(reader, content, folder / "input")
             kept = content.hex() if kind in BAD else ""
             log.write(f"{kind}\t{' '.join(words.split()) if kind in BAD else ''}\t{kept}\n")
             log.flush()
-
-
-class _Lines:
-    """Which lines of ours were ever run; ``fresh`` says whether the last block ran new ones."""
-
-    def __init__(self) -> None:
-        self.seen: set[tuple[object, int]] = set()
-        self.fresh = False
-
-    def __enter__(self) -> None:
-        self.fresh = False
-        sys.settrace(self._call)
-
-    def __exit__(self, *error: object) -> None:
-        sys.settrace(None)
-
-    def _call(self, frame, event, arg):
-        return self._line if frame.f_code.co_filename.startswith(_OURS) else None
-
-    def _line(self, frame, event, arg):
-        key = frame.f_code, frame.f_lineno
-        if key not in self.seen:
-            self.seen.add(key)
-            self.fresh = True
-        return self._line

@@ -1,6 +1,6 @@
 """Broken files: every reader reads its seeds, states what is wrong with others, and nothing else.
 
-Seconds of it; ``python -m fuzz`` has the hours.
+Seconds of it; ``python -m campaigns.fuzz`` has the hours.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import os
 import signal
 
 import pytest
-from fuzz import seeds
-from fuzz.readers import READERS, Reader
-from fuzz.running import BAD, GOOD, Nonsense, inputs, judge, run
+from campaigns.fuzz import seeds
+from campaigns.fuzz.readers import READERS, Reader
+from campaigns.fuzz.running import BAD, GOOD, Nonsense, inputs, judge, run
 
 from fragprune_plugins.errors import RecordError
 
@@ -85,5 +85,5 @@ def test_a_reader_that_hangs_is_ended(monkeypatch):
         while True:
             pass
 
-    monkeypatch.setattr("fuzz.running.HANG", 0.2)
+    monkeypatch.setattr("campaigns.fuzz.running.HANG", 0.2)
     assert run(Reader("git", hang), 2).outcomes == {"hang": 2}

@@ -1,4 +1,4 @@
-"""Makes the corpus: small good files of every kind that is read. ``python -m fuzz.seeds``.
+"""Makes the corpus, small good files of every kind: ``python -m campaigns.fuzz.seeds``.
 
 All of it is our own, made from numbers. Files named ``found-*`` are inputs that once broke a
 reader; nothing here makes or removes them.

@@ -1,4 +1,4 @@
-"""``python -m tests.mutation``: changes the code a little, and counts how often the tests notice.
+"""``python -m tests.campaigns.mutation``: changes the code, and counts how often tests notice.
 
 mutmut makes and runs the mutants; ``[tool.mutmut]`` in ``pyproject.toml`` names modules and tests.
 This command draws a sample of them, because all take hours, and prints a table. The exit code is 1
@@ -30,7 +30,7 @@ ENDED = ("killed", "out of time")
 
 def main() -> int:
     """Make mutants, run a sample of each module, and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.mutation", description=__doc__)
     parser.add_argument("modules", nargs="*", help="parts of their names; default: all")
     parser.add_argument("--sample", type=int, default=60, help="mutants of each (60); 0: all")
     parser.add_argument("--seed", type=int, default=0, help="of the sample (0)")
