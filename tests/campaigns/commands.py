@@ -30,6 +30,7 @@ from typing import Any
 import torch
 from campaigns.fuzz.mutate import mutated
 from click.testing import CliRunner
+from core.hostile import camera_entry
 from finetune import tiny
 
 from fragprune_plugins.files import sidecar
@@ -141,10 +142,7 @@ class Scene:
         ended = in_child(lambda: command(*self.words("finetune")))
         if ended[0] not in FINE[::2]:
             raise RuntimeError(f"finetune of a good scene: {ended}")
-        view = tiny.cameras(1)[0]
-        camera = {"id": 0, "img_name": "a", "width": view.width, "height": view.height}
-        camera |= {"position": [0, 0, -3], "rotation": torch.eye(3).tolist(), "fx": 36, "fy": 36}
-        (self.folder / "cameras.json").write_text(json.dumps([camera]))
+        (self.folder / "cameras.json").write_text(json.dumps([camera_entry()]))
 
     def words(self, name: str) -> list[object]:
         """The words of a command that reads the scene."""

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from attack.hostile import EYE, GEOMETRY, NAN, camera_entry, header, image_record, png, special
+from core.hostile import EYE, GEOMETRY, NAN, camera_entry, header, image_record, png, special
 from finetune import tiny
 from safetensors.torch import load_file, save_file
 
