@@ -14,7 +14,6 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 
-
 _OPTION = re.compile("-[bBdEiIOPqsSuvx]+|-[WX].*")
 """Options of the interpreter. Those that name what to run are not among them: ``-c`` and ``-m``."""
 

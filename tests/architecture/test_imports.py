@@ -65,7 +65,7 @@ MODULES = [
 def test_the_outer_rooms_import_without_torch(python):
     core = (
         "adapting constants errors types hosts.adapter hosts.choosing hosts.graphdeco hosts.seams "
-        "hosts.source injection.launch injection.patching learning.pressure learning.schedule "
+        "hosts.source injection.patching learning.pressure learning.schedule "
         "plugins.hookspecs plugins.loading files.atomic"
     )
     light = [
