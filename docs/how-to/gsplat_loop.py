@@ -41,8 +41,8 @@ import torch  # noqa: E402
 from plyfile import PlyData  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
+from fragprune_plugins.engines.losses import photometric_loss  # noqa: E402
 from fragprune_plugins.files.ply import read_ply  # noqa: E402
-from fragprune_plugins.learning.losses import photometric_loss  # noqa: E402
 from fragprune_plugins.types import View  # noqa: E402
 from fragprune_plugins.workbench.scenes.dataset import load_dataset  # noqa: E402
 

@@ -229,6 +229,15 @@ def test_another_configuration_is_refused_and_named(
     assert path.read_bytes() == before
 
 
+def test_another_code_for_the_loss_is_refused(model, dataset, tmp_path, monkeypatch):
+    """Its last bits differ."""
+    settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
+    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch)
+    monkeypatch.setattr(loop, "code_for", lambda _: "another")
+    with pytest.raises(CheckpointError, match="with other loss; "):
+        run(model, dataset, settings, path)
+
+
 def test_another_model_photographs_or_thresholds_are_refused(
     model, truth, dataset, tmp_path, monkeypatch
 ):

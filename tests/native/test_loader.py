@@ -39,7 +39,7 @@ def test_header_and_python_hold_the_same_constants() -> None:
     "mirror",
     [
         *(binding.Inputs, binding.Outputs, binding.OutputGrads, binding.InputGrads, binding.Error),
-        *(binding.Spacetime, binding.Sliced, binding.SpacetimeGrads),
+        *(binding.Spacetime, binding.Sliced, binding.SpacetimeGrads, binding.Photometric),
     ],
 )
 def test_header_and_python_hold_the_same_structs(mirror: type[ctypes.Structure]) -> None:

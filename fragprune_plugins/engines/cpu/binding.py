@@ -175,6 +175,23 @@ class SpacetimeGrads(_Sized):
     )
 
 
+class Photometric(_Sized):
+    """fragprune_photometric."""
+
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        ("threads", ctypes.c_int32),
+        ("channels", ctypes.c_int32),
+        ("height", ctypes.c_int32),
+        ("width", ctypes.c_int32),
+        ("l1_weight", ctypes.c_float),
+        ("ssim_weight", ctypes.c_float),
+        *_pointers("image target gradient workspace"),
+        ("l1", ctypes.c_double),
+        ("dissimilarity", ctypes.c_double),
+    )
+
+
 @dataclass(frozen=True)
 class Library:
     """An opened build.
@@ -240,6 +257,10 @@ def open_build(build: str) -> Library:
         ctypes.POINTER(Spacetime),
         ctypes.POINTER(Sliced),
         ctypes.POINTER(SpacetimeGrads),
+        ctypes.POINTER(Error),
+    ]
+    calls.fragprune_photometric_loss.argtypes = [
+        ctypes.POINTER(Photometric),
         ctypes.POINTER(Error),
     ]
     calls.fragprune_free.argtypes = [_POINTER]

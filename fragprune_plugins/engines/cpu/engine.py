@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import ctypes
-import math
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cpu.calling import empty, expect_ok
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs, native_threads
 from fragprune_plugins.engines.slicing import slice_by
-from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import RasterOutputs, Splats
 
 if TYPE_CHECKING:
@@ -41,30 +40,7 @@ _NAMES = (
     "background",
 )
 
-_SMALL = 1 << 16
-"""Bytes below which the C library has memory at hand itself."""
-
 _STAGES = ("projection", "binning", "blend")
-
-
-def _empty(workspace: binding.Workspace, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Like torch.empty for 4-byte numbers, but large tensors reuse memory of the engine.
-
-    Fresh memory is slow: the system clears it page by page, which takes longer than filling it.
-    """
-    size = 4 * math.prod(shape)
-    if size < _SMALL:
-        return torch.empty(shape, dtype=dtype)
-    return torch.frombuffer(workspace.take(size), dtype=dtype).view(shape)
-
-
-def _stop(status: int, error: binding.Error) -> NoReturn:
-    text = error.message.decode(errors="replace")
-    if status == binding.OUT_OF_MEMORY:
-        raise MemoryError(f"fragprune's cpu engine: {text}")
-    raise EngineError(
-        "engine 'cpu'", text, "inputs it can draw", "Check the camera and the Gaussians."
-    )
 
 
 @dataclass
@@ -97,20 +73,20 @@ class _Drawing:
         """Run the forward pass; returns the autograd function's outputs, in their order."""
         view, n = self.inputs.view, len(self.inputs.splats)
         size = (view.height, view.width)
-        empty = partial(_empty, self.workspace)
-        image, planes = empty(3, *size), self.inputs.planes
-        invdepth, alpha = (empty(int(name in planes), *size) for name in ("invdepth", "alpha"))
-        features = empty(_channels(self.inputs.splats.features), *size)
+        fresh = partial(empty, self.workspace)
+        image, planes = fresh(3, *size), self.inputs.planes
+        invdepth, alpha = (fresh(int(name in planes), *size) for name in ("invdepth", "alpha"))
+        features = fresh(_channels(self.inputs.splats.features), *size)
         flat = isinstance(self.inputs.splats, Splats) and self.inputs.splats.flat
-        surface = empty(6 * (flat and "surface" in planes), *size)
-        radii, whole = empty(n, dtype=torch.int32), torch.int32
+        surface = fresh(6 * (flat and "surface" in planes), *size)
+        radii, whole = fresh(n, dtype=torch.int32), torch.int32
         if self.inputs.counts:
-            self.found["fragments"] = empty(*size, dtype=whole)
-            self.found["fragments_per_gaussian"] = empty(n, dtype=whole)
+            self.found["fragments"] = fresh(*size, dtype=whole)
+            self.found["fragments_per_gaussian"] = fresh(n, dtype=whole)
         if self.inputs.scores:
-            self.found["weights_per_gaussian"] = empty(n)
-            self.found["wins_per_gaussian"] = empty(n, dtype=whole)
-            self.found["winners"] = empty(*size, dtype=whole)
+            self.found["weights_per_gaussian"] = fresh(n)
+            self.found["wins_per_gaussian"] = fresh(n, dtype=whole)
+            self.found["winners"] = fresh(*size, dtype=whole)
         outputs = binding.Outputs(
             image=address(image),
             invdepth=address(invdepth),
@@ -136,8 +112,7 @@ class _Drawing:
             ctypes.byref(handle) if keep else None,
             ctypes.byref(error),
         )
-        if status != binding.OK:
-            _stop(status, error)
+        expect_ok(status, error)
         if keep:
             self.state = binding.State(self.library)
             self.state.handle = handle.value
@@ -164,7 +139,7 @@ class _Drawing:
         n = len(self.inputs.splats)
         shapes = {name: array.shape for name, array in self.arrays.items()}
         shapes["hook"] = torch.Size((n, 3))
-        grads = {k: _empty(self.workspace, *shapes[k]) for k, wanted in wants.items() if wanted}
+        grads = {k: empty(self.workspace, *shapes[k]) for k, wanted in wants.items() if wanted}
         error = binding.Error()
         status = self.library.calls.fragprune_backward(
             self.state.handle,
@@ -173,8 +148,7 @@ class _Drawing:
             native_threads(),
             ctypes.byref(error),
         )
-        if status != binding.OK:
-            _stop(status, error)
+        expect_ok(status, error)
         return grads
 
 
@@ -219,7 +193,7 @@ class _Blade:
     where = torch.device("cpu")
 
     def empty(self, *shape: int) -> Tensor:
-        return _empty(self.workspace, *shape)
+        return empty(self.workspace, *shape)
 
     def slice(self, given: binding.Spacetime, to: binding.Sliced) -> None:
         self._call("fragprune_slice", given, to)
@@ -232,8 +206,7 @@ class _Blade:
     def _call(self, function: str, *structs: ctypes.Structure) -> None:
         error = binding.Error()
         status = getattr(self.library.calls, function)(*map(ctypes.byref, (*structs, error)))
-        if status != binding.OK:
-            _stop(status, error)
+        expect_ok(status, error)
 
 
 class CpuEngine:

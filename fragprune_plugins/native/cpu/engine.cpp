@@ -1,4 +1,4 @@
-// The C interface on a CPU: project, sort, bin, blend; and back.
+// The C interface on a CPU: project, sort, bin, blend; and back. And the loss of what was drawn.
 
 #include <array>
 #include <chrono>
@@ -12,6 +12,7 @@
 
 #include "binning.h"
 #include "blend.h"
+#include "loss.h"
 #include "slice.h"
 #include "surfels.h"
 
@@ -835,6 +836,15 @@ bool wants_absent(const fragprune_spacetime& in, const fragprune_spacetime_grads
   return false;
 }
 
+const char* fault_of(const fragprune_photometric* images) {
+  if (!images || images->size != sizeof *images) return kOtherVersion;
+  for (int32_t side : {images->channels, images->height, images->width})
+    if (side < 1 || side > 1 << 16) return "channels, height and width must be 1 to 65536";
+  if (is_bad_thread_count(images->threads)) return kBadThreads;
+  if (!images->image || !images->target) return "image and target are needed";
+  return nullptr;
+}
+
 template <class Work>
 int guarded(fragprune_error* error, Work work) {
   if (error) error->message[0] = 0;
@@ -928,6 +938,15 @@ int fragprune_unslice(const fragprune_spacetime* inputs, const fragprune_sliced*
     fp::Team(inputs->threads)
         .each(static_cast<size_t>(inputs->count), fp::kPiece,
               [&](size_t begin, size_t end) { unslicer.run(begin, end); });
+  });
+}
+
+int fragprune_photometric_loss(fragprune_photometric* images, fragprune_error* error) {
+  if (const char* fault = fp::fault_of(images))
+    return fp::fail(error, FRAGPRUNE_BAD_INPUT, fault);
+  return fp::guarded(error, [&] {
+    fp::photometric_loss(*images, images->workspace ? images->workspace->memory
+                                                    : std::make_shared<fp::Pool>());
   });
 }
 

@@ -281,6 +281,28 @@ FRAGPRUNE_EXPORT int fragprune_unslice(const fragprune_spacetime *inputs,
                                        const fragprune_spacetime_grads *input_grads,
                                        fragprune_error *error);
 
+/* Two images and what differs between them: l1_weight * l1 + ssim_weight * dissimilarity. Structural
+ * similarity is that of the hosts: an 11x11 Gaussian window of sigma 1.5, zero outside the image,
+ * C1 = 0.01^2, C2 = 0.03^2, each channel for itself. NaN in a pixel is NaN in what is filled in. */
+typedef struct fragprune_photometric {
+  uint32_t size;
+  int32_t threads;     /* 1 to 1024; results do not depend on it */
+  int32_t channels;    /* C, 1 to 65536 */
+  int32_t height;      /* pixels, 1 to 65536 */
+  int32_t width;
+  float l1_weight;
+  float ssim_weight;
+  const float *image;  /* (C, H, W) */
+  const float *target; /* (C, H, W) */
+  float *gradient;     /* (C, H, W) of the weighted sum, by the image; or NULL: not wanted */
+  fragprune_workspace *workspace; /* memory to use again; or NULL */
+  double l1;            /* filled in: mean absolute difference */
+  double dissimilarity; /* filled in: 1 - mean structural similarity */
+} fragprune_photometric;
+
+FRAGPRUNE_EXPORT int fragprune_photometric_loss(fragprune_photometric *images,
+                                                fragprune_error *error);
+
 /* Memory that calls hand on to the next ones, so that the system need not find and clear it each
  * time. Any number of calls may use one workspace at once; the states that came of them may outlive
  * it. What lies idle is bounded by what was lately in use. NULL: out of memory, which is no harm. */

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.losses import code_for, photometric_loss
 from fragprune_plugins.errors import AlignmentError, CheckpointError, UsageError
 from fragprune_plugins.files.ply import SplatFile
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, Waiting, between_steps
-from fragprune_plugins.learning.losses import photometric_loss
 from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2
@@ -260,6 +260,7 @@ class _Run:
         self.others: dict[str, Any] = {
             "rule": None if rule is None else getattr(rule, "name", repr(rule)),
             "prices": dict(cost.prices) if clock and cost else None,  # times were predicted by them
+            "loss": code_for(model.xyz.device),
         }
         self.curves: list[StepStats] = []
         self.done, self.between = 0, True

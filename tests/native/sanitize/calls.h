@@ -515,16 +515,19 @@ inline void borrow(fragprune_workspace* workspace, Source& from) {
 struct Tally {
   int64_t calls = 0, drew = 0, poisoned = 0, backward = 0, refused = 0, empty = 0;
   int64_t cut = 0, present = 0;  // of slices.h
+  int64_t losses = 0;            // of images.h
 
   void print() const {
     std::printf("calls %lld drew %lld poisoned %lld backward %lld refused %lld empty %lld ",
                 (long long)calls, (long long)drew, (long long)poisoned, (long long)backward,
                 (long long)refused, (long long)empty);
-    std::printf("cut %lld present %lld\n", (long long)cut, (long long)present);
+    std::printf("cut %lld present %lld losses %lld\n", (long long)cut, (long long)present,
+                (long long)losses);
   }
   void operator+=(const Tally& t) {
     calls += t.calls, drew += t.drew, poisoned += t.poisoned, backward += t.backward;
     refused += t.refused, empty += t.empty, cut += t.cut, present += t.present;
+    losses += t.losses;
   }
 };
 

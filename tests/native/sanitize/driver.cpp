@@ -9,6 +9,7 @@
 #include <new>
 #include <thread>
 
+#include "images.h"
 #include "slices.h"
 
 namespace {
@@ -49,6 +50,7 @@ calls::Tally many(uint64_t seed, int64_t count) {
     calls::Source from(calls::seed_in_hand);
     calls::run(from, {}, tally);
     if (from.one_in(4)) calls::run_cut(from, tally);
+    if (from.one_in(8)) calls::run_loss(from, tally);
   }
   return tally;
 }
@@ -127,6 +129,11 @@ void run_out_of_memory(uint64_t seed) {
     return fragprune_backward(state, &loss.grads, &g.to, 3, error);
   });
   fragprune_free(state);
+  calls::Pair pair = calls::make_pair(from);
+  pair.in.threads = 3;
+  until_it_works([&](fragprune_error* error) {
+    return fragprune_photometric_loss(&pair.in, error);
+  });
 }
 
 }  // namespace
