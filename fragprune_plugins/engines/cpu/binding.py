@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from fragprune_plugins import native
 
-API_VERSION: Final = 8
+API_VERSION: Final = 9
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"

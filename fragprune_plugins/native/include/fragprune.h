@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 8
+#define FRAGPRUNE_API_VERSION 9
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
