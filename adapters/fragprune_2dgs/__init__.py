@@ -22,6 +22,7 @@ from fragprune_plugins.adapting import (
     RasterInputs,
     RasterizerCall,
     RasterOutputs,
+    graphdeco,
     hookimpl,
     revised,
 )
@@ -84,6 +85,7 @@ class SurfelSplatting(GraphdecoAdapter):
         ),
     )
     package = PACKAGE
+    kernel = graphdeco.SURFEL
     on_gpu = False
     calls = (RasterizerCall(outputs=3),)
     own_names = ("utils.point_utils:depth_to_normal", "gaussian_renderer:allmap")

@@ -98,7 +98,11 @@ def locate(
             package
             for adapter in adapters
             for package in adapter.installed[:1]
-            if (name.replace("_", "-") == adapter.name if name else repo.imports(package))
+            if (
+                name.replace("_", "-") == adapter.name
+                if name
+                else repo.imports(package) and not (repo.root / package).is_dir()  # its own
+            )
         ]
         packages = [package for each in used if (package := HostRepo.installed(each))]
         outer = [HostRepo(folder.resolve().parent)] if above else []

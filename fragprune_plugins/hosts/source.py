@@ -112,7 +112,7 @@ class HostRepo:
         """
         return bool(self.package) or lies_in(path, self.root)
 
-    def _read(self, path: Path) -> str:
+    def read(self, path: Path) -> str:
         """The text of a file; "" where it is missing, or leads out of the checkout."""
         try:
             if self._inside(path):
@@ -126,7 +126,7 @@ class HostRepo:
         """The module's syntax tree, or None when it is absent or not Python."""
         if module not in self._trees:
             path = self.path(module)
-            self._trees[module] = parsed(self._read(path)) if path else None
+            self._trees[module] = parsed(self.read(path)) if path else None
         return self._trees[module]
 
     def function(self, module: str, attribute: str) -> Function | None:
@@ -214,12 +214,12 @@ class HostRepo:
         if self.package:
             return _distributions(self.package, self.root)
         git = self.root / ".git"
-        head = self._read(git / "HEAD").strip()
+        head = self.read(git / "HEAD").strip()
         reference = _REFERENCE.fullmatch(head)
         if reference is None:
             return head if _COMMIT.fullmatch(head) else ""
-        found = [self._read(git / reference[1]).strip()]
-        for line in self._read(git / "packed-refs").splitlines():
+        found = [self.read(git / reference[1]).strip()]
+        for line in self.read(git / "packed-refs").splitlines():
             commit, _, name = line.partition(" ")
             found += [commit] if name == reference[1] else []
         return next((each for each in found if _COMMIT.fullmatch(each)), "")

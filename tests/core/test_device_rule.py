@@ -7,7 +7,7 @@ import contextlib
 import pytest
 import torch
 from cli.commands import run
-from miniatures.skeletons import skeleton
+from miniatures.skeletons import FLAGS, skeleton
 
 from fragprune_plugins import engines
 from fragprune_plugins.errors import UsageError
@@ -126,6 +126,7 @@ def test_a_host_stays_on_the_gpu_that_was_named(gpus, tmp_path, monkeypatch):
         "import torch, pathlib\n"
         "torch.cuda.set_device(0)\n"
         "pathlib.Path(__file__).with_name('seen').write_text(str(torch.cuda.current_device()))\n"
+        + FLAGS
     )
     launch.run([str(script)], RunOptions(stage="off", device="cuda:1"))
     assert (tmp_path / "seen").read_text() == "1"

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from miniatures.skeletons import skeleton
+from miniatures.skeletons import FLAGS, skeleton
 
 from fragprune_plugins.errors import (
     HostFailed,
@@ -35,7 +35,7 @@ def host(tmp_path):
     skeleton(root)
 
     def write(code: str, name: str = "train.py") -> str:
-        (root / name).write_text(code)
+        (root / name).write_text(code + FLAGS)
         return str(root / name)
 
     return write

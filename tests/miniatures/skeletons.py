@@ -12,6 +12,19 @@ SETTINGS = [
     *("viewmatrix", "projmatrix", "sh_degree", "campos", "prefiltered", "debug"),
 ]
 
+GETTERS = {
+    "get_xyz": "self._xyz",
+    "get_opacity": "self.opacity_activation(self._opacity)",
+}
+
+FLAGS = """
+def read_flags(parser):
+    for name in "--model_path", "--checkpoint_iterations", "--start_checkpoint":
+        parser.add_argument(name)
+    return parser.parse_args()
+"""
+"""What a training script must have besides."""
+
 MODEL = {
     "__init__": "sh_degree",
     "capture": "",
@@ -79,6 +92,10 @@ def skeleton(
         + "\n".join(
             f"    def {name}({', '.join(filter(None, ['self', args]))}): {bodies.get(name, '...')}"
             for name, args in model.items()
+        )
+        + "".join(
+            f"\n    @property\n    def {name}(self): return {value}"
+            for name, value in GETTERS.items()
         ),
         "gaussian_renderer/__init__.py": f"from {package} import GaussianRasterizationSettings, "
         "GaussianRasterizer\n\n\n"
@@ -91,7 +108,8 @@ def skeleton(
             for function in functions
         ),
         "train.py": "from gaussian_renderer import render\n"
-        + ("SparseGaussianAdam\n" if state == "October 2024" else ""),
+        + ("SparseGaussianAdam\n" if state == "October 2024" else "")
+        + FLAGS,
     }
     for name, text in files.items():
         path = root / name

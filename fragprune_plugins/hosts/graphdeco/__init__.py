@@ -3,6 +3,7 @@
 call          the rasterizer's call in their source
 adapter       the base of their adapters: seams, names, files
 densifying    the rows that their densify methods copy
+reading       the getters and the flags that every adapter needs
 stand_ins     modules of ours for their compiled packages; imports torch
 """
 
@@ -16,11 +17,13 @@ from fragprune_plugins.hosts.graphdeco.adapter import (
 )
 from fragprune_plugins.hosts.graphdeco.call import RasterizerCall
 from fragprune_plugins.hosts.graphdeco.densifying import clones, needy, reaches, splits
+from fragprune_plugins.hosts.kernels import SURFEL
 
 __all__ = [
     "CLONE",
     "MODEL",
     "SPLIT",
+    "SURFEL",
     "GraphdecoAdapter",
     "GraphdecoDialect",
     "RasterizerCall",

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from fragprune_plugins.errors import ModelFileError, NotComparedError
 from fragprune_plugins.hosts.adapter import (
@@ -22,6 +22,8 @@ from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_plugins.hosts.graphdeco.densifying import clones, splits
 from fragprune_plugins.hosts.graphdeco.output import WIDEST
+from fragprune_plugins.hosts.graphdeco.reading import read_flags, read_getters
+from fragprune_plugins.hosts.kernels import SPLAT, Kernel, read_kernels
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import Function, HostRepo
@@ -176,6 +178,8 @@ class GraphdecoAdapter(ScriptAdapter):
     """
 
     package = "diff_gaussian_rasterization"
+    kernel: ClassVar[Kernel] = SPLAT
+    """How the host's rasterizer draws; the sources of a vendored one are compared with it."""
     renderer = RENDERER
     """The module of the functions that call the rasterizer."""
     calls: tuple[RasterizerCall, ...] = (RasterizerCall(),)
@@ -201,11 +205,24 @@ class GraphdecoAdapter(ScriptAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Check scripts, the host's own names, param groups, and the calls of the rasterizer."""
+        """Check scripts and flags, the host's own names, the model, and the rasterizer."""
         missing = [f"no {name}" for name in self.scripts if not (repo.root / name).is_file()]
         for module, name in (each.split(":") for each in self.own_names):
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
-        return [*self.other_host(repo, missing), *self._groups(repo), *self._calls(repo)]
+        packages = dict.fromkeys([self.package, *(each.package for each in self.calls)])
+        return [
+            *self.other_host(repo, missing),
+            *(
+                finding
+                for package in packages
+                if package
+                for finding in read_kernels(repo, package, self.kernel)
+            ),
+            *read_getters(repo, MODEL),
+            *(read_flags(repo, self.command_line(repo)) if repo.tree(MODEL) else ()),
+            *self._groups(repo),
+            *self._calls(repo),
+        ]
 
     def _groups(self, repo: HostRepo) -> list[Finding]:
         """An error if the source spells out other param groups."""

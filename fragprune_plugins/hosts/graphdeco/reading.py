@@ -1,0 +1,132 @@
+"""Reads what adapters of this family need: getters of the model and flags of the script."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Iterator
+
+from fragprune_plugins.hosts.adapter import CommandLine
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.source import Function, HostRepo
+
+GETTERS = ("get_xyz", "get_opacity")
+"""Properties of the model that every adapter of this family reads."""
+_OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "click", "absl")
+
+
+def read_getters(repo: HostRepo, module: str, model: str = "GaussianModel") -> list[Finding]:
+    """An error for each getter that is no property, and for computed positions.
+
+    A threshold belongs to a row of the positions that the optimizer moves.
+    """
+    found = []
+    for name in GETTERS if repo.tree(module) else ():  # if not, the seams say so
+        function = repo.function(module, f"{model}.{name}")
+        if function is None:
+            what: str | None = "no such property"
+        elif not is_property(function):
+            what = "a method"
+        elif name == "get_xyz":
+            what = computed(function, "_xyz")
+        else:
+            what = None
+        if what:
+            found.append((name, what))
+    return [
+        Finding(
+            "error",
+            "model-getter",
+            f"{module}:{model}.{name} ({repo.place(module, f'{model}.{name}')})",
+            what,
+            "a property that returns self._xyz, the parameter itself"
+            if name == "get_xyz"
+            else "a property",
+            "Thresholds follow the rows of the parameter, which these are not."
+            if what.startswith("computed")
+            else "",
+        )
+        for name, what in found
+    ]
+
+
+def is_property(function: Function) -> bool:
+    """Whether a method is read without a call."""
+    return any("property" in ast.unparse(each) for each in function.decorator_list)
+
+
+def computed(function: Function, attribute: str) -> str | None:
+    """How a getter computes its value; None if it always returns an attribute of ``self``."""
+    names = {f"self.{attribute}"}
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign) and ast.unparse(node.value) in names:
+            names |= {each.id for each in node.targets if isinstance(each, ast.Name)}
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign) and ast.unparse(node.value) not in names:
+            names -= {ast.unparse(each) for each in node.targets}
+    returned = [node.value for node in ast.walk(function) if isinstance(node, ast.Return)]
+    others = [ast.unparse(each) for each in returned if each and ast.unparse(each) not in names]
+    if others:
+        return f"computed, it returns {others[0][:60]}"
+    return None if returned else "computed, it returns nothing"
+
+
+def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
+    """An error for each training script that lacks a flag that we set, or reads no flags."""
+    wanted = ("iterations", "output", "save_checkpoints", "resume")
+    found = []
+    for script in line.scripts:
+        module = script.removesuffix(".py").replace("/", ".")
+        tree = repo.tree(module)
+        if tree is None:
+            continue
+        if not any(
+            isinstance(node, ast.Call)
+            and getattr(node.func, "attr", "") in ("parse_args", "parse_known_args")
+            for node in ast.walk(tree)
+        ):
+            others = [name for name in _imported(tree) if name in _OTHER_FLAGS]
+            by = f"it reads its settings with {', '.join(others)}" if others else "no argparse"
+            found.append((script, by, "flags, read with argparse"))
+            continue
+        flags = {*_strings(tree), *_of_groups(repo)}
+        missing = [
+            line.spellings(field)[-1]
+            for field in wanted
+            if not flags.intersection(line.spellings(field))
+        ]
+        if missing:
+            found.append((script, f"no {', '.join(missing)}", "the flags that we set"))
+    return [
+        Finding("error", "flags", script, what, expected, "Its training cannot be driven.")
+        for script, what, expected in found
+    ]
+
+
+def _imported(tree: ast.Module) -> Iterable[str]:
+    names: dict[str, None] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {each.name.split(".")[0]: None for each in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names[node.module.split(".")[0]] = None
+    return names
+
+
+def _strings(tree: ast.Module) -> Iterator[str]:
+    """Strings in a script that could be flags."""
+    for node in ast.walk(tree):
+        value = getattr(node, "value", None) if isinstance(node, ast.Constant) else None
+        if isinstance(value, str) and value.startswith("-"):
+            yield value
+
+
+def _of_groups(repo: HostRepo) -> Iterator[str]:
+    """Flags that the argument groups make of their attributes; ``_name`` also makes ``-n``."""
+    tree = repo.tree("arguments")
+    for node in ast.walk(tree) if tree else ():
+        targets = node.targets if isinstance(node, ast.Assign) else []
+        for each in targets:
+            if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
+                yield f"--{each.attr.removeprefix('_')}"
+                if each.attr.startswith("_"):
+                    yield f"-{each.attr[1]}"

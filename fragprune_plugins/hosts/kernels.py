@@ -1,0 +1,249 @@
+"""Reads the CUDA sources of a vendored rasterizer: do they draw by the rule that we know?
+
+The import name of a rasterizer proves nothing: forks keep it and change the kernel.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from weakref import WeakKeyDictionary
+
+from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.source import HostRepo
+
+_DEEPEST = 6
+"""Folders below the checkout in which a rasterizer is looked for."""
+_NOT_THEIRS = {"third_party", "build", "dist", "site-packages", "node_modules", "glm", "backward"}
+_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+_ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
+_JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
+_FILTER = re.compile(r"\bcov(?:\[0\]\[0\]|\.x)\s*\+=\s*([^;]+);")
+_EWA = re.compile(
+    r"\((\w+)/(\w+)\.z,0\.?0?,-\(?\1\*\2\.x\)?/\(\2\.z\*\2\.z\),"
+    r"0\.?0?,(\w+)/\2\.z,-\(?\3\*\2\.y\)?/\(\2\.z\*\2\.z\),0\.?0?,0\.?0?,0\.?0?\)"
+)
+_QUADRATIC = re.compile(
+    r"-0\.5\*\((\w+)\.x\*(\w+)\.x\*\2\.x\+\1\.z\*\2\.y\*\2\.y\)-\1\.y\*\2\.x\*\2\.y"
+)
+_SURFEL = re.compile(r"-0\.5\*rho")
+_POLYNOMIAL = re.compile(r"[\w.+()-]*(?:\*[\w.+()-]+){5,}")
+"""Sums of products, as when a quadratic form is multiplied out; ours to read by a proof only."""
+_LAUNCH = re.compile(r"\b(\w+)\s*(?:<[^<>;]*>)?\s*<<\s*<")
+_KERNEL = re.compile(r"__global__[^;{(]*?(?:__launch_bounds__\s*\([^)]*\)\s*)?(\w+)\s*\(")
+_LOW_PASS = 0.3
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """How a rasterizer draws a Gaussian.
+
+    Attributes:
+        exponent: the exponent of the falloff, as normalised source.
+        says: the same for people.
+        projected: the Gaussian is projected by the EWA Jacobian and widened by a low-pass filter.
+    """
+
+    exponent: re.Pattern[str]
+    says: str
+    projected: bool = True
+
+
+SPLAT = Kernel(_QUADRATIC, "alpha = min(0.99, opacity exp(-q/2)), q from the conic")
+SURFEL = Kernel(_SURFEL, "alpha = min(0.99, opacity exp(-rho/2))", projected=False)
+
+
+def read_kernels(repo: HostRepo, package: str, kernel: Kernel) -> list[Finding]:
+    """Compare the sources of a rasterizer that a checkout vendors with a known rule.
+
+    Args:
+        repo: the checkout.
+        package: import name of the rasterizer.
+        kernel: the rule that the adapter's engines draw by.
+
+    Returns:
+        An error for each difference; a warning where an exponent cannot be read. Empty if the
+        checkout vendors no such package.
+    """
+    found: list[Finding] = []
+    for project in _projects(repo, package):
+        found += project.compare(kernel)
+    return found
+
+
+_read: WeakKeyDictionary[HostRepo, dict[str, list[_Project]]] = WeakKeyDictionary()
+
+
+def _projects(repo: HostRepo, package: str) -> list[_Project]:
+    """The vendored projects of a package; read once for all adapters."""
+    known = _read.setdefault(repo, {})
+    if package not in known:
+        known[package] = [_Project(repo, each, package) for each in vendored(repo, package)]
+    return known[package]
+
+
+def vendored(repo: HostRepo, package: str) -> list[Path]:
+    """Folders of a checkout that contain the package's import folder and CUDA sources."""
+    if repo.package:
+        return []
+    name = package.rpartition(".")[2]
+    return [
+        folder
+        for folder, inside in _folders(repo.root)
+        if name in inside and (folder / name / "__init__.py").is_file() and any(_sources(folder))
+    ]
+
+
+def _folders(root: Path) -> Iterator[tuple[Path, list[str]]]:
+    """The folders of a checkout with the names of their folders, in order."""
+    for path, inside, _ in os.walk(root):
+        folder = Path(path)
+        inside[:] = sorted(name for name in inside if not _foreign(name))
+        yield folder, list(inside)
+        if len(folder.relative_to(root).parts) >= _DEEPEST:
+            inside.clear()
+
+
+def _foreign(name: str) -> bool:
+    return name.startswith(".") or name in _NOT_THEIRS
+
+
+def _sources(folder: Path) -> Iterator[Path]:
+    """The CUDA sources of a project that draw; ``backward`` only differentiates."""
+    for path, inside, files in os.walk(folder):
+        inside[:] = sorted(name for name in inside if not _foreign(name))
+        for name in sorted(files):
+            stem, dot, ending = name.partition(".")
+            if dot and ending in ("cu", "cuh", "h") and not stem.startswith("backward"):
+                yield Path(path) / name
+
+
+def _normal(text: str) -> str:
+    """An expression in one spelling: no spaces, no float suffix, one name for each function."""
+    text = re.sub(r"\s+|\(float\)|glm::|std::", "", text)
+    text = re.sub(r"(?<=[\d.])f\b", "", text)
+    return re.sub(r"\b(?:__)?(exp|fmin|min)f\b|\bfmin\b", lambda m: (m[1] or "min")[-3:], text)
+
+
+class _Project:
+    """The sources of one vendored rasterizer."""
+
+    def __init__(self, repo: HostRepo, folder: Path, package: str) -> None:
+        self.repo, self.folder, self.package = repo, folder, package
+        self.texts = {
+            path: _COMMENT.sub(lambda each: "\n" * each[0].count("\n"), repo.read(path))
+            for path in _sources(folder)
+        }
+
+    def compare(self, kernel: Kernel) -> Iterator[Finding]:
+        """The differences from a rule."""
+        yield from self._alphas(kernel)
+        if kernel.projected:
+            jacobians = list(self._found(_JACOBIAN))
+            if not jacobians:
+                yield self._finding(self.folder, 0, "no Jacobian of the projection", "EWA's")
+            for path, position, text in jacobians:
+                if not _EWA.fullmatch(text):
+                    yield self._finding(
+                        path,
+                        position,
+                        f"another projection, J = {_short(text)}",
+                        "the EWA projection",
+                    )
+            yield from self._filters()
+
+    def _alphas(self, kernel: Kernel) -> Iterator[Finding]:
+        drawn, known, unread = self._launched(), 0, []
+        for path, position, text in self._found(_ALPHA):
+            if re.fullmatch(r"[\d.]+", text):  # a start, which the code below it changes
+                continue
+            exponent = self._exponent(path, position, text)
+            if exponent is None or "min(0.99," not in text:
+                what = "no exp()" if exponent is None else "not capped at 0.99"
+                yield self._finding(path, position, f"alpha = {_short(text)}: {what}", kernel.says)
+            elif kernel.exponent.fullmatch(exponent):
+                known += not drawn or self._function(path, position) in drawn
+            else:
+                unread.append((path, position, exponent))
+        for path, position, exponent in unread:
+            what = f"the exponent of alpha is {_short(exponent)}"
+            other = not known and not (kernel.projected and _POLYNOMIAL.fullmatch(exponent))
+            yield self._finding(path, position, what, kernel.says, error=other)
+        if not known and not unread:
+            yield self._finding(self.folder, 0, "no alpha = min(0.99, opacity exp())", kernel.says)
+
+    def _launched(self) -> set[str]:
+        """Names of the kernels that the sources launch."""
+        return {match[1] for text in self.texts.values() for match in _LAUNCH.finditer(text)}
+
+    def _function(self, path: Path, position: int) -> str:
+        """The kernel that contains a position, or the last one before it."""
+        names = [match[1] for match in _KERNEL.finditer(self.texts[path], 0, position)]
+        return names[-1] if names else ""
+
+    def _exponent(self, path: Path, position: int, text: str) -> str | None:
+        """The exponent of an alpha, with the variables that it goes through; None without exp."""
+        for _ in range(3):
+            if inner := re.search(r"exp\(([^()]*)\)", text):
+                return self._assigned(path, position, inner[1]) or inner[1]
+            names = re.findall(r"[*(,](\w+)\)", text)
+            values = [each for name in names if (each := self._assigned(path, position, name))]
+            text = next((each for each in values if "exp(" in each), "")
+        return None
+
+    def _assigned(self, path: Path, position: int, name: str) -> str | None:
+        """The last value that a variable was declared with before a position."""
+        if not name.isidentifier():
+            return None
+        declared = re.compile(rf"\b(?:float|auto)\s+{name}\s*=([^;]+);")
+        before = [
+            value for where, at, value in self._found(declared) if where == path and at < position
+        ]
+        return before[-1] if before else None
+
+    def _filters(self) -> Iterator[Finding]:
+        added = list(self._found(_FILTER))
+        if not added:
+            yield self._finding(self.folder, 0, "no low-pass filter", f"{_LOW_PASS} added to it")
+        for path, position, text in added:
+            try:
+                width = float(text)
+            except ValueError:  # a name: a setting, which the call must pass, or a constant
+                constant = list(
+                    self._found(re.compile(rf"\b{re.escape(text)}\s*=?\s*([\d.]+)f?\b"))
+                )
+                width = float(constant[0][2]) if constant else _LOW_PASS
+            if width != _LOW_PASS:
+                yield self._finding(
+                    path, position, f"a low-pass filter of {width:g}", f"one of {_LOW_PASS}"
+                )
+
+    def _found(self, pattern: re.Pattern[str]) -> Iterator[tuple[Path, int, str]]:
+        """File, position and normalised value of each match."""
+        for path, text in self.texts.items():
+            for match in pattern.finditer(text):
+                yield path, match.start(), _normal(match[1])
+
+    def _finding(
+        self, path: Path, position: int, found: str, expected: str, *, error: bool = True
+    ) -> Finding:
+        at = path.relative_to(self.repo.root).as_posix()
+        if path in self.texts:
+            at += f":{self.texts[path].count(chr(10), 0, position) + 1}"
+        return Finding(
+            "error" if error else "warning",
+            "kernel",
+            f"{self.package} ({at})",
+            found,
+            expected,
+            "Its pictures are not ours, so no adapter draws them."
+            if error
+            else "It was not read any further; compare pictures on the first run.",
+        )
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,228 @@
+"""A checkout may have every name and shape of vanilla 3DGS and still compute something else."""
+
+from __future__ import annotations
+
+import pytest
+from miniatures.skeletons import skeleton
+
+from fragprune_2dgs import SurfelSplatting
+from fragprune_plugins.errors import UnknownHostError
+from fragprune_plugins.hosts.choosing import locate
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_vanilla_3dgs import Vanilla3DGS
+
+PACKAGE = "diff_gaussian_rasterization"
+
+PROJECTION = """
+__device__ float3 spread(float3 m, float fx, float fy, float* cov3, float* view) {
+    float3 p = to_view(m, view);
+    %s
+    glm::mat3 M = W * J;
+    glm::mat3 cov = glm::transpose(M) * V * M;
+    %s
+    return {cov[0][0], cov[0][1], cov[1][1]};
+}
+"""
+EWA = """glm::mat3 J = glm::mat3(
+        fx / p.z, 0.0f, -(fx * p.x) / (p.z * p.z),   // by rows
+        0.0f, fy / p.z, -(fy * p.y) / (p.z * p.z),
+        0, 0, 0);"""
+TANGENT = """/* EWA was: glm::mat3 J = glm::mat3(fx / p.z, 0, 0, 0, fy / p.z, 0, 0, 0, 0); */
+    glm::mat3 J = glm::mat3(fx * p.z * s, 0.0f, -fx * p.x * s, 0.0f, fy, -fy * p.y, 0, 0, 0);"""
+WIDENED = "cov[0][0] += 0.3f;\n    cov[1][1] += 0.3f;"
+BLEND = """
+__global__ void draw(float4* conics, float2* at) {
+    for (int k = 0; k < n; k++) {
+        float2 d = {at[k].x - x, at[k].y - y};
+        float4 c = conics[k];
+        %s
+        if (alpha < 1.0f / 255.0f) continue;
+    }
+}
+void launch() { draw <<<grid, block>>>(conics, at); }
+"""
+QUADRATIC = "float power = -0.5f * (c.x * d.x * d.x + c.z * d.y * d.y) - c.y * d.x * d.y;"
+EXPONENTIAL = f"{QUADRATIC}\n        float alpha = min(0.99f, c.w * exp(power));"
+
+
+def vendor(root, projection=EWA, widened=WIDENED, blend=EXPONENTIAL, folder="a", package=PACKAGE):
+    project = root / "submodules" / folder
+    (project / package).mkdir(parents=True)
+    (project / package / "__init__.py").write_text("from . import _C\n")
+    (project / "cuda").mkdir()
+    (project / "cuda" / "forward.cu").write_text(PROJECTION % (projection, widened) + BLEND % blend)
+
+
+def errors(repo, adapter=Vanilla3DGS):
+    return [str(f) for f in adapter().match(repo).findings if f.level == "error"]
+
+
+def test_a_vendored_rasterizer_that_draws_by_the_known_rule_fits(tmp_path):
+    vendor(tmp_path)
+    assert not errors(skeleton(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"projection": TANGENT}, "forward.cu:5): another projection, J = (fx*p.z*s"),
+        ({"blend": "float alpha = min(0.99f, c.w * area(d));"}, "c.w*area(d)): no exp()"),
+        (
+            {"blend": "float power = -0.5f * nearest;\n float alpha = min(0.99f, exp(power));"},
+            "the exponent of alpha is -0.5*nearest",
+        ),
+        ({"widened": "cov[0][0] += 0.1f;"}, "a low-pass filter of 0.1"),
+        ({"widened": ""}, "no low-pass filter"),
+        (
+            {"blend": f"{QUADRATIC} float alpha = c.w * exp(power);"},
+            "not capped at 0.99",
+        ),
+    ],
+)
+def test_one_that_draws_by_another_is_refused_by_line(tmp_path, changed, says):
+    vendor(tmp_path, **changed)
+    found = errors(skeleton(tmp_path))
+    assert any(says in error for error in found), found
+
+
+@pytest.mark.parametrize(
+    "blend",
+    [
+        f"{QUADRATIC} const float g = __expf(power); const float alpha = fminf(0.99f, c.w * g);",
+        f"{QUADRATIC} float alpha = 0.0f; {{ float alpha = min(0.99f, c.w * exp(power)); }}",
+    ],
+)
+def test_the_rule_is_known_in_other_spellings(tmp_path, blend):
+    vendor(tmp_path, blend=blend)
+    assert not errors(skeleton(tmp_path))
+
+
+def test_a_known_kernel_that_is_never_launched_proves_nothing(tmp_path):
+    vendor(tmp_path)
+    source = tmp_path / "submodules/a/cuda/forward.cu"
+    text = source.read_text().replace("void launch() { draw", "void launch() { rays")
+    source.write_text(
+        text
+        + "__global__ void rays(float* q) { float e = -0.5f * q[0];\n"
+        + "float alpha = min(0.99f, o * exp(e)); }\n"
+    )
+    assert any("exponent of alpha is -0.5*q[0]" in error for error in errors(skeleton(tmp_path)))
+
+
+def test_a_form_multiplied_out_fits_and_is_named(tmp_path):
+    """It may be the same quadratic form; only a picture tells."""
+    vendor(
+        tmp_path,
+        blend="float power = A * xx + B * xy + C * yy + (u.x * x + u.y * y) + w;\n"
+        "float alpha = min(0.99f, exp(power));",
+    )
+    findings = Vanilla3DGS().match(skeleton(tmp_path)).findings
+    assert [f.level for f in findings if f.code == "kernel"] == ["warning"]
+    assert Vanilla3DGS().match(skeleton(tmp_path)).fits
+
+
+def test_every_rasterizer_of_the_name_counts(tmp_path):
+    vendor(tmp_path, folder="a")
+    vendor(tmp_path, folder="b", projection=TANGENT)
+    vendor(tmp_path, folder="c", projection=TANGENT, package="another_rasterizer")
+    found = errors(skeleton(tmp_path))
+    assert ["submodules/b/cuda" in error for error in found] == [True]
+
+
+def test_surfels_have_a_rule_of_their_own(tmp_path):
+    """A rasterizer of surfels has no projection of covariances."""
+    surfel = "diff_surfel_rasterization"
+    splats = skeleton(tmp_path, package=surfel, outputs=3)
+    vendor(
+        tmp_path,
+        projection="",
+        widened="",
+        blend="float power = -0.5f * rho; float alpha = min(0.99f, o * exp(power));",
+        package=surfel,
+    )
+    assert not any("[kernel]" in error for error in errors(splats, SurfelSplatting))
+
+
+def rewritten(repo: HostRepo, file: str, old: str, new: str) -> HostRepo:
+    path = repo.root / file
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    return HostRepo(repo.root)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (
+            "return self._xyz",
+            "\n        return self._xyz if self.mesh is None else self.mesh.place(self._xyz)",
+            "get_xyz (scene/gaussian_model.py:",
+        ),
+        (
+            "return self._xyz",
+            "\n        moved = self.activation(self._xyz)\n        return moved",
+            "computed, it returns moved",
+        ),
+        ("@property\n    def get_xyz", "def get_xyz", "a method"),
+        ("@property\n    def get_opacity", "def get_opacity", "a method"),
+        ("def get_opacity", "def opacities", "no such property"),
+    ],
+)
+def test_positions_that_are_not_the_parameter_are_refused(tmp_path, old, new, says):
+    repo = rewritten(skeleton(tmp_path), "scene/gaussian_model.py", old, new)
+    found = errors(repo)
+    assert ["[model-getter]" in error and says in error for error in found] == [True]
+
+
+def test_a_getter_may_name_the_parameter_first(tmp_path):
+    repo = rewritten(
+        skeleton(tmp_path),
+        "scene/gaussian_model.py",
+        "return self._xyz",
+        "\n        means = self._xyz\n        return means",
+    )
+    assert not errors(repo)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("import hydra\n@hydra.main()\ndef main(cfg): ...\n", "it reads its settings with hydra"),
+        ("args = parser.parse_args()\n", "--start_checkpoint; expected the flags"),
+    ],
+)
+def test_a_script_without_our_flags_is_refused(tmp_path, text, says):
+    repo = skeleton(tmp_path)
+    (tmp_path / "train.py").write_text(text)
+    assert any("[flags]" in error and says in error for error in errors(repo))
+
+
+def test_argument_groups_make_flags_of_their_attributes(tmp_path):
+    repo = skeleton(tmp_path)
+    repo = rewritten(repo, "train.py", '"--model_path", ', "")
+    assert any("no --model_path" in error for error in errors(repo))  # iterations is a group's
+    groups = tmp_path / "arguments/__init__.py"
+    groups.write_text(groups.read_text() + "        self._model_path = ''\n")
+    assert not errors(HostRepo(tmp_path))
+
+
+def test_a_folder_of_the_same_name_as_an_installed_host_is_not_that_host(tmp_path, monkeypatch):
+    class Installed(Vanilla3DGS):
+        installed = ("sharedname",)
+
+    installed, checkout = tmp_path / "lib", tmp_path / "checkout"
+    skeleton(installed / "sharedname")
+    (installed / "sharedname/__init__.py").write_text("")
+    (checkout / "sharedname").mkdir(parents=True)
+    (checkout / "train.py").write_text("from sharedname.scene import Scene\n")
+    monkeypatch.syspath_prepend(str(installed))
+    looked_at = []
+    monkeypatch.setattr(HostRepo, "installed", lambda name: looked_at.append(name))
+    with pytest.raises(UnknownHostError):
+        locate(checkout, [Installed()], above=False)
+    assert not looked_at
+    (checkout / "sharedname").rmdir()
+    with pytest.raises(UnknownHostError):
+        locate(checkout, [Installed()], above=False)
+    assert looked_at == ["sharedname"]
