@@ -18,7 +18,7 @@ from fragprune_plugins.constants import VERSION
 
 if TYPE_CHECKING:
     from fragprune_plugins.engines import slice_at
-    from fragprune_plugins.files.ply import SplatFile
+    from fragprune_plugins.files.model import Model
     from fragprune_plugins.injection.api import activate, deactivate, paused
     from fragprune_plugins.learning.ranks import joined
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
@@ -34,12 +34,13 @@ if TYPE_CHECKING:
         Splats,
         View,
     )
+    from fragprune_plugins.workbench.figures.evaluate import measure
     from fragprune_plugins.workbench.figures.viewing import overview, render_view
     from fragprune_plugins.workbench.finetune.itself import own_pictures
     from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
     from fragprune_plugins.workbench.finetune.processes import part_of, whole_of
     from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
-    from fragprune_plugins.workbench.models.model import Model, load, save
+    from fragprune_plugins.workbench.models.model import load, save
     from fragprune_plugins.workbench.prices.calibration import prices_of
     from fragprune_plugins.workbench.prices.cost import Cost
     from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
@@ -52,7 +53,7 @@ _HOME = {
     "Cost": "workbench.prices.cost",
     "FinetuneResult": "workbench.finetune.loop",
     "Footprints": "types",
-    "Model": "workbench.models.model",
+    "Model": "files.model",
     "Moment": "types",
     "RasterInputs": "types",
     "RasterOutputs": "types",
@@ -61,7 +62,6 @@ _HOME = {
     "ShardedEngine": "workbench.finetune.sharded",
     "Sliced": "types",
     "SpacetimeSplats": "types",
-    "SplatFile": "files.ply",
     "Splats": "types",
     "StepPlan": "learning.schedule",
     "ThresholdStore": "learning.thresholds",
@@ -76,6 +76,7 @@ _HOME = {
     "load": "workbench.models.model",
     "load_cameras": "workbench.scenes.cameras",
     "load_dataset": "workbench.scenes.dataset",
+    "measure": "workbench.figures.evaluate",
     "overview": "workbench.figures.viewing",
     "own_pictures": "workbench.finetune.itself",
     "part_of": "workbench.finetune.processes",
@@ -101,7 +102,6 @@ __all__ = [
     "ShardedEngine",
     "Sliced",
     "SpacetimeSplats",
-    "SplatFile",
     "Splats",
     "StepPlan",
     "ThresholdStore",
@@ -117,6 +117,7 @@ __all__ = [
     "load",
     "load_cameras",
     "load_dataset",
+    "measure",
     "overview",
     "own_pictures",
     "part_of",

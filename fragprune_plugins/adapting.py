@@ -6,11 +6,11 @@ drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs, slice_
 its script  CommandLine, ConfigFile, Photographs
 of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
             share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages
-files       Door, for those that a host reads; SplatFile, read_ply
+files       Door, for those that a host reads; Model, read_ply
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
-Importing this module imports no torch. SplatFile, read_ply, slice_at and stand_ins load it when
+Importing this module imports no torch. Model, read_ply, slice_at and stand_ins load it when
 they are first used: import them inside functions, or under TYPE_CHECKING.
 """
 
@@ -61,11 +61,12 @@ from fragprune_plugins.types import (
 
 if TYPE_CHECKING:
     from fragprune_plugins.engines import slice_at
-    from fragprune_plugins.files.ply import SplatFile, read_ply
+    from fragprune_plugins.files.model import Model
+    from fragprune_plugins.files.ply import read_ply
     from fragprune_plugins.hosts.graphdeco import stand_ins
 
 _WITH_TORCH = {
-    "SplatFile": "files.ply",
+    "Model": "files.model",
     "read_ply": "files.ply",
     "slice_at": "engines",
     "stand_ins": "hosts.graphdeco.stand_ins",
@@ -90,6 +91,7 @@ __all__ = [
     "HostRepo",
     "InputError",
     "Interrupted",
+    "Model",
     "ModelFileError",
     "Moment",
     "NotComparedError",
@@ -105,7 +107,6 @@ __all__ = [
     "SessionError",
     "Sliced",
     "SpacetimeSplats",
-    "SplatFile",
     "Splats",
     "Terminated",
     "UsageError",

@@ -1,4 +1,4 @@
-"""How values that hold tensors are shown: on one line, with shapes and types, without numbers."""
+"""How values that hold tensors are shown: on one line, with shapes and types."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ def one_line(thing: Any) -> str:
 
 
 def short(value: Any) -> str:
-    """A tensor as ``float32[9, 3]``, with its device unless it is the CPU; a list as its length."""
+    """A tensor as ``float32[9, 3]``, with its device unless it is the CPU; a list as its length.
+
+    Of a tensor that holds one number without an axis, that number.
+    """
+    if getattr(value, "ndim", None) == 0:
+        return f"{float(value):.6g}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         kind = str(value.dtype).removeprefix("torch.")
         device = str(getattr(value, "device", "cpu"))

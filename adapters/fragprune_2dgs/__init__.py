@@ -30,7 +30,7 @@ from fragprune_plugins.adapting import (
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.adapting import SplatFile
+    from fragprune_plugins.adapting import Model
 
 PACKAGE = "diff_surfel_rasterization"
 
@@ -92,7 +92,7 @@ class SurfelSplatting(GraphdecoAdapter):
     dialect_type = SurfelDialect
     seams = revised(GraphdecoAdapter.seams, {"GaussianRasterizer.forward": {"module": PACKAGE}})
 
-    def read_model(self, ply: Path) -> SplatFile:
+    def read_model(self, ply: Path) -> Model:
         """The host's own PLY, with two scales."""
         from fragprune_plugins.adapting import read_ply
 

@@ -36,7 +36,7 @@ from fragprune_plugins.adapting import (
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.adapting import SplatFile
+    from fragprune_plugins.adapting import Model
 
 MODEL = "scene.gaussian_model"
 KERNEL_SIZE = 0.1
@@ -115,7 +115,7 @@ class MipSplatting(GraphdecoAdapter):
         opacities: Tensor = model.get_opacity_with_3D_filter
         return opacities.detach().reshape(-1)
 
-    def read_model(self, ply: Path) -> SplatFile:
+    def read_model(self, ply: Path) -> Model:
         """Read the host's PLY, including its 3D filter."""
         from fragprune_plugins.adapting import read_ply
 

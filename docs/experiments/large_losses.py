@@ -23,8 +23,8 @@ from PIL import Image
 
 from fragprune_plugins.learning.pressure import ElasticPressure, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.finetune.loop import finetune
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_dataset
@@ -68,7 +68,7 @@ class Unbounded(Schedule):
 def compare(args: Namespace) -> None:
     """Train the arms, and print them as a table in Markdown."""
     torch.set_num_threads(1)
-    splat, _ = models.load(args.model, truncation=False)
+    splat = models.load(args.model, truncation=False)
     dataset: Dataset = load_dataset(args.data, white_background=args.white_background)
     usual = Settings(iterations=1000, seed=args.seed)
     arms: dict[str, tuple[Settings, Schedule | None]] = {
@@ -83,8 +83,8 @@ def compare(args: Namespace) -> None:
         last = result.curves[-len(dataset.train) :]
         loss = sum(step.loss for step in last) / len(last)
         ended.append(f"{label} | {loss:.4f} | {result.curves[-1].pressure:.1e}")
-        drawn.append(Candidate(result.model, result.store))
-    rows = measure(drawn, dataset.test, engine="cpu", repeats=1)
+        drawn.append(Candidate(result.model))
+    rows = measure_all(drawn, dataset.test, engine="cpu", repeats=1)
     print("| arm | loss | λ | fragments | PSNR, dB | SSIM | frame, ms | frame at 4x, ms |")
     print("|---|---|---|---|---|---|---|---|")
     times = zip(frames(drawn, dataset, 1), frames(drawn, dataset, 4), strict=True)
@@ -109,7 +109,7 @@ def frames(drawn: list[Candidate], dataset: Dataset, enlarge: int) -> list[float
         for at, view in enumerate(views):
             for index in range(len(drawn))[:: -1 if turn % 2 else 1]:
                 inputs = drawn[index].inputs(view, splats[index])
-                thresholds = thresholds_for(inputs, drawn[index].thresholds)
+                thresholds = drawn[index].thresholds(inputs)
                 started = time.process_time()
                 engine.rasterize(inputs, thresholds)
                 spent = 1e3 * (time.process_time() - started)

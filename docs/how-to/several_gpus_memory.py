@@ -31,12 +31,12 @@ class Grey(Shot):
         return torch.full((3, self.view.height, self.view.width), 0.5)
 
 
-def part(count: int, rank: int, size: int) -> fp.SplatFile:
+def part(count: int, rank: int, size: int) -> fp.Model:
     """One process' piece of the corridor, 4 x 3 units wide."""
     stream = torch.Generator().manual_seed(rank)
     place = torch.rand(count, 3, generator=stream) - torch.tensor([0.5, 0.5, -float(rank)])
     shape = 0.3 * torch.randn(count, 3, generator=stream) - 4
-    return fp.SplatFile(
+    return fp.Model(
         xyz=place * torch.tensor([4.0, 3.0, LENGTH / size]),
         f_dc=torch.randn(count, 1, 3, generator=stream),
         f_rest=0.1 * torch.randn(count, 15, 3, generator=stream),

@@ -29,7 +29,7 @@ from fragprune_plugins.constants import (
     TRANSMITTANCE_MIN,
     VERSION,
 )
-from fragprune_plugins.files.ply import SplatFile, write_ply
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.workbench.models import cutoffs, formats
 from fragprune_plugins.workbench.models.formats.values import SH_C0, of_codes, splat_of
 from fragprune_plugins.workbench.scenes.pinhole import Camera
@@ -45,7 +45,7 @@ FRAGMENTS = 0.02
 _DEPTH = 6.0
 
 
-def _grid(codes: list[int], opacities: list[float], scales: tuple[float, float]) -> SplatFile:
+def _grid(codes: list[int], opacities: list[float], scales: tuple[float, float]) -> Model:
     """One Gaussian per threshold (columns) and opacity (rows), apart from each other."""
     across, down = len(codes), len(opacities)
     x, y = np.meshgrid(
@@ -66,12 +66,12 @@ def _grid(codes: list[int], opacities: list[float], scales: tuple[float, float])
     )
 
 
-def _rims() -> SplatFile:
+def _rims() -> Model:
     """Opaque ellipses: each rim shows a threshold; the first column is neutral."""
     return _grid([0, 64, 128, 192, 224, 255], [0.99, 0.6, 0.3], (0.35, 0.14))
 
 
-def _faint() -> SplatFile:
+def _faint() -> Model:
     """Stacks of faint discs: where opacity is low the 1/255 rule decides, else the threshold."""
     discs = _grid([0, 32, 64, 96, 160, 224] * 6, [0.2, 0.06, 0.02, 0.003], (0.3, 0.3))
     column = torch.arange(len(discs)) % 6  # six times the same six columns, behind each other
@@ -80,7 +80,7 @@ def _faint() -> SplatFile:
     return replace(discs, xyz=xyz, f_dc=discs.f_dc + 2)
 
 
-def _cloud() -> SplatFile:
+def _cloud() -> Model:
     """Overlapping Gaussians of all sizes, with view-dependent colours of degree 1."""
     stream = np.random.default_rng(7)
     count = 200
@@ -95,7 +95,7 @@ def _cloud() -> SplatFile:
     )
 
 
-SCENES: dict[str, Callable[[], SplatFile]] = {"rims": _rims, "faint": _faint, "cloud": _cloud}
+SCENES: dict[str, Callable[[], Model]] = {"rims": _rims, "faint": _faint, "cloud": _cloud}
 
 
 def cameras() -> dict[str, Camera]:
@@ -110,23 +110,22 @@ def cameras() -> dict[str, Camera]:
     return result
 
 
-def scene(name: str) -> SplatFile:
+def scene(name: str) -> Model:
     """A scene as SPZ holds it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.spz"
-        raw = SCENES[name]()
-        formats.write(formats.named(path), path, raw, raw.thresholds)
+        formats.write(formats.named(path), path, SCENES[name]())
         return formats.read(path)
 
 
-def draw(splat: SplatFile, camera: Camera, thresholds: Tensor | None) -> tuple[Tensor, float]:
+def draw(splat: Model, camera: Camera) -> tuple[Tensor, float]:
     """The oracle's picture (3, H, W) over black, and its fragments per pixel."""
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.types import RasterInputs
 
     with torch.no_grad():
         inputs = RasterInputs(camera.view(), splat.splats(), planes=())
-        drawn = create_engine("reference").rasterize(inputs, thresholds)
+        drawn = create_engine("reference").rasterize(inputs, splat.falloff)
     return drawn.image.clamp(0, 1), float(drawn.fragments_per_pixel)
 
 
@@ -144,15 +143,15 @@ def write(out: Path) -> dict[str, Any]:
     scenes: dict[str, Any] = {}
     for name in SCENES:
         splat = scene(name)
-        write_ply(out / f"{name}.ply", splat, splat.thresholds)
-        write_ply(out / f"{name}.without.ply", splat)
-        for suffix in SUFFIXES[1:]:
+        without = splat.untruncated()
+        formats.write(formats.PLY, out / f"{name}.without.ply", without)
+        for suffix in SUFFIXES:
             path = out / f"{name}{suffix}"
-            formats.write(formats.named(path), path, splat, splat.thresholds)
+            formats.write(formats.named(path), path, splat)
         views = {}
         for view, camera in cameras().items():
-            image, fragments = draw(splat, camera, splat.thresholds)
-            ignored, more = draw(splat, camera, None)
+            image, fragments = draw(splat, camera)
+            ignored, more = draw(without, camera)
             save_image(out / f"{name}.{view}.png", image)
             save_image(out / f"{name}.{view}.without.png", ignored)
             views[view] = {
@@ -164,13 +163,13 @@ def write(out: Path) -> dict[str, Any]:
                     "psnr_against_picture": round(float(psnr(ignored, image)), 2),
                 },
             }
-        assert splat.thresholds is not None
+        assert splat.falloff is not None
         scenes[name] = {
             "says": (SCENES[name].__doc__ or "").strip(),
             "gaussians": len(splat),
             "files": [f"{name}{suffix}" for suffix in SUFFIXES],
             "file_without_cutoffs": f"{name}.without.ply",
-            "codes": cutoffs.encode(splat.thresholds).tolist(),
+            "codes": cutoffs.encode(splat.falloff).tolist(),
             "views": views,
         }
     content = {

@@ -11,7 +11,6 @@ of Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaus
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import InputError, ModelFileError
+from fragprune_plugins.errors import ModelFileError
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.model import REST_COUNTS, Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
 from fragprune_plugins.files.reading import Door
-from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import Splats
+from fragprune_plugins.learning.thresholds import ThresholdStore
 
 THRESHOLD_COLUMN = "trunc_threshold"
 
@@ -36,7 +35,6 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _FILTER = "filter_3D"
-_REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
 _REMEDY = "Pass the point_cloud.ply that a 3DGS training saved."
 _DOOR = Door(
     ModelFileError,
@@ -55,93 +53,7 @@ _QUATERNION_MIN = 1e-12  # torch's normalize divides by no less
 _SHOWN_ROWS = 5  # of those that a message is about
 
 
-@dataclass(frozen=True, eq=False)
-class SplatFile:
-    """A splat with the values of its file: N Gaussians, before activation, float32.
-
-    Attributes:
-        xyz: (N, 3) means, world.
-        f_dc: (N, 1, 3) first SH coefficient.
-        f_rest: (N, K - 1, 3) the other coefficients, K = (degree + 1)^2.
-        opacity: (N, 1) logits.
-        scaling: (N, 3) logarithms of standard deviations; (N, 2) of surfels.
-        rotation: (N, 4) quaternions w, x, y, z of any length.
-        thresholds: (N,) truncation thresholds in (0, 1); None if the file has none.
-        filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units. It widens
-            every axis and lowers the opacity accordingly.
-    """
-
-    xyz: Tensor
-    f_dc: Tensor
-    f_rest: Tensor
-    opacity: Tensor
-    scaling: Tensor
-    rotation: Tensor
-    thresholds: Tensor | None = None
-    filter_3d: Tensor | None = None
-
-    __repr__ = one_line
-
-    def __post_init__(self) -> None:
-        n = len(self.xyz)
-        shapes = {
-            "xyz": (n, 3),
-            "f_dc": (n, 1, 3),
-            "f_rest": (n, self.f_rest.shape[1] if self.f_rest.ndim == 3 else 0, 3),
-            "opacity": (n, 1),
-            "scaling": (n, 2 if tuple(self.scaling.shape[1:]) == (2,) else 3),
-            "rotation": (n, 4),
-            "thresholds": (n,),
-            "filter_3d": (n, 1),
-        }
-        for name, shape in shapes.items():
-            if (part := getattr(self, name)) is not None and tuple(part.shape) != shape:
-                found = tuple(part.shape)
-                raise InputError(f"SplatFile.{name}", f"shape {found}", f"{shape}", "Check it.")
-        if 3 * self.f_rest.shape[1] not in _REST_COUNTS:
-            raise InputError(
-                "SplatFile.f_rest",
-                f"{self.f_rest.shape[1]} coefficients",
-                "0, 3, 8 or 15 (SH degree 0 to 3)",
-                "Check it.",
-            )
-
-    def __len__(self) -> int:
-        return len(self.xyz)
-
-    @property
-    def sh_degree(self) -> int:
-        """The SH degree, 0 to 3, from the number of coefficients."""
-        return _REST_COUNTS[3 * self.f_rest.shape[1]]
-
-    def to(self, device: torch.device | str) -> SplatFile:
-        """The same Gaussians on a device; tensors that are there already are not copied."""
-        moved = {name: each.to(device) for name, each in vars(self).items() if each is not None}
-        return replace(self, **moved)
-
-    def keep(self, mask: Tensor) -> SplatFile:
-        """The rows where mask (N,) bool is True, in their order."""
-        held = {each.name: getattr(self, each.name) for each in fields(self)}
-        return replace(self, **{k: rows[mask] for k, rows in held.items() if rows is not None})
-
-    def splats(self) -> Splats:
-        """The Gaussians after activation, for engines; differentiable."""
-        opacities, scales = torch.sigmoid(self.opacity[:, 0]), torch.exp(self.scaling)
-        if self.filter_3d is not None:
-            wider = (scales.square() + self.filter_3d.square()).sqrt()
-            opacities = opacities * (scales / wider).prod(dim=1)
-            scales = wider
-        return Splats(
-            means=self.xyz,
-            opacities=opacities,
-            scales=scales,
-            rotations=torch.nn.functional.normalize(self.rotation),
-            sh=torch.cat([self.f_dc, self.f_rest], dim=1),
-            sh_degree=self.sh_degree,
-        )
-
-
-def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
+def read_ply(path: Path, *, filtered: bool = False) -> Model:
     """Read a trained splat. The number of f_rest columns gives the SH degree.
 
     Args:
@@ -170,7 +82,7 @@ def read_ply(path: Path, *, filtered: bool = False) -> SplatFile:
         return _splat(path, columns, filtered)
 
 
-def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
+def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
     """The splat of a file's columns; raises ModelFileError."""
     names, count = columns.keys(), len(next(iter(columns.values())))
     scales = _SCALES if _SCALES[2] in names else _SCALES[:2]
@@ -207,7 +119,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
         (name for name in names if name.startswith("f_rest_") and name[7:].isdecimal()),
         key=lambda name: (len(name), name),
     )
-    if len(rest) not in _REST_COUNTS or rest != [f"f_rest_{i}" for i in range(len(rest))]:
+    if len(rest) not in REST_COUNTS or rest != [f"f_rest_{i}" for i in range(len(rest))]:
         raise ModelFileError(
             str(path),
             f"{len(rest)} f_rest columns",
@@ -223,7 +135,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
         _require_finite(path, wanted, data)
         return torch.from_numpy(data)
 
-    splat = SplatFile(
+    splat = Model(
         xyz=column(*_XYZ),
         f_dc=column(*_DC)[:, None, :],
         f_rest=(
@@ -235,9 +147,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
         scaling=column(*scales),
         rotation=column(*_ROTATION),
         thresholds=(
-            _checked_thresholds(path, column(THRESHOLD_COLUMN)[:, 0])
-            if THRESHOLD_COLUMN in names
-            else None
+            _store_of(path, column(THRESHOLD_COLUMN)[:, 0]) if THRESHOLD_COLUMN in names else None
         ),
         filter_3d=column(_FILTER) if _FILTER in names else None,
     )
@@ -245,15 +155,12 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> SplatFile:
     return splat
 
 
-def write_ply(
-    path: Path, model: SplatFile, thresholds: Tensor | None = None, *, marked: bool = False
-) -> None:
-    """Write a splat atomically in the hosts' layout, with the exact values that ``read_ply`` gave.
+def write_ply(path: Path, model: Model, *, marked: bool = False) -> None:
+    """Write a model atomically in the hosts' layout, with the exact values that ``read_ply`` gave.
 
     Args:
         path: the file; an existing one is replaced only when the new one is complete.
-        model: the Gaussians.
-        thresholds: (N,) for the last column ``trunc_threshold``; None for no such column.
+        model: the Gaussians; thresholds that cut become the last column, ``trunc_threshold``.
         marked: note in the header that a sidecar with thresholds belongs to the file.
 
     Raises:
@@ -274,8 +181,8 @@ def write_ply(
     ]
     if model.filter_3d is not None:
         columns.append(((_FILTER,), model.filter_3d))
-    if thresholds is not None:
-        columns.append(((THRESHOLD_COLUMN,), thresholds.reshape(n, 1)))
+    if (falloff := model.falloff) is not None:
+        columns.append(((THRESHOLD_COLUMN,), falloff.reshape(n, 1)))
     names = [name for group, _ in columns for name in group]
     table = torch.cat([values.detach().cpu().float() for _, values in columns], dim=1)
     rows = np.ascontiguousarray(table.numpy()).view([(name, "<f4") for name in names])[:, 0]
@@ -316,7 +223,7 @@ def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, An
         )
 
 
-def expect_drawable(path: Path, splat: SplatFile) -> None:
+def expect_drawable(path: Path, splat: Model) -> None:
     """Check values that were read from a file.
 
     Raises:
@@ -326,8 +233,6 @@ def expect_drawable(path: Path, splat: SplatFile) -> None:
     for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
         values = getattr(splat, name)
         _require_finite(path, (name,), values.reshape(len(splat), -1).numpy())
-    if splat.thresholds is not None:
-        _checked_thresholds(path, splat.thresholds)
     vast = (splat.scaling > LOG_SCALE_MAX).any(dim=1)
     if splat.filter_3d is not None:
         vast |= splat.filter_3d[:, 0].abs() > math.exp(LOG_SCALE_MAX)
@@ -355,7 +260,7 @@ def _rows(wrong: Tensor, columns: str = "") -> str:
     return f"{len(rows)} of {len(wrong)} rows{where}: {listed}{more}"
 
 
-def _checked_thresholds(path: Path, values: Tensor) -> Tensor:
+def _store_of(path: Path, values: Tensor) -> ThresholdStore:
     outside = ~((values > 0) & (values < 1))
     if outside.any():
         raise ModelFileError(
@@ -364,4 +269,4 @@ def _checked_thresholds(path: Path, values: Tensor) -> Tensor:
             "falloff thresholds in (0, 1)",
             "Export the model again with fragprune export.",
         )
-    return values
+    return ThresholdStore.from_falloff(values)

@@ -17,6 +17,7 @@ from fragprune_plugins.reprs import short
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99
+_ROUNDING = 1e-4  # relative: sigmoid of logit loses less, unless the logit had to be clamped
 
 
 class ThresholdStore:
@@ -41,6 +42,8 @@ class ThresholdStore:
         # eps as the hosts have it: a larger one freezes thresholds whose gradients are tiny.
         self.optimizer = torch.optim.Adam([self.logits], lr=lr, eps=1e-15)
         self._seen: tuple[Tensor, int] | None = None  # the logits last looked at, and their version
+        # the logits that given thresholds became, their version, and the thresholds
+        self._given: tuple[Tensor, int, Tensor] | None = None
 
     def __len__(self) -> int:
         return len(self.logits)
@@ -69,7 +72,7 @@ class ThresholdStore:
                 "Correct them; ThresholdStore.from_alpha takes a limit of alpha.",
             )
         store = cls(len(thresholds), thresholds.device, lr)
-        store.place(torch.logit(thresholds.detach()))
+        store._place_values(thresholds.detach().float())
         return store
 
     @classmethod
@@ -96,8 +99,31 @@ class ThresholdStore:
 
     @property
     def values(self) -> Tensor:
-        """(N,) thresholds in (0, 1), also in float32; differentiable with respect to the logits."""
-        return torch.sigmoid(self.logits.clamp(LOGIT_MIN, LOGIT_MAX))
+        """(N,) thresholds in (0, 1), float32; differentiable with respect to the logits.
+
+        Those of ``from_falloff`` come back to the bit for as long as they do not change.
+        """
+        values = torch.sigmoid(self.logits.clamp(LOGIT_MIN, LOGIT_MAX))
+        if (given := self._given_values()) is None:
+            return values
+        return values + (given - values).detach()  # exact: they are neighbours
+
+    def _given_values(self) -> Tensor | None:
+        """The thresholds that ``from_falloff`` got, unless the logits have changed since."""
+        if self._given is None:
+            return None
+        logits, version, values = self._given
+        return values if logits is self.logits and version == logits._version else None
+
+    def _place_values(self, values: Tensor) -> None:
+        """Set thresholds (N,) whose sigmoid is not rounded back: files get the bits they gave."""
+        neutral = torch.sigmoid(torch.full_like(values, NEUTRAL_LOGIT))
+        logits = torch.logit(values)
+        self.place(torch.where(values <= neutral, logits.clamp_max(NEUTRAL_LOGIT), logits))
+        near = self.logits.detach().sigmoid()
+        same = (values - near).abs() <= _ROUNDING * near
+        if not self.logits.is_inference():  # made in inference mode, it has no version
+            self._given = self.logits, self.logits._version, torch.where(same, values, near)
 
     @property
     def neutral(self) -> bool:
@@ -161,6 +187,18 @@ class ThresholdStore:
     def place(self, logits: Tensor) -> None:
         """Set the logits (N,), clamped to where float32 thresholds differ from 0 and from 1."""
         self.logits.copy_(logits.clamp(LOGIT_MIN, LOGIT_MAX))
+
+    def clone(self, device: torch.device | str | None = None) -> ThresholdStore:
+        """A copy with its moments, on a device; on its own when None."""
+        device = self.logits.device if device is None else device
+        other = ThresholdStore(0, device, self.optimizer.param_groups[0]["lr"])
+        other.load_state_dict(self.state_dict())
+        if (given := self._given_values()) is not None:
+            other._given = other.logits, other.logits._version, given.to(other.logits.device)
+        return other
+
+    def __deepcopy__(self, memo: object) -> ThresholdStore:
+        return self.clone()
 
     def keep(self, mask: Tensor) -> None:
         """Keep the rows where mask (N,) bool is True, in their order, with their moments."""
@@ -292,7 +330,7 @@ class ThresholdStore:
 
     def _resize(self, change: Any, tail: Tensor | None = None) -> None:
         """Apply a row operation to logits and moments alike; tail overwrites the last logits."""
-        old = self.optimizer.state.get(self.logits)
+        old, given = self.optimizer.state.get(self.logits), self._given_values()
         lr = self.optimizer.param_groups[0]["lr"]
         logits = change(self.logits.detach())
         if tail is not None and len(tail):
@@ -300,6 +338,8 @@ class ThresholdStore:
         self._bind(logits, lr)
         if old:
             self._set_moments(change(old["exp_avg"]), change(old["exp_avg_sq"]), old["step"])
+        if given is not None and tail is None:
+            self._given = self.logits, self.logits._version, change(given)
 
     def _rows(self, rows: Tensor, count: int, operation: str) -> Tensor:
         rows = torch.as_tensor(rows, dtype=torch.int64, device=self.logits.device)

@@ -6,18 +6,19 @@ Every command, the session of a host and the functions of the package ask here a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import ENGINES, Engine, create_engine
-from fragprune_plugins.errors import EngineError
+from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.loading import Plugins, Wrong, installed
-from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.types import RasterInputs, RasterOutputs, View
 
 if TYPE_CHECKING:
     from fragprune_plugins.hosts.findings import Match
@@ -107,9 +108,24 @@ def select_adapter(
     return name
 
 
+@overload
 def rasterize(
     inputs: RasterInputs,
     thresholds: Tensor | ThresholdStore | None = None,
+    *,
+    engine: str | Engine = "auto",
+) -> RasterOutputs: ...
+
+
+@overload
+def rasterize(
+    inputs: Model, thresholds: View, /, *, engine: str | Engine = "auto"
+) -> RasterOutputs: ...
+
+
+def rasterize(
+    inputs: RasterInputs | Model,
+    thresholds: Tensor | ThresholdStore | View | None = None,
     *,
     engine: str | Engine = "auto",
 ) -> RasterOutputs:
@@ -120,21 +136,35 @@ def rasterize(
     rim.
 
     Args:
-        inputs: camera and Gaussians.
+        inputs: camera and Gaussians; or a model, which has its thresholds.
         thresholds: (N,) falloff in (0, 1), used as they are; a store, for which plugins are asked;
-            or None for no truncation.
+            or None for no truncation. For a model, the view: ``rasterize(model, view)``.
         engine: a name ("auto", "reference", "cpu", "cuda", a plugin's) or an engine object.
 
     Raises:
-        InputError: thresholds that do not match the Gaussians.
+        InputError: thresholds that do not match the Gaussians, or a model without a view.
         EngineError: there is no such engine here.
         PluginError: a plugin raised, or its answer cannot be used.
     """
+    if isinstance(inputs, Model) or isinstance(thresholds, View):
+        inputs, thresholds = _of_model(inputs, thresholds)
     thresholds = thresholds_for(inputs, thresholds)
     inputs.check_thresholds(thresholds)  # also for engines that are not ours
     if isinstance(engine, str):
         engine = engine_for(engine, inputs.splats.device)
     return engine.rasterize(inputs, thresholds)
+
+
+def _of_model(model: Any, view: Any) -> tuple[RasterInputs, ThresholdStore | None]:
+    """What a model is drawn with from a view."""
+    if not (isinstance(model, Model) and isinstance(view, View)):
+        raise InputError(
+            "rasterize",
+            f"{type(model).__name__} and {type(view).__name__}",
+            "RasterInputs and thresholds, or a Model and a View",
+            "Pass rasterize(model, view); overview(model) makes a view.",
+        )
+    return RasterInputs(view, model.splats()), model.thresholds
 
 
 def _unknown_engine(name: str, asked: Sequence[str]) -> EngineError:

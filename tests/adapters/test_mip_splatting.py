@@ -185,7 +185,7 @@ def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained,
     run([str(mini / "render.py"), "-m", str(out), "--skip_train"], OPTIONS)
     folder = out / "test" / "ours_29" / "test_preds_1"
     values = sidecar.load(summary.model_after)[0].values.detach()
-    candidate = Candidate(models(summary)[1], values, summary.drawing)
+    candidate = Candidate(models(summary)[1], summary.drawing)
     (shot,) = load_dataset(photographs).test
     with torch.no_grad():
         image = rasterize(candidate.inputs(shot.view, candidate.model.splats()), values).image

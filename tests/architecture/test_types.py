@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +20,11 @@ view = fp.View.look_at((0, 0, -3), (0, 0, 0))
 reveal_type(model)
 reveal_type(fp.render_view(model, view))
 reveal_type(fp.ThresholdStore.from_alpha)
+reveal_type(fp.measure("model.ply", fp.load_dataset("scene")))
 fp.render_view("model.ply")
+fp.render_view(fp.finetune(model, fp.load_dataset("scene")))
+fp.rasterize(model, view)
+fp.rasterize(model)
 """
 
 
@@ -40,23 +45,40 @@ def installed(tmp_path_factory) -> Path:
     return python
 
 
-def test_a_script_of_a_user_is_checked_against_them(installed, tmp_path):
+def checked(python: Path, folder: Path, script: str, *options: str) -> list[str]:
+    """What mypy says about a script, line by line."""
     pytest.importorskip("mypy")
-    (tmp_path / "script.py").write_text(SCRIPT)
-    words = ["--strict", "--python-executable", installed, "--cache-dir", tmp_path / "cache"]
+    (folder / "script.py").write_text(script)
+    words = ["--python-executable", python, "--cache-dir", folder / "cache", *options]
     done = subprocess.run(
         [sys.executable, "-m", "mypy", *words, "script.py"],
-        cwd=tmp_path,
+        cwd=folder,
         capture_output=True,
         text=True,
     )
-    said = done.stdout.splitlines()
+    assert not done.stderr, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_script_of_a_user_is_checked_against_them(installed, tmp_path):
+    said = checked(installed, tmp_path, SCRIPT, "--strict")
     revealed = [line.split('Revealed type is "')[1] for line in said if "Revealed" in line]
-    assert "fragprune_plugins.workbench.models.model.Model" in revealed[0], (
-        done.stdout + done.stderr
-    )
+    assert "fragprune_plugins.files.model.Model" in revealed[0], said
     assert revealed[1] == 'PIL.Image.Image"'
     assert revealed[2].startswith("def (alpha: float, opacities: ")
+    assert revealed[3].startswith("dict[str, ")
     (error,) = (line for line in said if " error: " in line)
-    assert error.startswith("script.py:9: ")
-    assert '"render_view" has incompatible type "str"' in error
+    assert error.startswith("script.py:13: ")
+    assert 'No overload variant of "rasterize" matches argument type "Model"' in error
+
+
+def test_the_lines_of_readme_and_the_how_to_are_right(installed, tmp_path):
+    pages = [(ROOT / name).read_text() for name in ("README.md", "docs/how-to/python.md")]
+    fenced = re.findall(r"```python\n(.*?)```", pages[0], re.DOTALL)
+    indented = [line[4:] for line in pages[1].splitlines() if line.startswith("    ")]
+    assert fenced
+    assert len(indented) > 20
+    script = "\n".join(["import torch", *fenced, *indented])
+    options = ("--ignore-missing-imports", "--disable-error-code", "no-redef")
+    said = checked(installed, tmp_path, script, *options)
+    assert said[-1].startswith("Success"), said

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
@@ -83,8 +82,8 @@ def cameras_file(folder: Path) -> Path:
 @pytest.mark.parametrize("learned", [False, True])
 def test_a_model_of_ones_own_with_its_thresholds(tmp_path: Path, learned: bool) -> None:
     model = tmp_path / "mine.ply"
-    thresholds = torch.full((60,), 0.5) if learned else None
-    write_ply(model, tiny.random_model(), thresholds)
+    splat = tiny.random_model()
+    write_ply(model, tiny.cut(splat, 0.5) if learned else splat)
     arguments = ("--model", model, "--cameras", cameras_file(tmp_path), "--size", "32x32")
     rows = run_json("bench", *arguments, "--repeats", 2, "--forward-only")["results"]
     assert [(row["scene"], row["gaussians"]) for row in rows] == [("mine", 60)] * 2

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
@@ -18,7 +18,7 @@ DIGEST = "f817cb6da8fd62dc50b6708bc3d1ff33eb9ef1bac9659ece73ee8aaf77c8b582"
 digit changes no bit. If it changes all the same, published figures are of another scene."""
 
 
-def digest(scene: SplatFile) -> str:
+def digest(scene: Model) -> str:
     found = hashlib.sha256()
     for name in COLUMNS:
         found.update(getattr(scene, name).numpy().astype("<f4").tobytes())

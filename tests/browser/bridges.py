@@ -71,9 +71,11 @@ def ours(models: dict[str, Path], view: View) -> dict[str, float]:
     """Fragments per pixel of our cpu engine."""
     found = {}
     for name, path in models.items():
-        splat, store = load(path)
-        inputs = RasterInputs(view, splat.splats(), counts=True, planes=())
-        found[name] = float(rasterize(inputs, store, engine="cpu").fragments.float().mean())
+        model = load(path)
+        inputs = RasterInputs(view, model.splats(), counts=True, planes=())
+        found[name] = float(
+            rasterize(inputs, model.thresholds, engine="cpu").fragments.float().mean()
+        )
     return found
 
 
@@ -83,7 +85,7 @@ def camera(words: str, unpruned: Path) -> View:
     if words == "bench":
         return make_view(width, height)
     if words == "overview":
-        return overview(load(unpruned).splat, width=width, height=height)
+        return overview(load(unpruned), width=width, height=height)
     path, _, number = words.rpartition(":")
     given = load_cameras(Path(path))[int(number)][1]
     pose = given.viewmatrix.T

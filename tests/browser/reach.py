@@ -22,9 +22,10 @@ from typing import Any
 from browser.chromium import chromium, opened
 from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
 
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.viewing import overview
-from fragprune_plugins.workbench.models.model import Model, load
+from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.prices.machine import describe_machine
 from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 from fragprune_plugins.workbench.view.server import address, open_server
@@ -52,7 +53,7 @@ RATIOS = [
 
 def compare(browser: Any, before: Model, after: Model, view: View, rounds: int) -> dict[str, Any]:
     """Draw a pruned and an unpruned model in all ways, in turns."""
-    found: dict[str, Any] = {"gaussians": len(before.splat), "ways": {}}
+    found: dict[str, Any] = {"gaussians": len(before), "ways": {}}
     with tempfile.TemporaryDirectory() as folder:
         write_page(Path(folder), [after, before], view)
         with viewing(browser, Path(folder), "full") as tab:
@@ -101,7 +102,7 @@ def serving(model: Model, view: View) -> Any:
 def cold(browser: Any, count: int, rounds: int) -> dict[str, Any]:
     """From the request of the page to its first picture; then frames while the camera turns."""
     view, first, frames = make_view(*SIZE), [], {}
-    with serving(Model(make_scene(count)), view) as where:
+    with serving(make_scene(count), view) as where:
         for _ in range(rounds):
             with opened(browser, where) as tab:
                 tab.page.wait_for_function("() => window.viewer?.firstFrame", timeout=120_000)
@@ -201,7 +202,7 @@ def main() -> None:
             if camera == "bench":
                 view = make_view(width, height)
             else:
-                view = overview(before.splat, width=width, height=height)
+                view = overview(before, width=width, height=height)
             report["scenes"][name] = compare(browser, before, after, view, words.rounds)
         report["cold"] = [cold(browser, count, 3) for count in words.cold]
         with opened(browser, "data:text/html,") as tab:

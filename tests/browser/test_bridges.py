@@ -13,7 +13,8 @@ from browser.engines import NoEnginesError, drawing, engines, install
 from cli.commands import run
 
 from fragprune_plugins import RasterInputs, View, rasterize
-from fragprune_plugins.files.ply import SplatFile, write_ply
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.workbench.models.cutoffs import decode, encode
 
 pytestmark = pytest.mark.browser
@@ -55,7 +56,7 @@ def splat():
     random = torch.Generator().manual_seed(1)
     depth = uniform(random, 2, 5, COUNT)
     across = torch.stack([uniform(random, -w, w, COUNT) for w in (0.6, 0.45)], 1)
-    return SplatFile(
+    return Model(
         xyz=torch.cat([across * depth[:, None], depth[:, None]], 1),
         f_dc=uniform(random, -1.5, 1.5, COUNT, 1, 3),
         f_rest=torch.zeros(COUNT, 0, 3),
@@ -68,7 +69,7 @@ def splat():
 
 @pytest.fixture(scope="module")
 def codes(splat):
-    return encode(splat.thresholds).tolist()
+    return encode(splat.falloff).tolist()
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,7 @@ def view():
 def whole(splat, tmp_path_factory):
     """The file without cutoffs."""
     path = tmp_path_factory.mktemp("whole") / "model.ply"
-    write_ply(path, splat)
+    write_ply(path, splat.untruncated())
     return path
 
 
@@ -89,7 +90,7 @@ def whole(splat, tmp_path_factory):
 def cut(splat, tmp_path_factory):
     """The file with the column of cutoffs."""
     path = tmp_path_factory.mktemp("cut") / "model.ply"
-    write_ply(path, splat, splat.thresholds)
+    write_ply(path, splat)
     return path
 
 
@@ -114,7 +115,7 @@ def ours(splat, view, engine, thresholds):
 
 def falloffs(splat, truncated=True):
     """The least falloff that is drawn of each Gaussian, (N,)."""
-    tau = torch.from_numpy(decode(encode(splat.thresholds))) if truncated else torch.zeros(COUNT)
+    tau = torch.from_numpy(decode(encode(splat.falloff))) if truncated else torch.zeros(COUNT)
     return tau.clamp(min=EDGE)
 
 
@@ -152,12 +153,12 @@ def test_the_conformance_scenes_are_drawn_as_expected(draw, engine, name, tmp_pa
     conformance = pytest.importorskip("cutoff_files")
     splat, camera = conformance.scene(name), conformance.cameras()["front"]
     path = tmp_path / "scene.ply"
-    write_ply(path, splat, splat.thresholds)
+    write_ply(path, splat)
     have = draw(engine, path, camera.view(), bridge=True, plain=True) / 255
-    want, _ = conformance.draw(splat, camera, splat.thresholds)
+    want, _ = conformance.draw(splat, camera)
     if (engine, name) != ("playcanvas", "cloud"):
         assert psnr(have, want.permute(1, 2, 0).numpy()) > CONFORMING
-    want = ours(splat, camera.view(), engine, splat.thresholds.clamp(min=EDGE)).image
+    want = ours(splat, camera.view(), engine, splat.falloff.clamp(min=EDGE)).image
     assert psnr(have, want.permute(1, 2, 0).clamp(0, 1).numpy()) > CONFORMING + 2
 
 
@@ -217,10 +218,10 @@ def test_rows_that_playcanvas_was_told_to_leave_in_order(draw, whole, cut, codes
 def test_playcanvas_draws_the_cutoffs_of_a_sog(draw, splat, codes, tmp_path):
     """The format reorders rows; a file keeps its codes in its own order, also without a column."""
     formats = pytest.importorskip("fragprune_plugins.workbench.models.formats")
-    for name, thresholds in (("cut", splat.thresholds), ("whole", None)):
+    for name, each in (("cut", splat), ("whole", splat.untruncated())):
         path = tmp_path / f"{name}.sog"
-        formats.write(formats.named(path), path, splat, thresholds)
-    stored = encode(formats.read(tmp_path / "cut.sog").thresholds).tolist()
+        formats.write(formats.named(path), path, each)
+    stored = encode(formats.read(tmp_path / "cut.sog").falloff).tolist()
     assert sorted(stored) == sorted(codes)
     assert stored != codes
     cut = draw("playcanvas", tmp_path / "cut.sog", bridge=True)

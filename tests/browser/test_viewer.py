@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,9 +11,9 @@ from browser.chromium import opened, served
 from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
 from finetune import tiny
 
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import View
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.view.site import Layer, Shown, make_site, save_site, single_page
 from reference_renderer import Camera, Gaussians, Options
@@ -30,7 +32,7 @@ def a_model(degree: int = 1, count: int = 300, seed: int = 3) -> Model:
     splat.scaling.add_(0.8 * torch.randn(count, 3, generator=stream) - 0.6)
     splat.opacity.copy_(2.5 * torch.randn(count, 1, generator=stream))
     thresholds = torch.rand(count, generator=stream) * 0.5 + 0.004
-    return Model(splat, ThresholdStore.from_falloff(thresholds))
+    return replace(splat, thresholds=ThresholdStore.from_falloff(thresholds))
 
 
 def a_view(**lens: float) -> View:
@@ -67,8 +69,8 @@ def boxes(
 
     Shapes are boxes, or octagons around ellipses of more than ``large`` square pixels.
     """
-    splat = model.splat.splats()
-    front = (model.splat.xyz @ view.viewmatrix[:3, :3] + view.viewmatrix[3, :3])[:, 2] > 0.2
+    splat = model.splats()
+    front = (model.xyz @ view.viewmatrix[:3, :3] + view.viewmatrix[3, :3])[:, 2] > 0.2
     camera = Camera(**{name: getattr(view, name) for name in Camera.__dataclass_fields__})
     gaussians = Gaussians(
         means=splat.means.double(),
@@ -138,7 +140,7 @@ def test_full_pixels_are_left_alone_and_look_the_same(browser, tmp_path):
 
 def test_usual_quads_reach_as_far_for_every_gaussian(browser, tmp_path):
     model, view = a_model(), a_view()
-    model.splat.opacity.fill_(-3.0)  # faint ones end long before the square root of 8
+    model.opacity.fill_(-3.0)  # faint ones end long before the square root of 8
     write_page(tmp_path, [model], view)
     quads = {}
     for options in ("", "quads=fixed"):
@@ -173,7 +175,7 @@ def test_hands_and_keys(browser, tmp_path):
     data, _, splat = tiny.scene(tmp_path / "scene")
     shown = [Shown(shot.name, shot.view, shot) for shot in load_dataset(data).test]
     store = ThresholdStore.from_falloff(torch.full((len(splat),), 0.3))
-    write_page(tmp_path / "page", [Model(splat, store)], shown[0].view, tuple(shown))
+    write_page(tmp_path / "page", [replace(splat, thresholds=store)], shown[0].view, tuple(shown))
     with viewing(browser, tmp_path / "page", width=800, height=600) as tab:
         page = tab.page
         page.wait_for_function("() => viewer.counted")

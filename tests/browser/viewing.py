@@ -14,8 +14,8 @@ import torch
 from browser.chromium import Tab, opened, served
 
 from fragprune_plugins import rasterize
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, View
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.view.site import Layer, camera, make_site, save_site
 
 
@@ -78,7 +78,7 @@ def engine_frame(model: Model, view: View, *, truncated: bool = True) -> np.ndar
     """Our cpu engine's picture, (H, W, 3) RGB in [0, 1]."""
     store = model.thresholds if truncated else None
     with torch.no_grad():
-        inputs = RasterInputs(view, model.splat.splats(), planes=())
+        inputs = RasterInputs(view, model.splats(), planes=())
         image = rasterize(inputs, store, engine="cpu").image
     return image.clamp(0, 1).permute(1, 2, 0).numpy()
 

@@ -114,7 +114,7 @@ def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(model
 
 def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
     path = tmp_path / "pruned.ply"
-    write_ply(path, tiny.random_model(), torch.full((60,), 0.3))
+    write_ply(path, tiny.cut(tiny.random_model(), 0.3))
     words = ("--views", 1, "--resolution", 16)
     report = run_json("audit", path, "--out", tmp_path / "out", *words)
     assert report["truncated"] is True

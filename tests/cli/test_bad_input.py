@@ -122,7 +122,7 @@ def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypat
     def never(*args, **kwargs):
         raise AssertionError("learned although nothing can be written")
 
-    monkeypatch.setattr("fragprune_plugins.workbench.finetune.finetune", never)
+    monkeypatch.setattr("fragprune_plugins.workbench.finetune.loop.finetune", never)
     inside = out / "below-a-file.ply"
     refused(("finetune", path, "--data", data, "--out", inside), "output", "cannot be written")
     folder = tmp_path / "folder.ply"
@@ -134,7 +134,7 @@ def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypat
 @pytest.mark.parametrize("command", ["finetune", "export"])
 def test_the_model_itself_is_no_output(scene, command):
     data, path, _ = scene
-    write_ply(path, tiny.random_model(8), torch.full((8,), 0.3))
+    write_ply(path, tiny.cut(tiny.random_model(8), 0.3))
     before = path.read_bytes()
     more = ("--data", data) if command == "finetune" else ()
     for out in (path, path.with_suffix(".PLY")):  # one sidecar for both
@@ -162,7 +162,7 @@ def test_a_file_is_not_written_under_the_name_of_another_kind(words, wrong, kind
 
 def test_upper_case_is_the_same_kind(scene, tmp_path):
     _, path, _ = scene
-    write_ply(path, tiny.random_model(8), torch.full((8,), 0.3))
+    write_ply(path, tiny.cut(tiny.random_model(8), 0.3))
     assert run("export", path, "--out", tmp_path / "OUT.PLY").exit_code == 0
     assert read_ply(tmp_path / "OUT.PLY").thresholds is not None
 
@@ -215,7 +215,7 @@ def test_bugs_keep_their_traceback(scene, monkeypatch):
     def bug(*args, **kwargs):
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("fragprune_plugins.workbench.figures.measure", bug)
+    monkeypatch.setattr("fragprune_plugins.workbench.figures.evaluate.measure_all", bug)
     with pytest.raises(ZeroDivisionError):
         run("profile", path, "--data", data)
 
@@ -234,7 +234,7 @@ def test_what_the_machine_refuses_is_stated(scene, monkeypatch, error, code):
     def refuse(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr("fragprune_plugins.workbench.figures.measure", refuse)
+    monkeypatch.setattr("fragprune_plugins.workbench.figures.evaluate.measure_all", refuse)
     refused(("profile", path, "--data", data), code, "")
 
 

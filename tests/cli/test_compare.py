@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 
-import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
@@ -16,7 +15,7 @@ FIGURES = ("psnr", "ssim", "fragments_per_pixel", "gaussians")
 def test_two_models(tmp_path):
     data, path, model = tiny.scene(tmp_path)
     other = tmp_path / "other.ply"
-    write_ply(other, model, torch.full((len(model),), 0.3))
+    write_ply(other, tiny.cut(model, 0.3))
     report = run_json("compare", path, other, "--data", data, "--out", tmp_path / "pictures")
     assert report["speedup"] > 1.2
     assert report["a"]["model"] == str(path)

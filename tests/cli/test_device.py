@@ -33,7 +33,7 @@ def engine(monkeypatch, plug):
 @pytest.fixture
 def scene(tmp_path):
     data, path, model = tiny.scene(tmp_path)
-    write_ply(path, model, torch.full((len(model),), 0.3))
+    write_ply(path, tiny.cut(model, 0.3))
     cameras = tmp_path / "path.json"
     content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
     cameras.write_text(json.dumps(content))

@@ -295,7 +295,7 @@ def test_goes_on_from_thresholds_beside_the_model(scene, tmp_path):
 
 def test_goes_on_from_an_exported_column(scene, tmp_path):
     data, path, model = scene
-    write_ply(path, model, torch.full((len(model),), 0.3))
+    write_ply(path, tiny.cut(model, 0.3))
     out = tmp_path / "out.ply"
     run_json("finetune", path, "--data", data, "--out", out, "--iters", 1)
     values = sidecar.load(out)[0].values.detach()
@@ -337,7 +337,7 @@ def test_sigterm_saves_at_once_and_leaves_with_143(scene, tmp_path, monkeypatch)
         raise AssertionError("whoever sends SIGTERM does not wait for this")
 
     monkeypatch.setattr(loop, "photometric_loss", photometric)
-    monkeypatch.setattr("fragprune_plugins.workbench.figures.measure", measured)
+    monkeypatch.setattr("fragprune_plugins.workbench.figures.evaluate.measure_all", measured)
     result = run("finetune", path, "--data", data, "--out", out, "--iters", 50, "--json")
     assert result.exit_code == 143
     report = json.loads(result.stdout)

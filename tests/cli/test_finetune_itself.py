@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -60,7 +61,7 @@ def test_no_photograph_is_opened(tmp_path, write):
     for file in data.glob("transforms_*.json"):  # these may leave the size to the images
         file.write_text(json.dumps(json.loads(file.read_text()) | {"w": tiny.SIDE, "h": tiny.SIDE}))
     forget_photographs(data)
-    fp.save(path, fp.Model(truth))
+    fp.save(path, truth)
     report = finetuned(path, tmp_path / "out.ply", "--data", data, "--pressure", 1e-3)
     assert report["target"] == report["after"]["target"] == "itself"
     assert report["after"]["views"] == 2  # the folder's held-out cameras
@@ -79,7 +80,7 @@ def test_the_figure_is_the_difference_to_the_model_s_own_pictures(scene, cameras
     with torch.no_grad():
         values = [
             psnr(
-                fp.rasterize(RasterInputs(view, learned.splat.splats()), learned.thresholds).image,
+                fp.rasterize(RasterInputs(view, learned.splats()), learned.thresholds).image,
                 fp.rasterize(RasterInputs(view, model.splats())).image,
             )
             for _, view in held_out
@@ -139,7 +140,7 @@ def test_the_target_is_what_the_model_shows_as_it_came_in(scene, falloff):
     _, _, model = scene
     store = falloff and fp.ThresholdStore.from_falloff(torch.full((len(model),), falloff))
     views = [(f"view{i}", camera.view()) for i, camera in enumerate(tiny.cameras(3))]
-    shot = fp.own_pictures(fp.Model(model, store), views, views).train[0]
+    shot = fp.own_pictures(replace(model, thresholds=store), views, views).train[0]
     thresholds = store and store.values.detach().clone()
     if store:
         store.place(store.logits.detach() + 1)  # it learns
@@ -187,8 +188,8 @@ def test_in_python(scene, cameras, tmp_path):
     _, path, _ = scene
     model, out = fp.load(path), tmp_path / "out.ply"
     pictures = fp.own_pictures(model, fp.load_cameras(cameras))
-    result = fp.finetune(model.splat, pictures, fp.Settings(iterations=2, itself=True))
-    fp.save(out, fp.Model(result.model, result.store))
+    result = fp.finetune(model, pictures, fp.Settings(iterations=2, itself=True))
+    fp.save(out, result)
     assert not fp.load(out).thresholds.neutral
 
 

@@ -95,7 +95,9 @@ def test_a_finished_command_says_so_and_does_nothing(scene, tmp_path, monkeypatc
     out = tmp_path / "out.ply"
     first = run_json(*words(scene, out))
     with monkeypatch.context() as patch:
-        patch.setattr("fragprune_plugins.workbench.finetune.finetune", None)  # cannot be called
+        patch.setattr(
+            "fragprune_plugins.workbench.finetune.loop.finetune", None
+        )  # cannot be called
         again = run_json(*words(scene, out))
         assert again == first | {"already_finished": True}
         text = run(*words(scene, out, "--curves", tmp_path / "curves.png"))

@@ -7,7 +7,6 @@ from argparse import Namespace
 from dataclasses import replace
 
 import pytest
-import torch
 from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
@@ -150,5 +149,5 @@ def test_models_of_different_things_are_told_apart(tmp_path):
     (warning,) = run_json("compare", path, other, "--data", data)["warnings"]
     assert warning.startswith("B hardly shows these photographs")
     near = tmp_path / "near.ply"
-    write_ply(near, model, torch.full((len(model),), 0.2))
+    write_ply(near, tiny.cut(model, 0.2))
     assert run_json("compare", path, near, "--data", data)["warnings"] == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
@@ -14,7 +13,7 @@ def test_with_and_without_thresholds(tmp_path):
     plain = run_json("profile", path, "--data", data)
     assert plain["truncated"] is False
     assert list(plain["columns"]) == ["untruncated"]
-    write_ply(path, model, torch.full((len(model),), 0.3))
+    write_ply(path, tiny.cut(model, 0.3))
     report = run_json("profile", path, "--data", data, "--out", tmp_path / "pictures")
     assert list(report["columns"]) == ["untruncated", "truncated"]
     assert report["fragments_per_pixel"] == report["columns"]["truncated"]["fragments_per_pixel"]

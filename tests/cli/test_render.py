@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import pytest
-import torch
 from cli.commands import run, run_json
 from finetune import tiny
 from finetune.several import command
@@ -17,7 +16,7 @@ from fragprune_plugins.files.ply import write_ply
 @pytest.fixture
 def scene(tmp_path):
     data, path, model = tiny.scene(tmp_path)
-    write_ply(path, model, torch.full((len(model),), 0.3))
+    write_ply(path, tiny.cut(model, 0.3))
     return data, path
 
 

@@ -7,7 +7,6 @@ import urllib.request
 from threading import Thread
 
 import pytest
-import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
@@ -18,7 +17,7 @@ from fragprune_plugins.workbench.view import server as serving
 @pytest.fixture
 def scene(tmp_path):
     data, path, model = tiny.scene(tmp_path)
-    write_ply(path, model, torch.full((len(model),), 0.3))
+    write_ply(path, tiny.cut(model, 0.3))
     return data, path
 
 

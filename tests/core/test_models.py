@@ -8,23 +8,20 @@ from cli.commands import run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.errors import AlignmentError, OutputError, SidecarError
+from fragprune_plugins.errors import OutputError, SidecarError
 from fragprune_plugins.files import sidecar
 
 
 @pytest.fixture
 def model():
-    splat = tiny.random_model()
-    return fp.Model(splat, fp.ThresholdStore.from_falloff(torch.linspace(0.01, 0.5, len(splat))))
+    return tiny.cut(tiny.random_model(), torch.linspace(0.01, 0.5, 60))
 
 
 def test_what_was_saved_comes_back(model, tmp_path):
     beside = fp.save(str(tmp_path / "a.ply"), model)
     assert beside == tmp_path / "a.fragprune.safetensors"
-    splat, thresholds = fp.load(str(tmp_path / "a.ply"))
-    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
-        assert torch.equal(getattr(splat, name), getattr(model.splat, name))
-    assert torch.equal(thresholds.logits, model.thresholds.logits)
+    read = tiny.state(fp.load(str(tmp_path / "a.ply")))
+    assert all(torch.equal(each, read[name]) for name, each in tiny.state(model).items())
     assert fp.load(tmp_path / "a.ply", truncation=False).thresholds is None
 
 
@@ -37,7 +34,7 @@ def test_others_may_read_what_a_plain_open_lets_them(model, tmp_path):
 
 def test_a_model_without_thresholds_replaces_one_with_them(model, tmp_path):
     fp.save(tmp_path / "a.ply", model)
-    fp.save(tmp_path / "a.ply", model._replace(thresholds=None))
+    fp.save(tmp_path / "a.ply", model.untruncated())
     assert fp.load(tmp_path / "a.ply").thresholds is None
 
 
@@ -59,10 +56,7 @@ def test_the_sidecar_says_that_it_belongs_to_the_file(model, tmp_path):
         fp.load(str(tmp_path / "a.ply"))
 
 
-@pytest.mark.parametrize(
-    ("name", "rows", "error"), [("a.png", 60, OutputError), ("a.ply", 59, AlignmentError)]
-)
-def test_what_cannot_be_saved_leaves_nothing(model, tmp_path, name, rows, error):
-    with pytest.raises(error):
-        fp.save(tmp_path / name, model._replace(thresholds=fp.ThresholdStore(rows)))
+def test_what_cannot_be_saved_leaves_nothing(model, tmp_path):
+    with pytest.raises(OutputError):
+        fp.save(tmp_path / "a.png", model)
     assert list(tmp_path.iterdir()) == []

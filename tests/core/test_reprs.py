@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pkgutil
+from dataclasses import replace
 from importlib import import_module
 
 import pytest
@@ -41,11 +42,11 @@ def values():
     inputs = fp.RasterInputs(tiny.cameras()[0].view(), splat.splats())
     outputs = fp.rasterize(inputs.with_counts())
     store = fp.ThresholdStore(500)
-    model = fp.Model(splat, store)
+    model = replace(splat, thresholds=store)
     return [inputs.view, inputs.splats, inputs, outputs, splat, store, model]
 
 
-def test_one_line_without_numbers_of_tensors(values):
+def test_one_line_without_the_numbers_of_tensors(values):
     for value in values:
         text = repr(value)
         assert text.startswith(type(value).__name__ + "(")
@@ -58,10 +59,10 @@ def test_shapes_types_and_counts_are_shown(values):
     view, splats, *_, splat, store, model = values
     assert repr(store) == "ThresholdStore(logits=float32[500], steps=0)"
     assert repr(splat) == (
-        "SplatFile(xyz=float32[500, 3], f_dc=float32[500, 1, 3], f_rest=float32[500, 3, 3], "
+        "Model(xyz=float32[500, 3], f_dc=float32[500, 1, 3], f_rest=float32[500, 3, 3], "
         "opacity=float32[500, 1], scaling=float32[500, 3], rotation=float32[500, 4])"
     )
-    assert repr(model) == f"Model(splat={splat!r}, thresholds={store!r})"
+    assert repr(model) == f"{repr(splat)[:-1]}, thresholds={store!r})"
     assert repr(view).startswith("View(width=32, height=32, tan_fov_x=0.44")
     assert "sh_degree=1" in repr(splats)
     assert "cov3d" not in repr(splats)  # what is not given is not shown

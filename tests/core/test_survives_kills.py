@@ -26,22 +26,22 @@ SPLAT = tiny.random_model(20)
 
 def save(path: Path, generation: int, kind: str = "pair") -> None:
     """Save a model all of whose numbers tell its generation."""
-    splat = fp.SplatFile(**vars(SPLAT) | {"opacity": torch.full((20, 1), float(generation))})
+    splat = fp.Model(**vars(SPLAT) | {"opacity": torch.full((20, 1), float(generation))})
     if kind == "alone":  # as export, and as a host's stage 1
         with atomic.staging(path) as folder:
             write_ply(folder / path.name, splat)
             sidecar.replace_pair(path, folder / path.name, None)
         return
     thresholds = torch.full((20,), 1 / (2.0 + generation))
-    fp.save(path, fp.Model(splat, fp.ThresholdStore.from_falloff(thresholds)))
+    fp.save(path, tiny.cut(splat, thresholds))
 
 
 def generation(path: Path) -> int:
     """Of both parts of a pair, loaded as every reader loads it."""
-    splat, store = fp.load(path)
+    splat = fp.load(path)
     found = int(splat.opacity[0])
-    if store is not None:
-        assert torch.allclose(store.values, torch.tensor(1 / (2.0 + found)))
+    if splat.falloff is not None:
+        assert torch.allclose(splat.falloff, torch.tensor(1 / (2.0 + found)))
     assert (splat.opacity == found).all()
     return found
 

@@ -14,7 +14,7 @@ from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+from fragprune_plugins.workbench.figures.evaluate import measure
 from fragprune_plugins.workbench.finetune.loop import photometric_loss
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
@@ -163,14 +163,14 @@ def test_what_a_mask_hides_neither_teaches_nor_counts(tmp_path, images):
     assert drawn.grad is not None
     assert float((drawn.grad * hidden).abs().max()) == 0
     assert float((drawn.grad * (1 - hidden)).abs().max()) > 0
-    with_mask = measure([Candidate(tiny.random_model())], data.test, repeats=1)[0]["psnr"]
+    with_mask = measure(tiny.random_model(), data, repeats=1)["psnr"]
     for path in (tmp_path / "images").iterdir():  # what the mask hides changes
         with Image.open(path) as picture:
             pixels = np.array(picture)
         pixels[:, : tiny.SIDE // 2] = 255
         Image.fromarray(pixels).save(path)
-    again = measure([Candidate(tiny.random_model())], load_dataset(tmp_path).test, repeats=1)
-    assert again[0]["psnr"] == with_mask
+    again = measure(tiny.random_model(), load_dataset(tmp_path), repeats=1)
+    assert again["psnr"] == with_mask
 
 
 def test_the_path_that_nerfstudios_viewer_saves(tmp_path):

@@ -58,7 +58,7 @@ def require_calm(steps: int, folder: Path) -> None:
     curves, (half, end), result = learn_for(steps, folder)
     assert end[1] <= half[1] + 2  # tensors alive
     assert end[0] - half[0] < 4_000_000 + A_POINT * steps // 2  # bytes
-    assert all(each.isfinite().all() for each in result.store.numbers.values())
+    assert all(each.isfinite().all() for each in result.model.thresholds.numbers.values())
     third, last = (
         sum(point.fragments_per_pixel for point in part) / len(part)
         for part in (curves[steps // 2 : 3 * steps // 4], curves[3 * steps // 4 :])

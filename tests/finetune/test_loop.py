@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
@@ -54,8 +55,8 @@ def test_loss_falls_and_fragments_fall(default, model, dataset):
     )
     assert last < first
     engine = create_engine("auto")
-    before = mean_fragments(model, None, dataset.test, engine)
-    after = mean_fragments(default.model, default.thresholds, dataset.test, engine)
+    before = mean_fragments(model, dataset.test, engine)
+    after = mean_fragments(default.model, dataset.test, engine)
     assert after < 0.9 * before
     assert default.progress.speedup == pytest.approx(before / after, rel=0.1)
     assert default.progress.steps == 60
@@ -70,8 +71,7 @@ def test_more_pressure_draws_less(default, model, dataset):
 
 def test_control_learns_opacities_alone(model, dataset):
     result = finetune(model, dataset, Settings(iterations=20, truncate=False))
-    assert result.store.neutral
-    assert result.thresholds is None
+    assert result.model.thresholds is None
     assert result.progress.speedup == pytest.approx(1, abs=0.05)  # opacities alone move
     assert not torch.equal(result.model.opacity, model.opacity)
     assert result.curves[-1].loss < result.curves[0].loss
@@ -85,7 +85,7 @@ def test_same_seed_same_result_and_global_streams_untouched(default, model, data
     assert torch.equal(states[0], torch.random.get_rng_state())
     assert states[1] == random.getstate()
     assert torch.equal(again.model.opacity, default.model.opacity)
-    assert torch.equal(again.store.logits, default.store.logits)
+    assert torch.equal(again.model.thresholds.logits, default.model.thresholds.logits)
     other = finetune(model, dataset, Settings(iterations=60, pressure=1e-3, seed=1))
     assert not torch.equal(other.model.opacity, default.model.opacity)
 
@@ -94,8 +94,8 @@ def test_same_seed_same_result_and_global_streams_untouched(default, model, data
 def test_target_is_met_on_training_views(model, dataset, target):
     result = finetune(model, dataset, Settings(iterations=80, target_speedup=target))
     engine = create_engine("auto")
-    before = mean_fragments(model, None, dataset.train, engine)
-    after = mean_fragments(result.model, result.thresholds, dataset.train, engine)
+    before = mean_fragments(model, dataset.train, engine)
+    after = mean_fragments(result.model, dataset.train, engine)
     assert before / after == pytest.approx(target, rel=0.02)
     assert result.progress.target_reached
     assert result.progress.speedup == pytest.approx(target, rel=0.02)
@@ -120,11 +120,10 @@ def test_interrupted(model, dataset, monkeypatch):
 
 
 def test_divergence_that_no_loss_shows_is_noticed_before_there_is_a_result(model, dataset):
-    store = ThresholdStore(len(model))
     spoiled = replace(model, opacity=model.opacity.clone())
     spoiled.opacity[:2] = torch.nan  # not drawn, so not in the loss either
     with pytest.raises(DivergedError, match=rf"opacity \(2 of {len(model)} rows\)"):
-        finetune(spoiled, dataset, Settings(iterations=3), store=store)
+        finetune(spoiled, dataset, Settings(iterations=3))
 
 
 @pytest.mark.parametrize(("bad", "rows"), [(torch.nan, 3), (torch.inf, 1), (1e25, 2)])
@@ -165,22 +164,25 @@ def test_a_run_that_skips_too_much_stops(model, dataset, monkeypatch):
         finetune(model, dataset, Settings(iterations=9, nonfinite="skip"))
 
 
-def test_going_on_from_a_store(default, model, dataset):
-    store = ThresholdStore(len(model))
-    store.load_state_dict(default.store.state_dict())
-    start = store.logits.detach().clone()
-    result = finetune(default.model, dataset, Settings(iterations=3), store=store)
-    assert result.store is store
-    assert store.steps == default.store.steps + 3
-    assert float((store.logits.detach() - start).abs().max()) < 0.5
+def test_going_on_from_a_result_leaves_that_result_alone(default, dataset):
+    before = tiny.state(default.model)
+    result = finetune(default, dataset, Settings(iterations=3))
+    now, start = result.model.thresholds, default.model.thresholds
+    assert now.steps == start.steps + 3
+    assert 0 < float((now.logits - start.logits).detach().abs().max()) < 0.5
+    for name, each in tiny.state(default.model).items():
+        assert torch.equal(each, before[name]), name
+
+
+def test_a_control_has_no_thresholds_even_of_a_model_with_some(default, dataset):
+    result = finetune(default, dataset, Settings(iterations=1, truncate=False))
+    assert result.model.thresholds is None
 
 
 @pytest.mark.parametrize("rows", [0, 1, 61])
-@pytest.mark.parametrize("truncate", [True, False])
-def test_a_store_of_another_model_is_refused_with_both_counts(model, dataset, rows, truncate):
-    settings = Settings(iterations=1, truncate=truncate)
+def test_thresholds_of_another_model_are_refused_with_both_counts(model, rows):
     with pytest.raises(AlignmentError, match=f"{rows} thresholds; expected 60"):
-        finetune(model, dataset, settings, store=ThresholdStore(rows))
+        replace(model, thresholds=ThresholdStore(rows))
 
 
 def test_save_writes_a_pair_that_reads_back(default, tmp_path):
@@ -189,7 +191,7 @@ def test_save_writes_a_pair_that_reads_back(default, tmp_path):
     assert beside == sidecar.path_beside(path)
     assert torch.equal(read_ply(path).opacity, default.model.opacity)
     store, info = sidecar.load(path)
-    assert torch.equal(store.logits, default.store.logits)
+    assert torch.equal(store.logits, default.model.thresholds.logits)
     assert info.settings["iterations"] == 60
     assert sorted(p.name for p in path.parent.iterdir()) == sorted([path.name, beside.name])
 
@@ -247,9 +249,9 @@ def test_a_target_time_is_met_where_frames_take_what_is_measured(
     assert result.progress.target_reached
     assert result.progress.faster == pytest.approx(target, rel=0.02)
     engine, times = create_engine("cpu"), []
-    for splat, cut in ((model, None), (result.model, result.thresholds)):
+    for each in (model, result.model):
         drawn = [
-            engine.rasterize(RasterInputs(shot.view, splat.splats(), planes=()), cut)
+            engine.rasterize(RasterInputs(shot.view, each.splats(), planes=()), each.falloff)
             for shot in dataset.train
         ]
         times.append(sum(real.ms(work_of(outputs)) for outputs in drawn))

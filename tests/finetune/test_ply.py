@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.errors import InputError, ModelFileError
-from fragprune_plugins.files.ply import SplatFile, expect_drawable, read_ply, write_ply
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.files.ply import expect_drawable, read_ply, write_ply
 
 
-def same(a: SplatFile, b: SplatFile) -> bool:
+def same(a: Model, b: Model) -> bool:
     return all(
         torch.equal(one, other) if torch.is_tensor(one) else one is other
         for f in fields(a)
@@ -38,19 +39,19 @@ def same(a: SplatFile, b: SplatFile) -> bool:
 def test_round_trip_is_bit_exact(tmp_path, count, degree, seed, exported):
     model = tiny.random_model(count, degree, seed)
     thresholds = torch.rand(count) * 0.98 + 0.01 if exported else None
-    write_ply(tmp_path / "m.ply", model, thresholds)
+    write_ply(tmp_path / "m.ply", model if thresholds is None else tiny.cut(model, thresholds))
     read = read_ply(tmp_path / "m.ply")
     assert same(model, read)
     assert read.sh_degree == degree
     if exported:
-        assert torch.equal(read.thresholds, thresholds)
+        assert torch.equal(read.falloff, thresholds)
     else:
         assert read.thresholds is None
 
 
 def test_columns_are_the_hosts(tmp_path):
     model = tiny.random_model(3, degree=2)
-    write_ply(tmp_path / "m.ply", model, torch.full((3,), 0.25))
+    write_ply(tmp_path / "m.ply", tiny.cut(model, 0.25))
     vertex = PlyData.read(tmp_path / "m.ply")["vertex"]
     names = [p.name for p in vertex.properties]
     rest = " ".join(f"f_rest_{i}" for i in range(24))
@@ -125,7 +126,7 @@ def test_activation(tmp_path):
     assert splats.sh_degree == 3
 
 
-def nan_in_two_rows(model: SplatFile) -> SplatFile:
+def nan_in_two_rows(model: Model) -> Model:
     scaling = model.scaling.clone()
     scaling[1, 2] = torch.nan
     scaling[3, 2] = torch.inf
@@ -181,7 +182,10 @@ def spoil(path: Path, how: str) -> None:
     elif how == "nan":
         write_ply(path, nan_in_two_rows(tiny.random_model(8, degree=1)))
     elif how == "thresholds":
-        write_ply(path, tiny.random_model(8, degree=1), torch.linspace(0.5, 1.2, 8))
+        write_ply(path, tiny.cut(tiny.random_model(8, degree=1), 0.5))
+        content = PlyData.read(path, mmap=False)
+        content["vertex"]["trunc_threshold"][:] = np.linspace(0.5, 1.2, 8)
+        content.write(path)
 
 
 MESSAGES = {
@@ -215,9 +219,8 @@ def test_shapes_are_checked():
     model = tiny.random_model(4)
     with pytest.raises(InputError, match="opacity"):
         replace(model, opacity=model.opacity[:, 0])
-    for name in ("thresholds", "filter_3d"):
-        with pytest.raises(InputError, match=name):
-            replace(model, **{name: torch.full((3, 1), 0.5)})
+    with pytest.raises(InputError, match="filter_3d"):
+        replace(model, filter_3d=torch.full((3, 1), 0.5))
     with pytest.raises(InputError, match="f_rest"):
         replace(model, f_rest=torch.zeros(4, 5, 3))
 
@@ -238,14 +241,15 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 def test_kept_rows_stay_in_their_order_with_all_that_they_have():
-    model = replace(
-        tiny.random_model(6), thresholds=torch.linspace(0.1, 0.6, 6), filter_3d=torch.rand(6, 1)
+    model = tiny.cut(
+        replace(tiny.random_model(6), filter_3d=torch.rand(6, 1)), torch.linspace(0.1, 0.6, 6)
     )
     mask = torch.tensor([True, False, True, True, False, False])
     kept = model.keep(mask)
     assert len(kept) == 3
-    for each in fields(SplatFile):
-        assert torch.equal(getattr(kept, each.name), getattr(model, each.name)[mask])
+    for name, each in model.tensors.items():
+        assert torch.equal(getattr(kept, name), each[mask])
+    assert torch.equal(kept.falloff, model.falloff[mask])
     assert tiny.random_model(6).keep(mask).thresholds is None
 
 

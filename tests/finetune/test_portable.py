@@ -39,7 +39,7 @@ def test_more_pressure_covers_less(scene):
     free, light = (
         finetune(model, dataset, replace(settings, pressure=pressure)) for pressure in (0.0, 5e-2)
     )
-    assert light.thresholds is None
+    assert light.model.thresholds is None
     assert area(light.model, dataset) < 0.9 * area(free.model, dataset)
     assert len(light.model) == len(model)
 
@@ -97,7 +97,7 @@ def test_the_record_has_the_area_of_both(scene, tmp_path, more):
     out = tmp_path / "out.ply"
     words = ("--data", data, "--out", out, "--iters", 30, "--portable", "--pressure", 1e-2)
     report = run_json("finetune", path, *words, *more)
-    learned = fp.load(out).splat
+    learned = fp.load(out)
     dataset = fp.load_dataset(data)
     for side, splat in (("before", model), ("after", learned)):
         assert report[side]["area_per_pixel"] == pytest.approx(area(splat, dataset), rel=1e-6)
@@ -157,6 +157,6 @@ def test_a_control_is_not_portable(tmp_path):
 
 def test_a_model_with_thresholds_is_refused(scene):
     data, _, model = scene
-    store = ThresholdStore.from_falloff(torch.full((len(model),), 0.1))
+    model = tiny.cut(model, 0.1)
     with pytest.raises(UsageError, match="--no-truncation"):
-        finetune(model, fp.load_dataset(data), Settings(portable=True), store=store)
+        finetune(model, fp.load_dataset(data), Settings(portable=True))

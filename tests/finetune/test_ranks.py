@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from finetune import tiny
 from finetune.several import launch, learn, lose_nan
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,7 +19,6 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning import ranks as module
 from fragprune_plugins.learning.ranks import Ranks, fingerprint, launched, speaks
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.loop import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
@@ -42,11 +42,8 @@ def one_thread(single_thread):
 
 def learned(model, dataset, settings, ranks=None):
     """Everything that a fine-tuning leaves, as plain values."""
-    store = ThresholdStore(len(model))
-    result = finetune(model, dataset, settings, store=store, engine="cpu", ranks=ranks)
-    tensors = {name: getattr(result.model, name) for name in ALL}
-    tensors |= {k: v for k, v in store.state_dict().items() if torch.is_tensor(v)}
-    return tensors, str(result.curves), result.progress
+    result = finetune(model, dataset, settings, engine="cpu", ranks=ranks)
+    return tiny.state(result.model), str(result.curves), result.progress
 
 
 def require_same(one, other):

@@ -12,7 +12,6 @@ from finetune import tiny
 
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune import checkpoints as files
 from fragprune_plugins.workbench.finetune import loop, resuming, timing
 from fragprune_plugins.workbench.finetune.loop import finetune
@@ -37,18 +36,13 @@ def run(
     cut=None,
     monkeypatch=None,
     tell=None,
-    store=None,
     **options,
 ):
     """Fine-tune, with a checkpoint every third step; ``cut`` ends it in the midst of that step."""
     kept = None if path is None else Checkpoints(path, None, 3, tell or (lambda _: None))
-    started = store
-    if started is None and path is not None:
-        started = ThresholdStore(len(model))
+    options |= {"engine": "cpu", "checkpoints": kept}
     if cut is None:
-        options |= {"store": started, "engine": "cpu", "checkpoints": kept}
         return finetune(model, dataset, settings, **options)
-    options |= {"store": started, "engine": "cpu", "checkpoints": kept}
     calls, loss = 0, loop.photometric_loss
 
     def cutting(*args):
@@ -66,11 +60,10 @@ def run(
 
 
 def require_same(one, other):
-    for name in ALL:
-        assert torch.equal(getattr(one.model, name), getattr(other.model, name)), name
-    for key, value in one.store.state_dict().items():
-        again = other.store.state_dict()[key]
-        assert torch.equal(value, again) if torch.is_tensor(value) else value == again, key
+    first, second = tiny.state(one.model), tiny.state(other.model)
+    assert first.keys() == second.keys()
+    for name, each in first.items():
+        assert torch.equal(each, second[name]), name
     assert str(one.curves) == str(other.curves)  # also where a figure is NaN
     assert one.progress == other.progress
 
@@ -143,7 +136,7 @@ def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkey
     monkeypatch.setattr(resuming, "digest", lambda path: read.append(path) or digest(path))
 
     def asked():
-        return resuming.configuration(model, None, dataset, Settings(), "cpu")["photographs"]
+        return resuming.configuration(model, dataset, Settings(), "cpu")["photographs"]
 
     first = asked()
     assert asked() == first
@@ -248,9 +241,8 @@ def test_another_model_photographs_or_thresholds_are_refused(
     darker = tiny.dataset_in_memory(tmp_path, tiny.random_model(seed=3))
     with pytest.raises(CheckpointError, match="other photographs;"):
         run(model, darker, settings, path)
-    learned = ThresholdStore.from_falloff(torch.full((len(model),), 0.1))
     with pytest.raises(CheckpointError, match="other thresholds;"):
-        run(model, dataset, settings, path, store=learned)
+        run(tiny.cut(model, 0.1), dataset, settings, path)
 
 
 def spoil(path, how):

@@ -23,7 +23,6 @@ from fragprune_plugins.workbench.finetune.loop import finetune
 from fragprune_plugins.workbench.finetune.processes import Shards, part_of, whole_of
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.sharded import ShardedEngine, reaching
-from fragprune_plugins.workbench.models.model import Model
 
 STEPS = 12
 ATTRIBUTES = ("means", "opacities", "scales", "rotations", "sh")
@@ -137,7 +136,7 @@ def test_a_process_without_thresholds_draws_neutral_ones_where_others_have_some(
     cut[COUNT // 2 :] = 1e-12
 
     def work(ranks):
-        splats = part_of(Model(tiny.random_model(COUNT)), ranks, "cpu").splat.splats()
+        splats = part_of(tiny.random_model(COUNT), ranks, "cpu").splats()
         inputs = RasterInputs(tiny.cameras()[ranks.rank].view(), splats)
         with torch.no_grad():
             return ShardedEngine(engine, ranks).rasterize(
@@ -249,29 +248,12 @@ CASES = {
 
 def learned(model, dataset, settings, ranks=None, checkpoints=None):
     """What a fine-tuning leaves: all Gaussians and thresholds, its curves and its progress."""
-    part, engine, store = model, create_engine("cpu"), ThresholdStore(len(model))
+    part, engine = model, create_engine("cpu")
     if ranks is not None:
-        part, _ = part_of(Model(model), ranks, "cpu")
-        engine, store = ShardedEngine(engine, ranks), ThresholdStore(len(part))
-    result = finetune(
-        part,
-        dataset,
-        settings,
-        store=store,
-        engine=engine,
-        ranks=ranks,
-        checkpoints=checkpoints,
-    )
-    splat, store = result.model, result.store
-    if ranks is not None:
-        splat, store = whole_of(splat, store, ranks)
-    state = store.state_dict()
-    tensors = {**vars(splat), **state}
-    return (
-        {name: each for name, each in tensors.items() if torch.is_tensor(each)},
-        result.curves,
-        result.progress,
-    )
+        part, engine = part_of(model, ranks, "cpu"), ShardedEngine(engine, ranks)
+    result = finetune(part, dataset, settings, engine=engine, ranks=ranks, checkpoints=checkpoints)
+    whole = result.model if ranks is None else whole_of(result.model, ranks)
+    return tiny.state(whole), result.curves, result.progress
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -380,14 +362,10 @@ def test_parts_hold_every_gaussian_once_and_make_the_whole_again(model):
     store.step()
 
     def work(ranks):
-        part = part_of(Model(model, store), ranks, "cpu")
-        splat, thresholds = whole_of(*part, ranks)
-        return len(part.splat), vars(splat), thresholds.state_dict()
+        part = part_of(replace(model, thresholds=store), ranks, "cpu")
+        return len(part), tiny.state(whole_of(part, ranks))
 
     parts = learn(4, work)
-    assert [count for count, _, _ in parts] == [15, 15, 15, 15]
-    _, splat, state = parts[0]
-    for name, each in vars(model).items():
-        assert each is splat[name] is None or torch.equal(each, splat[name]), name
-    for name, each in store.state_dict().items():
-        assert torch.equal(torch.as_tensor(each), torch.as_tensor(state[name])), name
+    assert [count for count, _ in parts] == [15, 15, 15, 15]
+    for name, each in tiny.state(replace(model, thresholds=store)).items():
+        assert torch.equal(each, parts[0][1][name]), name

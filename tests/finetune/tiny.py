@@ -13,7 +13,9 @@ import torch
 from PIL import Image
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.files.ply import SplatFile, write_ply
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph
 from fragprune_plugins.workbench.scenes.pinhole import Camera
@@ -22,14 +24,14 @@ SIDE = 32
 FOCAL = 36.0
 
 
-def random_model(count: int = 60, degree: int = 1, seed: int = 0) -> SplatFile:
+def random_model(count: int = 60, degree: int = 1, seed: int = 0) -> Model:
     """Opaque, overlapping Gaussians around the origin."""
     stream = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=stream)
 
-    return SplatFile(
+    return Model(
         xyz=0.5 * normal(count, 3),
         f_dc=0.8 * normal(count, 1, 3),
         f_rest=0.1 * normal(count, (degree + 1) ** 2 - 1, 3),
@@ -58,7 +60,7 @@ def cameras(count: int = 9) -> list[Camera]:
     return result
 
 
-def photographs(model: SplatFile) -> list[torch.Tensor]:
+def photographs(model: Model) -> list[torch.Tensor]:
     """The model as the cameras see it, (3, H, W) each."""
     with torch.no_grad():
         return [
@@ -144,7 +146,7 @@ def write_blender(folder: Path, images: list[torch.Tensor]) -> Path:
     return folder
 
 
-def scene(folder: Path) -> tuple[Path, Path, SplatFile]:
+def scene(folder: Path) -> tuple[Path, Path, Model]:
     """A COLMAP folder and a model whose opacities are off: data, model file, the model."""
     truth = random_model()
     data = write_colmap(folder / "data", photographs(truth))
@@ -154,13 +156,26 @@ def scene(folder: Path) -> tuple[Path, Path, SplatFile]:
     return data, path, model
 
 
-def perturbed(truth: SplatFile) -> SplatFile:
+def perturbed(truth: Model) -> Model:
     stream = torch.Generator().manual_seed(1)
     noise = 0.7 * torch.randn(truth.opacity.shape, generator=stream)
     return replace(truth, opacity=truth.opacity + noise)
 
 
-def dataset_in_memory(folder: Path, truth: SplatFile) -> Dataset:
+def cut(model: Model, thresholds: torch.Tensor | float) -> Model:
+    """The same Gaussians with thresholds (N,), or one for all."""
+    values = torch.as_tensor(thresholds).expand(len(model))
+    return replace(model, thresholds=ThresholdStore.from_falloff(values))
+
+
+def state(model: Model) -> dict[str, torch.Tensor]:
+    """All tensors of a model, those of its thresholds with their moments among them."""
+    store = model.thresholds
+    learned = {} if store is None else store.state_dict()
+    return model.tensors | {name: torch.as_tensor(each) for name, each in learned.items()}
+
+
+def dataset_in_memory(folder: Path, truth: Model) -> Dataset:
     """The dataset without a reader in between."""
     shots = []
     for i, (camera, image) in enumerate(zip(cameras(), photographs(truth), strict=True)):

@@ -5,17 +5,17 @@ from __future__ import annotations
 import torch
 from hypothesis import strategies as st
 
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 
 
-def random_splat(count: int, degree: int, seed: int) -> SplatFile:
+def random_splat(count: int, degree: int, seed: int) -> Model:
     """Values as trainings leave them: positions within 8, SH within 0.8, opacities 0.03 to 0.97."""
     stream = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
         return low + (high - low) * torch.rand(*shape, generator=stream)
 
-    return SplatFile(
+    return Model(
         xyz=uniform(-8, 8, count, 3),
         f_dc=uniform(-1.5, 1.5, count, 1, 3),
         f_rest=uniform(-0.8, 0.8, count, (degree + 1) ** 2 - 1, 3),
@@ -28,7 +28,7 @@ def random_splat(count: int, degree: int, seed: int) -> SplatFile:
 splats = st.builds(random_splat, st.integers(1, 70), st.integers(0, 3), st.integers(0, 1 << 31))
 
 
-def shapes(splat: SplatFile) -> torch.Tensor:
+def shapes(splat: Model) -> torch.Tensor:
     """(N, 3, 3) covariances in units of the largest axis: what rotations are there for."""
     w, x, y, z = torch.nn.functional.normalize(splat.rotation.double()).unbind(1)
     turn = torch.stack(
@@ -44,7 +44,7 @@ def shapes(splat: SplatFile) -> torch.Tensor:
     return half @ half.transpose(1, 2)
 
 
-def apart(one: SplatFile, other: SplatFile) -> dict[str, float]:
+def apart(one: Model, other: Model) -> dict[str, float]:
     """The largest difference of each kind of value, drawn colours and opacities in [0, 1]."""
     return {
         "xyz": _most(one.xyz, other.xyz),

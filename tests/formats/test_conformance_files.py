@@ -38,10 +38,10 @@ def expected(path):
 
 
 def drawn(path, view):
-    splat, store = load(path)
-    inputs = RasterInputs(view, splat.splats(), planes=())
+    model = load(path)
+    inputs = RasterInputs(view, model.splats(), planes=())
     with torch.no_grad():
-        out = create_engine("cpu").rasterize(inputs, None if store is None else store.values)
+        out = create_engine("cpu").rasterize(inputs, model.falloff)
     return out.image.clamp(0, 1), float(out.fragments_per_pixel)
 
 
@@ -75,8 +75,7 @@ def test_a_renderer_that_ignores_cutoffs_fails(folder, said, scene):
 def test_codes_are_listed_in_the_order_of_rows(folder, said, scene):
     codes = said["scenes"][scene]["codes"]
     for suffix in (".ply", ".spz", ".glb"):
-        store = load(folder / f"{scene}{suffix}").thresholds
-        assert encode(store.values.detach()).tolist() == codes
+        assert encode(load(folder / f"{scene}{suffix}").falloff).tolist() == codes
 
 
 def test_the_same_files_come_out_again(folder, tmp_path):

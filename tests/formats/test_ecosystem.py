@@ -14,10 +14,12 @@ from pathlib import Path
 import pytest
 import torch
 from campaigns.fuzz.seeds import spz_parts
+from finetune import tiny
 from formats.scenes import apart, random_splat
 
-from fragprune_plugins import Model, ThresholdStore, load, save
+from fragprune_plugins import load, save
 from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.models import formats
 
 pytestmark = [pytest.mark.npm, pytest.mark.timeout(600)]
 
@@ -60,15 +62,13 @@ def expect_same(one, other):
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".compressed.ply", ".splat"])
 def test_it_reads_what_we_write(convert, splat, suffix, thresholds, tmp_path):
     ours, theirs = tmp_path / f"ours{suffix}", tmp_path / "theirs.ply"
-    store = ThresholdStore.from_falloff(torch.linspace(0.01, 0.9, len(splat)))
-    if suffix == ".ply" and thresholds:
-        write_ply(ours, splat, store.values.detach())
-    elif suffix in (".compressed.ply", ".splat") and thresholds:
+    cut = tiny.cut(splat, torch.linspace(0.01, 0.9, len(splat)))
+    if suffix in (".compressed.ply", ".splat") and thresholds:
         pytest.skip("holds no thresholds")
-    else:
-        save(ours, Model(splat, store if thresholds else None))
-    back = load(convert(ours, theirs)).splat
-    expected = load(ours).splat
+    form = formats.named(ours)
+    formats.write(form, ours, cut if thresholds else splat)
+    back = load(convert(ours, theirs))
+    expected = load(ours)
     assert len(back) == len(splat)
     if suffix == ".splat":  # it reads 128 as 0.004, where the writers of the format put 0
         assert apart(back, expected)["shape"] < 0.03
@@ -81,18 +81,18 @@ def test_we_read_what_it_writes_as_it_does(convert, splat, suffix, tmp_path):
     write_ply(tmp_path / "a.ply", splat)
     theirs = convert(tmp_path / "a.ply", tmp_path / f"a{suffix}")
     again = convert(theirs, tmp_path / "again.ply")
-    expect_same(load(theirs).splat, load(again).splat)
+    expect_same(load(theirs), load(again))
     assert load(theirs).thresholds is None
 
 
 def test_we_read_its_glb_as_the_model_it_was_made_from(convert, splat, tmp_path):
     write_ply(tmp_path / "a.ply", splat)
-    expect_same(load(convert(tmp_path / "a.ply", tmp_path / "a.glb")).splat, splat)
+    expect_same(load(convert(tmp_path / "a.ply", tmp_path / "a.glb")), splat)
 
 
 def test_without_thresholds_an_spz_is_what_niantics_writer_makes(convert, splat, tmp_path):
     write_ply(tmp_path / "a.ply", splat)
-    save(tmp_path / "ours.spz", Model(splat))
+    save(tmp_path / "ours.spz", splat)
     theirs = convert(tmp_path / "a.ply", tmp_path / "theirs.spz").read_bytes()
     ours = (tmp_path / "ours.spz").read_bytes()
     assert ours[:32] == theirs[:32]

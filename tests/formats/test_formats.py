@@ -6,6 +6,7 @@ import gzip
 import math
 import struct
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,7 +17,7 @@ from finetune import tiny
 from formats.scenes import apart, random_splat, splats
 from hypothesis import HealthCheck, given, settings
 
-from fragprune_plugins import Model, ThresholdStore, load, save
+from fragprune_plugins import ThresholdStore, load, save
 from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
@@ -85,7 +86,7 @@ def through(suffix, model):
 @few
 @given(splat=splats)
 def test_what_is_written_comes_back(suffix, splat):
-    back = through(suffix, Model(splat)).splat
+    back = through(suffix, splat)
     if suffix in SORTED:
         splat = splat.keep(morton_order(splat))
     if suffix == ".splat":
@@ -100,7 +101,7 @@ def test_what_is_written_comes_back(suffix, splat):
 def test_thresholds_come_back_with_their_rows(suffix, splat):
     tau = torch.linspace(0.004, 0.97, len(splat))
     store = ThresholdStore.from_falloff(tau)
-    back = through(suffix, Model(splat, store)).thresholds
+    back = through(suffix, replace(splat, thresholds=store)).thresholds
     wanted = cutoffs.encode(tau if suffix not in SORTED else tau[morton_order(splat)])
     if back is None:  # a row alone may have been rounded to 1/255
         assert not wanted.any()
@@ -113,14 +114,14 @@ def test_neutral_rows_stay_neutral_and_a_neutral_store_is_not_written(suffix, tm
     splat = random_splat(9, 0, 3)
     store = ThresholdStore(9)
     path = tmp_path / f"a{suffix}"
-    save(path, Model(splat, store))
+    save(path, replace(splat, thresholds=store))
     without = path.read_bytes()
-    save(path, Model(splat))
+    save(path, splat)
     assert path.read_bytes() == without
     assert load(path).thresholds is None
     with torch.no_grad():
         store.logits[4] = 0.0
-    save(path, Model(splat, store))
+    save(path, replace(splat, thresholds=store))
     values = load(path).thresholds.values.detach()
     assert sorted((values < 1e-9).tolist()) == [False] + [True] * 8
     assert load(path, truncation=False).thresholds is None
@@ -130,24 +131,23 @@ def test_neutral_rows_stay_neutral_and_a_neutral_store_is_not_written(suffix, tm
 def test_the_same_model_gives_the_same_bytes(suffix, tmp_path):
     one, other = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
     for path in (one, other):
-        save(path, Model(random_splat(40, 2, 1)))
+        save(path, random_splat(40, 2, 1))
     assert one.read_bytes() == other.read_bytes()
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".compressed.ply"])
 def test_a_format_without_thresholds_refuses_them(suffix, tmp_path):
     path = tmp_path / f"a{suffix}"
-    store = ThresholdStore.from_falloff(torch.full((5,), 0.4))
     with pytest.raises(OutputError, match="cannot hold thresholds"):
-        save(path, Model(random_splat(5, 0, 0), store))
+        save(path, tiny.cut(random_splat(5, 0, 0), 0.4))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_plain_ply_beside_other_formats_keeps_its_sidecar(tmp_path):
     splat, store = random_splat(5, 0, 0), ThresholdStore.from_falloff(torch.full((5,), 0.4))
-    save(tmp_path / "a.ply", Model(splat, store))
+    save(tmp_path / "a.ply", replace(splat, thresholds=store))
     for suffix in BOUNDS:
-        save(tmp_path / f"a{suffix}", Model(splat))
+        save(tmp_path / f"a{suffix}", splat)
         assert load(tmp_path / f"a{suffix}").thresholds is None
     assert torch.equal(load(tmp_path / "a.ply").thresholds.logits, store.logits)
 
@@ -183,11 +183,11 @@ def test_sog_beside_its_images(tmp_path):
 
     splat = random_splat(60, 1, 0)
     store = ThresholdStore.from_falloff(torch.linspace(0.01, 0.9, 60))
-    save(tmp_path / "a.sog", Model(splat, store))
+    save(tmp_path / "a.sog", replace(splat, thresholds=store))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         archive.extractall(tmp_path / "folder")
     one, other = load(tmp_path / "a.sog"), load(tmp_path / "folder" / "meta.json")
-    assert max(apart(one.splat, other.splat).values()) == 0
+    assert max(apart(one, other).values()) == 0
     assert torch.equal(one.thresholds.logits, other.thresholds.logits)
     meta = tmp_path / "folder" / "meta.json"
     meta.write_text(meta.read_text().replace("quats.webp", "../a.sog"))
@@ -201,17 +201,17 @@ def test_spz_names_its_axes(tmp_path):
 
     path = tmp_path / "a.spz"
     splat = random_splat(5, 1, 0)
-    save(path, Model(splat))
+    save(path, splat)
     content = path.read_bytes()
 
     def axes(system):
         record = struct.pack("<III", 0xADBE0003, 4, system)
         head = content[:14] + b"\x02" + content[15:16] + struct.pack("<I", 32 + len(record))
         path.write_bytes(head + content[20:32] + record + content[32:])
-        return load(path).splat
+        return load(path)
 
     path.write_bytes(content)
-    plain = load(path).splat
+    plain = load(path)
     assert torch.equal(axes(6).xyz, plain.xyz)
     assert torch.equal(axes(4).xyz, plain.xyz * torch.tensor([1.0, -1.0, -1.0]))
     with pytest.raises(ModelFileError, match="coordinate system 12"):
@@ -222,7 +222,7 @@ def test_what_is_not_followed_is_named(tmp_path, caplog):
     import struct
 
     path = tmp_path / "a.spz"
-    save(path, Model(random_splat(5, 1, 0)))
+    save(path, random_splat(5, 1, 0))
     content = path.read_bytes()
     assert load(path)
     assert not caplog.messages
@@ -240,7 +240,7 @@ def test_more_gaussians_than_a_file_can_hold_are_not_allocated(tmp_path):
     from fragprune_plugins.workbench.models.formats.spz import zstd
 
     path, count = tmp_path / "a.spz", 100_000_000
-    save(path, Model(random_splat(5, 0, 0)))
+    save(path, random_splat(5, 0, 0))
     bomb = zstd.compress(bytes(9 * 1000))
     head = struct.pack("<IIIBBBBI", 0x5053474E, 4, count, 0, 12, 0, 5, 32) + bytes(12)
     table = b"".join(struct.pack("<QQ", len(bomb), count * width) for width in (9, 1, 3, 3, 4))
@@ -252,11 +252,11 @@ def test_more_gaussians_than_a_file_can_hold_are_not_allocated(tmp_path):
 def test_spz_of_a_scene_wider_than_its_usual_bits(tmp_path):
     splat = random_splat(5, 0, 0)
     wide = type(splat)(**{**vars(splat), "xyz": splat.xyz * 5000})
-    save(tmp_path / "a.spz", Model(wide))
-    assert float((load(tmp_path / "a.spz").splat.xyz - wide.xyz).abs().max()) <= 1 / 128
+    save(tmp_path / "a.spz", wide)
+    assert float((load(tmp_path / "a.spz").xyz - wide.xyz).abs().max()) <= 1 / 128
     far = type(splat)(**{**vars(splat), "xyz": splat.xyz * 1e7})
     with pytest.raises(OutputError, match="24 bits"):
-        save(tmp_path / "b.spz", Model(far))
+        save(tmp_path / "b.spz", far)
     assert not (tmp_path / "b.spz").exists()
 
 
@@ -285,7 +285,7 @@ def test_every_suffix_has_a_format_and_others_none():
 @pytest.mark.parametrize("suffix", formats.SUFFIXES)
 def test_commands_convert(suffix, tmp_path):
     _, path, model = tiny.scene(tmp_path)
-    write_ply(path, model, torch.linspace(0.1, 0.9, len(model)))
+    write_ply(path, tiny.cut(model, torch.linspace(0.1, 0.9, len(model))))
     form = formats.named(tmp_path / f"out{suffix}")
     out, back = tmp_path / f"out{suffix}", tmp_path / "back.ply"
     flag = () if form.carries else ("--no-truncation",)
@@ -301,7 +301,7 @@ def test_commands_convert(suffix, tmp_path):
 
 def test_export_says_why_it_refuses(tmp_path):
     _, path, model = tiny.scene(tmp_path)
-    write_ply(path, model, torch.linspace(0.1, 0.9, len(model)))
+    write_ply(path, tiny.cut(model, torch.linspace(0.1, 0.9, len(model))))
     result = run("export", path, "--out", tmp_path / "a.splat")
     assert result.exit_code == 1
     assert "cannot hold thresholds" in result.stderr
@@ -312,7 +312,7 @@ def test_export_says_why_it_refuses(tmp_path):
 def test_finetune_reads_and_writes_spz(tmp_path):
     data, _, model = tiny.scene(tmp_path)
     start, out = tmp_path / "start.spz", tmp_path / "pruned.spz"
-    save(start, Model(model))
+    save(start, model)
     words = ("finetune", start, "--data", data, "--out", out, "--iters", 10)
     report = run_json(*words)
     assert report["out"] == str(out)
@@ -329,7 +329,7 @@ def test_finetune_reads_and_writes_spz(tmp_path):
 @pytest.mark.parametrize("wrong", ["positions", "no file"])
 def test_values_that_cannot_be_drawn_are_refused(wrong, tmp_path):
     path = tmp_path / "a.splat"
-    save(path, Model(random_splat(3, 0, 0)))
+    save(path, random_splat(3, 0, 0))
     content = bytearray(path.read_bytes())
     content[0:4] = b"\xff\xff\xff\x7f"  # NaN
     path.write_bytes(content if wrong == "positions" else content[:40])
@@ -339,7 +339,7 @@ def test_values_that_cannot_be_drawn_are_refused(wrong, tmp_path):
 
 def sog_with(path: Path, name: str, content: bytes, how: int) -> Path:
     """A SOG with one image replaced, compressed in another way."""
-    save(path.with_name("good.sog"), Model(tiny.random_model(40), None))
+    save(path.with_name("good.sog"), tiny.random_model(40))
     with (
         zipfile.ZipFile(path.with_name("good.sog")) as good,
         zipfile.ZipFile(path, "w", how) as bomb,
@@ -370,7 +370,7 @@ def test_an_spz_that_unpacks_into_much_more_is_refused(tmp_path):
 
 
 def test_a_glb_that_counts_from_the_end_is_refused(tmp_path):
-    save(tmp_path / "a.glb", Model(tiny.random_model(3), None))
+    save(tmp_path / "a.glb", tiny.random_model(3))
     content = (tmp_path / "a.glb").read_bytes()
     opacity = b'"KHR_gaussian_splatting:OPACITY":4'
     assert content.count(opacity) == 1

@@ -7,6 +7,7 @@ import json
 import re
 import struct
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import torch
 from formats.scenes import random_splat
 from PIL import Image
 
-from fragprune_plugins import Model, ThresholdStore, load, save
+from fragprune_plugins import ThresholdStore, load, save
 from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.workbench.models import cutoffs
 
@@ -26,7 +27,7 @@ COUNT = 30
 @pytest.fixture
 def model():
     tau = torch.linspace(0.01, 0.95, COUNT)
-    return Model(random_splat(COUNT, 1, 0), ThresholdStore.from_falloff(tau))
+    return replace(random_splat(COUNT, 1, 0), thresholds=ThresholdStore.from_falloff(tau))
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def codes(model):
 
 
 def test_ply_column(model, tmp_path):
-    write_ply(tmp_path / "a.ply", model.splat, model.thresholds.values.detach())
+    write_ply(tmp_path / "a.ply", model)
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
     names = re.findall(rb"property float (\w+)", head)
     assert names[-1] == b"trunc_threshold"

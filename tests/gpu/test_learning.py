@@ -9,7 +9,7 @@ from finetune import tiny
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.finetune.loop import finetune
 
 
@@ -20,11 +20,13 @@ def test_learned_and_measured_as_on_the_cpu(engine: CudaEngine, tmp_path) -> Non
     courses = []
     for each in (engine, create_engine("cpu")):
         result = finetune(tiny.perturbed(truth), dataset, settings, engine=each)
-        candidate = Candidate(result.model, result.store)
-        (report,) = measure([candidate], dataset.test[:1], engine=each, repeats=1)
+        candidate = Candidate(result.model)
+        (report,) = measure_all([candidate], dataset.test[:1], engine=each, repeats=1)
         courses.append((result, report))
     (ours, seen), (cpu, expected) = courses
-    torch.testing.assert_close(ours.store.logits, cpu.store.logits, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(
+        ours.model.thresholds.logits, cpu.model.thresholds.logits, atol=1e-3, rtol=1e-3
+    )
     torch.testing.assert_close(ours.model.opacity, cpu.model.opacity, atol=1e-3, rtol=1e-3)
     assert (seen["engine"], expected["engine"]) == ("cuda", "cpu")
     for figure in ("psnr", "fragments_per_pixel"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from finetune import tiny
 from finetune.several import learn
@@ -12,7 +14,6 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.finetune.processes import part_of
 from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
-from fragprune_plugins.workbench.models.model import Model
 
 LEARNED = ("xyz", "f_rest", "opacity", "scaling")
 
@@ -20,20 +21,20 @@ LEARNED = ("xyz", "f_rest", "opacity", "scaling")
 def drawn(engine, model, indices):
     """Pictures from some cameras, and the gradients by all of them together."""
     for name in LEARNED:
-        getattr(model.splat, name).requires_grad_()
+        getattr(model, name).requires_grad_()
     pictures = []
     for index in indices:
-        inputs = RasterInputs(tiny.cameras()[index].view(), model.splat.splats())
+        inputs = RasterInputs(tiny.cameras()[index].view(), model.splats())
         outputs = engine.rasterize(inputs, model.thresholds.values)
         (outputs.image.square().sum() + outputs.fragments_per_pixel).backward()
         pictures.append(outputs.image.detach())
-    leaves = [getattr(model.splat, name) for name in LEARNED] + [model.thresholds.logits]
+    leaves = [getattr(model, name) for name in LEARNED] + [model.thresholds.logits]
     return pictures, [leaf.grad for leaf in leaves]
 
 
 def scene(count):
     splat = tiny.random_model(count, degree=3)
-    return Model(splat, ThresholdStore.from_falloff(torch.linspace(0.02, 0.4, count)))
+    return replace(splat, thresholds=ThresholdStore.from_falloff(torch.linspace(0.02, 0.4, count)))
 
 
 def test_the_kernels_draw_shards_as_they_draw_the_whole(device, single_thread):

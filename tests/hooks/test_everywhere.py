@@ -18,7 +18,7 @@ from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.figures.evaluate import Candidate, evaluate
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure, measure_all
 from fragprune_plugins.workbench.finetune.loop import finetune
 
 CUT_ALL = 0.999999
@@ -166,11 +166,12 @@ def test_finetune_learns_by_a_plugins_schedule(model, dataset, plug):
     learned = finetune(model, dataset, settings)
     plug(Never())
     result = finetune(model, dataset, settings)
-    assert torch.equal(result.store.logits, opened.store.logits)
-    assert not torch.equal(result.store.logits, learned.store.logits)
-    assert result.store.steps == 0
+    assert learned.model.thresholds is not None
+    assert result.model.thresholds is opened.model.thresholds is None
     given = finetune(model, dataset, settings, schedule=Schedule(settings))
-    assert torch.equal(given.store.logits, learned.store.logits)  # what is passed wins
+    assert torch.equal(
+        given.model.thresholds.logits, learned.model.thresholds.logits
+    )  # what is passed wins
 
 
 def test_finetune_learns_opacities_under_a_plugins_thresholds(model, dataset, plug):
@@ -183,7 +184,7 @@ def test_finetune_learns_opacities_under_a_plugins_thresholds(model, dataset, pl
     result = finetune(model, dataset, Settings(iterations=5, pressure=1e-3))
     start = ThresholdStore(len(model))
     start.open(torch.sigmoid(model.opacity))
-    assert torch.equal(result.store.logits, start.logits)  # they decided nothing
+    assert torch.equal(result.model.thresholds.logits, start.logits)  # they decided nothing
     assert not torch.equal(result.model.opacity, model.opacity)
     assert result.progress.fragments_after < 0.8 * result.progress.fragments_before
 
@@ -225,17 +226,16 @@ def test_an_engine_is_created_once_for_a_name_and_a_device(model, plug):
 
 
 def test_a_store_is_measured_as_its_thresholds_are(model, dataset):
-    store = ThresholdStore(len(model))
-    store.open(torch.full((len(model),), 0.5))
-    one = evaluate(model, store, dataset.test, repeats=1)
-    other = evaluate(model, store.values.detach(), dataset.test, repeats=1)
+    pruned = tiny.cut(model, 0.2)
+    as_they_are = Candidate(model, cut=torch.full((len(model),), 0.2))
+    one = measure(pruned, dataset, repeats=1)
+    other = measure_all([as_they_are], dataset.test, repeats=1)[0]
     for key in ("psnr", "ssim", "fragments_per_pixel", "evaluated_per_pixel"):
         assert one[key] == other[key]
-    assert Candidate(model, store).thresholds is store
 
 
 def test_an_exported_column_is_exported_again_to_the_bit(model, tmp_path):
     values = torch.rand(len(model), generator=torch.Generator().manual_seed(0)).clamp(0.01, 0.9)
-    write_ply(tmp_path / "a.ply", model, values)
+    write_ply(tmp_path / "a.ply", tiny.cut(model, values))
     assert run("export", tmp_path / "a.ply", "--out", tmp_path / "b.ply").exit_code == 0
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()

@@ -26,7 +26,6 @@ from fragprune_plugins.workbench.audit.audit import (
     audit,
     weigh,
 )
-from fragprune_plugins.workbench.models.model import Model
 from reference_renderer.composite import transmittances
 
 ENGINE = engine_for("auto", "cpu")
@@ -125,7 +124,7 @@ def test_alone_is_what_pictures_without_one_gaussian_show():
 @pytest.fixture(scope="module")
 def figures():
     views = [("the same", camera.view()) for camera in tiny.cameras(4)]
-    found, shown = audit(Model(tiny.random_model()), views, engine=ENGINE, repeats=1)
+    found, shown = audit(tiny.random_model(), views, engine=ENGINE, repeats=1)
     return found, shown
 
 
@@ -159,10 +158,10 @@ def test_cuts_are_compared_with_the_model_as_it_is(figures):
 
 def test_a_pruned_model_is_measured_with_its_thresholds_and_without():
     splat = tiny.random_model()
-    pruned = Model(splat, ThresholdStore.from_falloff(torch.full((len(splat),), 0.3)))
+    pruned = replace(splat, thresholds=ThresholdStore.from_falloff(torch.full((len(splat),), 0.3)))
     views = [("view", tiny.cameras()[0].view())]
     found, _ = audit(pruned, views, engine=ENGINE, repeats=1)
-    plain, _ = audit(Model(splat), views, engine=ENGINE, repeats=1)
+    plain, _ = audit(splat, views, engine=ENGINE, repeats=1)
     last = found["cuts"][-1]
     assert last["name"] == UNTRUNCATED
     assert last["fragments_per_pixel"] == plain["fragments_per_pixel"]

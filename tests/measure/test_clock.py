@@ -12,7 +12,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.timing import Case
 from fragprune_plugins.workbench.figures import clock
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
 
@@ -62,7 +62,7 @@ def test_the_clock_runs_from_idle_to_idle(events, monkeypatch):
 def test_every_timed_frame_of_a_measurement_waits(events, tmp_path):
     model = tiny.random_model()
     shots = tiny.dataset_in_memory(tmp_path, model).test
-    measure([Candidate(model)] * 2, shots, engine=Notes(events), repeats=3)
+    measure_all([Candidate(model)] * 2, shots, engine=Notes(events), repeats=3)
     looked_at, frames = 2 * 2 * len(shots), 3 * 2 * len(shots)
     assert events[:looked_at] == ["draw"] * looked_at
     assert events[looked_at:] == ["idle cpu", "draw", "idle cpu"] * frames

@@ -8,7 +8,7 @@ from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.workbench.figures.evaluate import Candidate, evaluate, measure
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure, measure_all
 from fragprune_plugins.workbench.figures.pictures import save_heatmap, save_image, save_panel
 
 NAMES = {
@@ -40,7 +40,7 @@ def shots(truth, tmp_path_factory):
 
 
 def test_report_of_the_truth(truth, shots):
-    report = evaluate(truth, None, shots, repeats=2)
+    report = measure(truth, shots, repeats=2)
     assert set(report) == NAMES
     assert report["psnr"] > 50  # 8-bit photographs of itself
     assert report["ssim"] > 0.999
@@ -52,15 +52,16 @@ def test_report_of_the_truth(truth, shots):
 
 
 def test_truncation_draws_less(truth, shots):
-    thresholds = torch.full((len(truth),), 0.2)
-    plain, cut = measure([Candidate(truth), Candidate(truth, thresholds)], shots, repeats=1)
+    pruned = tiny.cut(truth, 0.2)
+    plain, cut = measure_all([Candidate(truth), Candidate(pruned)], shots, repeats=1)
     assert cut["fragments_per_pixel"] < plain["fragments_per_pixel"]
     assert cut["psnr"] < plain["psnr"]
     assert plain["frame_ms_se"] == 0.0
 
 
 def test_a_model_is_measured_as_its_host_draws_it(truth, shots):
-    plain, wide = measure([Candidate(truth), Candidate(truth, None, {"dilation": 2.0})], shots)
+    candidates = [Candidate(truth), Candidate(truth, {"dilation": 2.0})]
+    plain, wide = measure_all(candidates, shots)
     assert wide["fragments_per_pixel"] > plain["fragments_per_pixel"]
     assert wide["psnr"] < plain["psnr"]
 

@@ -9,7 +9,7 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, View
 from fragprune_plugins.workbench.figures.extents import CUTS, SQRT8, VIEWERS, Extent, Viewer, shaded
 
@@ -18,7 +18,7 @@ BY_NAME = {viewer.names.split(",")[0]: viewer for viewer in VIEWERS}
 
 def one(opacity=0.5, size=0.2):
     """A round Gaussian in the middle of the picture, and its variance there, pixels^2."""
-    splat = SplatFile(
+    splat = Model(
         xyz=torch.zeros(1, 3),
         f_dc=torch.zeros(1, 1, 3),
         f_rest=torch.zeros(1, 0, 3),

@@ -101,7 +101,7 @@ def test_render_films_an_orbit_and_a_path(tmp_path):
     size, _, pictures = frames_of(film)
     assert (size, len(pictures)) == ((tiny.SIDE, tiny.SIDE), 4)
     assert max(float(picture.std()) for picture in pictures) > 5
-    write_ply(model, splat, torch.full((len(splat),), 0.5))  # thresholds apply to films, too
+    write_ply(model, tiny.cut(splat, 0.5))  # thresholds apply to films, too
     assert run_json("render", model, "--orbit", *words, "--out", film)["truncated"]
 
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.audit.placing import place
 
@@ -16,7 +16,7 @@ ENGINE = engine_for("auto", "cpu")
 
 def splat(xyz, size, opacity=0.95):
     count = len(xyz)
-    return SplatFile(
+    return Model(
         xyz=xyz.float(),
         f_dc=torch.zeros(count, 1, 3),
         f_rest=torch.zeros(count, 0, 3),
@@ -86,7 +86,7 @@ def test_thin_haze_all_around_is_no_air():
     """Large faint Gaussians before every wall: no place is open, so cameras stay outside."""
     walls = room()
     haze = splat(0.2 * torch.randn(60, 3, generator=torch.Generator().manual_seed(1)), 1.0, 0.3)
-    model = SplatFile(
+    model = Model(
         **{
             name: torch.cat([getattr(walls, name), getattr(haze, name)])
             for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")

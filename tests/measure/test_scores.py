@@ -13,7 +13,6 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.pruning import scores
 
 COUNT = 20
@@ -154,22 +153,18 @@ def test_thresholds_and_moments_stay_with_their_rows():
     store.open(model.splats().opacities)
     store.logits.grad = torch.linspace(-1, 1, len(model))
     store.step(0.05)
-    state = store.state_dict()
     engine = create_engine("auto")
-    smaller, kept_store = scores.keep_best(Model(model, store), 0.5, VIEWS, engine=engine)
+    smaller = scores.keep_best(replace(model, thresholds=store), 0.5, VIEWS, engine=engine)
     kept = scores.best(scores.removal_error(model, store.values.detach(), VIEWS, engine), 0.5)
-    assert len(smaller) == len(kept_store) == COUNT // 2
-    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
-        assert torch.equal(getattr(smaller, name), getattr(model, name)[kept])
-    for name in ("logits", "exp_avg", "exp_avg_sq"):
-        assert torch.equal(kept_store.state_dict()[name], state[name][kept])
-    assert len(store) == len(model)  # what was given is as it was
+    assert len(smaller) == COUNT // 2
+    expected = tiny.state(replace(model, thresholds=store).keep(kept))
+    assert all(torch.equal(each, expected[k]) for k, each in tiny.state(smaller).items())
 
 
 def test_a_model_without_thresholds_is_pruned_by_the_score_that_is_asked_for():
     model, _ = scene(False)
-    smaller, none = scores.keep_best(Model(model), 0.3, VIEWS, score=scores.opacity)
-    assert none is None
+    smaller = scores.keep_best(model, 0.3, VIEWS, score=scores.opacity)
+    assert smaller.thresholds is None
     faintest = model.opacity[:, 0].sort(descending=True).values[int(0.3 * COUNT) - 1]
     assert torch.equal(smaller.opacity, model.opacity[model.opacity[:, 0] >= faintest])
 
@@ -178,7 +173,7 @@ def test_what_can_be_spared_costs_no_more_than_its_share_of_the_error(tmp_path):
     truth = tiny.random_model()
     model, shots = tiny.perturbed(truth), tiny.dataset_in_memory(tmp_path, truth).train
     engine = create_engine("auto")
-    left = scores.keep_needed(Model(model), shots, engine=engine).splat
+    left = scores.keep_needed(model, shots, engine=engine)
     splats = model.splats()
     with torch.no_grad():
         pictures = [(engine.rasterize(RasterInputs(s.view, splats), None).image, s) for s in shots]
@@ -195,4 +190,4 @@ def test_one_gaussian_stays_even_if_all_can_be_spared(tmp_path, monkeypatch):
     truth = tiny.random_model()
     monkeypatch.setattr(scores, "SPARE", 1e9)
     shots = tiny.dataset_in_memory(tmp_path, truth).train
-    assert len(scores.keep_needed(Model(truth), shots).splat) == 1
+    assert len(scores.keep_needed(truth, shots)) == 1

@@ -84,7 +84,7 @@ def test_the_overview_shows_nine_tenths_however_far_the_others_float(up, size):
 
 def test_ply_to_png_in_three_lines(tmp_path):
     splat = tiny.random_model()
-    fp.save(tmp_path / "model.ply", fp.Model(splat))
+    fp.save(tmp_path / "model.ply", splat)
 
     model = fp.load(tmp_path / "model.ply")
     fp.render_view(model).save(tmp_path / "view.png")
@@ -99,7 +99,7 @@ def test_a_picture_is_truncated_as_the_thresholds_say(tmp_path):
     splat = tiny.random_model()
     view = tiny.cameras()[0].view()
     cut = fp.ThresholdStore.from_falloff(torch.full((len(splat),), 0.6))
-    drawn = np.asarray(fp.render_view(fp.Model(splat, cut), view))
+    drawn = np.asarray(fp.render_view(replace(splat, thresholds=cut), view))
     with torch.no_grad():
         image = fp.rasterize(fp.RasterInputs(view, splat.splats()), cut).image
     expected = (255 * image.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy()

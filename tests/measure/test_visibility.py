@@ -16,7 +16,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, Splats
-from fragprune_plugins.workbench.pruning.visibility import drop_invisible, visible
+from fragprune_plugins.workbench.pruning.visibility import visible
 
 VIEWS = [camera.view() for camera in tiny.cameras()]
 
@@ -52,7 +52,9 @@ def test_no_picture_changes(engine, seed, truncated):
     thresholds = torch.rand(len(model), generator=stream) ** 0.2 * 0.98 + 0.01
     thresholds = thresholds if truncated else None
     drawer = create_engine(engine)
-    kept = visible(model, thresholds, VIEWS, engine=drawer)
+    kept = visible(
+        model if thresholds is None else tiny.cut(model, thresholds), VIEWS, engine=drawer
+    )
     assert not kept[:20].any()
     splats = model.splats()
     for view in VIEWS:
@@ -87,7 +89,7 @@ def test_who_ends_a_pixel_without_being_drawn_there_stays():
     drawn = whole.fragments_per_gaussian > 0
     assert drawn.tolist() == [True, True, True, False, True]
     assert not torch.equal(draw(drawn).image, whole.image)
-    assert torch.equal(visible(model, thresholds, VIEWS[:1]), everybody)
+    assert torch.equal(visible(tiny.cut(model, thresholds), VIEWS[:1]), everybody)
 
 
 def test_without_views_only_what_no_view_can_draw_goes():
@@ -100,33 +102,25 @@ def test_without_views_only_what_no_view_can_draw_goes():
 
 def test_one_outside_one_view_stays_for_another():
     model = with_strays()
-    both = visible(model, None, VIEWS)
-    each = torch.stack([visible(model, None, [view]) for view in VIEWS])
+    both = visible(model, VIEWS)
+    each = torch.stack([visible(model, [view]) for view in VIEWS])
     assert torch.equal(both, each.any(dim=0))
 
 
-def test_thresholds_and_moments_go_with_their_rows():
+def test_kept_rows_keep_their_thresholds_and_moments():
     model = with_strays()
     store = ThresholdStore(len(model))
     store.open(model.splats().opacities)
     store.logits.grad = torch.linspace(-1, 1, len(model))
     store.step(0.05)
-    state = store.state_dict()
-    smaller, kept_store = drop_invisible(model, store, VIEWS)
-    kept = visible(model, store.values.detach(), VIEWS)
-    assert 0 < len(smaller) == len(kept_store) == int(kept.sum()) < len(model)
-    for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
-        assert torch.equal(getattr(smaller, name), getattr(model, name)[kept])
-    for name, value in kept_store.state_dict().items():
-        assert (
-            torch.equal(value, state[name][kept])
-            if torch.is_tensor(value)
-            else (value == state[name])
-        )
-    assert len(store) == len(model)  # what was given is as it was
+    model = replace(model, thresholds=store)
+    state, kept = tiny.state(model), torch.arange(len(model)) % 3 == 0
+    for name, each in tiny.state(model.keep(kept)).items():
+        assert torch.equal(each, state[name][kept] if each.ndim else state[name])
+    assert len(model) == len(store) == len(kept)  # what was given is as it was
 
 
 def test_views_of_something_else_are_refused():
     model = replace(tiny.random_model(), xyz=torch.full((60, 3), 900.0))
     with pytest.raises(InputError, match="none of 60 Gaussians"):
-        visible(model, None, VIEWS)
+        visible(model, VIEWS)

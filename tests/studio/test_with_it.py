@@ -398,10 +398,10 @@ def altered(run, tmp_path, change):
 def test_an_exported_ply_has_its_thresholds_beside_it(run, tmp_path):
     config, _, _, store, _ = run
     ply = export(config, tmp_path)
-    model, thresholds = models.load(ply)
+    model = models.load(ply)
     assert len(model) == len(store["logits"])
     assert torch.equal(sidecar.load(ply)[0].logits.detach(), store["logits"])
-    assert thresholds is not None
+    assert model.thresholds is not None
 
 
 def test_a_model_without_thresholds_is_exported_without(run, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.view.packing import pack, words_per_gaussian
 
 
@@ -36,7 +36,7 @@ def read(data, facts):
 def test_tables_hold_the_model(degree):
     splat = tiny.random_model(degree=degree)
     thresholds = torch.linspace(0.005, 0.9, len(splat))
-    data, facts = pack(Model(splat, ThresholdStore.from_falloff(thresholds)))
+    data, facts = pack(replace(splat, thresholds=ThresholdStore.from_falloff(thresholds)))
     assert len(data) == 4 * words_per_gaussian(degree) * len(splat)
     assert facts["degree"] == degree
     assert facts["truncated"] is True
@@ -56,7 +56,7 @@ def test_tables_hold_the_model(degree):
 
 
 def test_without_thresholds_every_cutoff_is_the_last():
-    data, facts = pack(Model(tiny.random_model()))
+    data, facts = pack(tiny.random_model())
     assert facts["truncated"] is False
     assert (read(data, facts)[0]["cutoff"] == 65535).all()
 
@@ -64,13 +64,13 @@ def test_without_thresholds_every_cutoff_is_the_last():
 def test_a_threshold_below_one_in_255_decides_nothing():
     splat = tiny.random_model()
     store = ThresholdStore.from_falloff(torch.full((len(splat),), 1e-3))
-    assert (read(*pack(Model(splat, store)))[0]["cutoff"] == 65535).all()
+    assert (read(*pack(replace(splat, thresholds=store)))[0]["cutoff"] == 65535).all()
 
 
 def test_scales_that_are_all_equal():
     splat = tiny.random_model()
     splat.scaling.fill_(-2.0)
-    data, facts = pack(Model(splat))
+    data, facts = pack(splat)
     low, high = facts["scales"]
     assert high > low
     np.testing.assert_allclose(

@@ -9,7 +9,6 @@ import pytest
 from finetune import tiny
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.view import site as sites
 
 
@@ -17,7 +16,7 @@ from fragprune_plugins.workbench.view import site as sites
 def site():
     view = tiny.cameras()[0].view()
     layers = [sites.Layer("one", 0, False)]
-    return sites.make_site("a title", [Model(tiny.random_model())], layers, [], view)
+    return sites.make_site("a title", [tiny.random_model()], layers, [], view)
 
 
 def test_every_file_that_a_page_asks_for_is_there(site, tmp_path):

@@ -16,7 +16,6 @@ from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.reference import fragments
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.pictures import COLOURS, LABEL
@@ -104,7 +103,7 @@ def _count(column: Candidate, shots: Sequence[Shot], engine: Engine, bar: Any) -
         assert mine is not None
         assert seen is not None
         inputs = column.inputs(shot.view, splats)
-        weights = weigh(inputs, thresholds_for(inputs, column.thresholds), _TILES)
+        weights = weigh(inputs, column.thresholds(inputs), _TILES)
         owned += mine
         pixels += seen.numel()
         maps.append(seen.cpu().tolist())

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.files.ply import SplatFile
+    from fragprune_plugins.files.model import Model
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ class Start:
     """
 
     name: str
-    model: Callable[[SplatFile], SplatFile]
+    model: Callable[[Model], Model]
 
-    def __call__(self, model: SplatFile) -> SplatFile:
+    def __call__(self, model: Model) -> Model:
         """The changed model."""
         return self.model(model)
 

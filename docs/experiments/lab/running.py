@@ -13,11 +13,11 @@ import torch
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import Interrupted, Terminated
 from fragprune_plugins.files.atomic import digest
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.plugins.hooks import schedule_for
-from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times, measure
+from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times, measure_all
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.pruning.scores import SCORES, best
@@ -88,7 +88,7 @@ def run(
     """
     from tqdm import tqdm
 
-    splat, _ = models.load(model, truncation=False, device=device)
+    splat = models.load(model, truncation=False, device=device)
     dataset = load_photographs(photographs).to(device)
     asked = _configuration(experiment, model, photographs, dataset, engine, device, seeds)
     folder = Folder(out, experiment.name, asked)
@@ -116,14 +116,12 @@ class Scores:
         progress: draw a bar on stderr.
     """
 
-    def __init__(
-        self, splat: SplatFile, dataset: Dataset, engine: Engine, *, progress: bool
-    ) -> None:
+    def __init__(self, splat: Model, dataset: Dataset, engine: Engine, *, progress: bool) -> None:
         self._splat, self._engine, self._progress = splat, engine, progress
         self._views = [shot.view for shot in dataset.train]
         self._known: dict[str, torch.Tensor] = {}
 
-    def prune(self, pruning: Pruning) -> SplatFile:
+    def prune(self, pruning: Pruning) -> Model:
         """The Gaussians that stay."""
         from tqdm import tqdm
 
@@ -138,7 +136,7 @@ class Scores:
 def _outcome(
     arm: Arm,
     seed: int,
-    splat: SplatFile,
+    splat: Model,
     scores: Scores,
     dataset: Dataset,
     engine: Engine,
@@ -195,17 +193,17 @@ def _schedule(arm: Arm, settings: Settings) -> Schedule:
 
 
 def _measure(
-    splat: SplatFile, result: FinetuneResult, dataset: Dataset, engine: Engine
+    splat: Model, result: FinetuneResult, dataset: Dataset, engine: Engine
 ) -> list[dict[str, Any]]:
     """Measurements before and after, timed in turns at both sizes."""
-    candidates = [Candidate(splat), Candidate(result.model, result.store)]
+    candidates = [Candidate(splat), Candidate(result.model)]
     views = [
         replace(s.view, width=ENLARGED * s.view.width, height=ENLARGED * s.view.height)
         for s in dataset.test
     ]
-    measured = measure(candidates, dataset.test, engine=engine)
+    measured = measure_all(candidates, dataset.test, engine=engine)
     enlarged = frame_times(candidates, views, engine)
-    learned_from = measure(candidates, dataset.train, engine=engine, repeats=1)
+    learned_from = measure_all(candidates, dataset.train, engine=engine, repeats=1)
     return [
         usual
         | {f"{key}_enlarged": value for key, value in large.items()}

@@ -40,16 +40,16 @@ def load_columns(
     columns: dict[str, Candidate] = {}
     said: dict[str, Any] = {}
     for label, path in zip(labels, paths, strict=True):
-        splat, store = models.load(path, device=device)
+        model = models.load(path, device=device)
         said[label] = {"sha256": digest(path), "thresholds": None, "learned": None}
-        if store is not None:
-            values = store.values.detach().cpu().numpy().tobytes()
+        if model.falloff is not None:
+            values = model.falloff.cpu().numpy().tobytes()
             said[label]["thresholds"] = hashlib.sha256(values).hexdigest()
         if formats.found(path).paired and sidecar.lies_beside(path):
             said[label]["learned"] = sidecar.load(path)[1].settings
-        if store is not None and len(paths) == 1:
-            columns[f"{label}, untruncated"] = Candidate(splat)
-        columns[label] = Candidate(splat, store)
+        if model.falloff is not None and len(paths) == 1:
+            columns[f"{label}, untruncated"] = Candidate(model.untruncated())
+        columns[label] = Candidate(model)
     return columns, said
 
 

@@ -15,7 +15,6 @@ import torch
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.stage2 import evenly
-from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.clock import timed
 from fragprune_plugins.workbench.figures.evaluate import Candidate
@@ -113,7 +112,7 @@ def _time(
             order.reverse()  # none is always the one that finds a cold cache
             for label in order:
                 inputs = columns[label].inputs(view, drawn[label])
-                thresholds = thresholds_for(inputs, columns[label].thresholds)
+                thresholds = columns[label].thresholds(inputs)
                 frame = partial(engine.rasterize, inputs, thresholds)
                 outputs, spent = timed(frame, inputs.splats.device)
                 stages = outputs.stages or {}

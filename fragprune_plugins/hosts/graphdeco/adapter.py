@@ -31,7 +31,7 @@ from fragprune_plugins.hosts.source import Function, HostRepo
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.files.ply import SplatFile
+    from fragprune_plugins.files.model import Model
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
@@ -346,7 +346,7 @@ class GraphdecoAdapter(ScriptAdapter):
             "Name another, or a PLY.",
         )
 
-    def read_model(self, ply: Path) -> SplatFile:
+    def read_model(self, ply: Path) -> Model:
         """The host's own PLY."""
         from fragprune_plugins.files.ply import read_ply
 

@@ -109,7 +109,7 @@ def command(
     if cameras is None and data is None:
         from fragprune_plugins.workbench.audit.placing import place
 
-        placed = place(loaded.splat, views, rasterizer, side=side or "auto", divide=resolution or 1)
+        placed = place(loaded, views, rasterizer, side=side or "auto", divide=resolution or 1)
     else:
         placed = _given(cameras, data, views, resolution, white_background)
     named = [(name, view.to(where)) for name, view in placed.views]

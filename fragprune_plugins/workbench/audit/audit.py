@@ -23,8 +23,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.reference import fragments
-from fragprune_plugins.files.ply import SplatFile
-from fragprune_plugins.plugins.hooks import thresholds_for
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import Splats, View
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
@@ -37,7 +36,6 @@ from fragprune_plugins.workbench.figures.extents import (
     shaded,
 )
 from fragprune_plugins.workbench.figures.metrics import psnr
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.prices.calibration import kept_at
 from fragprune_plugins.workbench.prices.cost import Cost, Work, work_of
 from fragprune_plugins.workbench.scenes.generated import Named
@@ -231,8 +229,7 @@ def audit(
     """
     from tqdm import tqdm
 
-    splat, store = model
-    splats = splat.splats()
+    splats = model.splats()
     candidates = _candidates(model, splats)
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in candidates}
     asked: dict[str, list[float]] = {}
@@ -260,7 +257,7 @@ def audit(
             overdraw.append(float(ellipses.fragments_per_pixel))
             for viewer in VIEWERS:
                 asked.setdefault(viewer.names, []).append(shaded(engine, inputs, viewer))
-            cut = thresholds_for(inputs, store)
+            cut = candidates[AS_IT_IS].thresholds(inputs)
             if cut is not None:
                 reach = honouring(cut, splats.opacities)
                 quads = 4 / math.pi * float(covered(engine, inputs, reach).fragments_per_pixel)
@@ -279,7 +276,7 @@ def audit(
         timed: list[View] = [views[number][1] for number in chosen]
         frames = frame_times(list(candidates.values()), timed, engine, repeats=repeats)
         bar.update()
-    cost = _prices(engine, splat)
+    cost = _prices(engine, model)
     cuts: list[dict[str, Any]] = [
         {"name": label}
         | _mean(found[label])
@@ -288,8 +285,8 @@ def audit(
         for label, frame in zip(candidates, frames, strict=True)
     ]
     figures = {
-        "gaussians": len(splat),
-        "truncated": store is not None,
+        "gaussians": len(model),
+        "truncated": model.falloff is not None,
         "views": len(views),
         "fragments_per_pixel": cuts[0]["fragments_per_pixel"],
         "evaluated_per_pixel": cuts[0]["evaluated_per_pixel"],
@@ -316,15 +313,13 @@ HONOURING = "a viewer that knows its thresholds"
 
 def _candidates(model: Model, splats: Splats) -> dict[str, Candidate]:
     """The model as it is, first, and with every cut on top."""
-    splat, store = model
-    found = {AS_IT_IS: Candidate(splat, store)}
-    own = None if store is None else store.values.detach()
+    found, own = {AS_IT_IS: Candidate(model)}, model.falloff
     for cut in CUTS:
         thresholds = cut.thresholds(splats.opacities)
         thresholds = thresholds if own is None else torch.maximum(own, thresholds)
-        found[cut.name] = Candidate(splat, thresholds)
-    if store is not None:
-        found[UNTRUNCATED] = Candidate(splat)
+        found[cut.name] = Candidate(model, cut=thresholds)
+    if own is not None:
+        found[UNTRUNCATED] = Candidate(model.untruncated())
     return found
 
 
@@ -337,9 +332,9 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     }
 
 
-def _prices(engine: Engine, splat: SplatFile) -> Cost | None:
+def _prices(engine: Engine, model: Model) -> Cost | None:
     """What ``fragprune bench --calibrate`` measured on this machine; None if it never ran."""
-    path = kept_at(engine, splat.xyz.device)
+    path = kept_at(engine, model.device)
     return Cost.load(path) if path.exists() else None
 
 

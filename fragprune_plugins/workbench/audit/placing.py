@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, Splats, View
 from fragprune_plugins.workbench.scenes.generated import Named, around, bounds, within
 
@@ -63,7 +63,7 @@ class Placed:
 
 @torch.no_grad()
 def place(
-    splat: SplatFile, count: int, engine: Engine, *, side: Side = "auto", divide: int = 1
+    splat: Model, count: int, engine: Engine, *, side: Side = "auto", divide: int = 1
 ) -> Placed:
     """Cameras all around a splat, or inside of it.
 
@@ -111,7 +111,7 @@ def _small(view: View) -> View:
     return replace(view, width=_PIXELS, height=_PIXELS)
 
 
-def _clear(splat: SplatFile, radius: float) -> list[Tensor]:
+def _clear(splat: Model, radius: float) -> list[Tensor]:
     """Places of a grid far from all but faint Gaussians and from each other, farthest first."""
     from scipy.spatial import cKDTree
 

@@ -218,10 +218,10 @@ def _scenes(
         from fragprune_plugins.workbench.models import model as models
         from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
-        splat, store = models.load(model, device=device)
+        loaded = models.load(model, device=device)
         view = load_cameras(cameras)[0][1].to(device)
         return [
-            (model.stem, splat.splats(), replace(view, width=w, height=h), store)
+            (model.stem, loaded.splats(), replace(view, width=w, height=h), loaded.thresholds)
             for w, h in map(_size, sizes)
         ]
     return [

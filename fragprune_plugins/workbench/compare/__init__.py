@@ -83,7 +83,7 @@ def command(
     from fragprune_plugins.files import records
     from fragprune_plugins.files.atomic import writable_folder
     from fragprune_plugins.hosts.photographs import Resolution
-    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
     from fragprune_plugins.workbench.figures.wording import describe, gain, nothing_drawn, strangers
     from fragprune_plugins.workbench.profile import draw_panels
 
@@ -102,9 +102,9 @@ def command(
         how = known.get(path)
         filtered, drawing = (how.filtered, how.drawing) if how else (False, {})
         model = models.load(path, truncation=not no_truncation, filtered=filtered, device=where)
-        columns[label] = Candidate(*model, drawing)
+        columns[label] = Candidate(model, drawing)
     shots = load_shots(scene, views, where)
-    first, second = measure(list(columns.values()), shots, engine=rasterizer, enlarge=enlarge)
+    first, second = measure_all(list(columns.values()), shots, engine=rasterizer, enlarge=enlarge)
     report: dict[str, Any] = {
         "a": {"model": str(a)} | first,
         "b": {"model": str(b)} | second,

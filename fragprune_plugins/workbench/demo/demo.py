@@ -16,7 +16,7 @@ from fragprune_plugins.workbench.demo.folder import claiming, clear
 from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
 
 if TYPE_CHECKING:
-    from fragprune_plugins.files.ply import SplatFile
+    from fragprune_plugins.files.model import Model
     from fragprune_plugins.injection.launch import RunOptions, RunSummary
 
 HOST = Path(__file__).with_name("host") / "train.py"
@@ -164,23 +164,23 @@ def _run_options(settings: DemoSettings) -> RunOptions:
     return RunOptions(settings=learning, engine=settings.engine, device=settings.device)
 
 
-def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> SplatFile:
+def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> Model:
     from fragprune_plugins.learning.schedule import Settings
     from fragprune_plugins.workbench.finetune.loop import finetune
     from fragprune_plugins.workbench.models import model as models
     from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
     assert summary.model_before is not None  # the host saves at its last iteration
-    model, _ = models.load(summary.model_before, device=settings.device)
+    model = models.load(summary.model_before, device=settings.device)
     learning = Settings(iterations=settings.finetune, truncate=False, seed=settings.seed)
     data = load_dataset(scene)
     return finetune(model, data, learning, engine=settings.engine, progress=True).model
 
 
 def _measure(
-    scene: Path, summary: RunSummary, control: SplatFile, settings: DemoSettings
+    scene: Path, summary: RunSummary, control: Model, settings: DemoSettings
 ) -> dict[str, Any]:
-    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
     from fragprune_plugins.workbench.models import model as models
     from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
@@ -188,13 +188,13 @@ def _measure(
     assert summary.model_after is not None
     candidates = [
         *(
-            Candidate(*models.load(path, device=settings.device))
+            Candidate(models.load(path, device=settings.device))
             for path in (summary.model_before, summary.model_after)
         ),
-        Candidate(control, None),
+        Candidate(control),
     ]
     shots = load_dataset(scene).test
-    before, after, zero = measure(candidates, shots, engine=settings.engine, repeats=_REPEATS)
+    before, after, zero = measure_all(candidates, shots, engine=settings.engine, repeats=_REPEATS)
     return {
         "before": before,
         "after": after,

@@ -80,8 +80,8 @@ def write_page(
 
     pictures = out / "pictures"
     paths = (Path(report["model_before"]), Path(report["model_after"]))
-    (one, _), (other, store) = (models.load(path, device=device) for path in paths)
-    before, after = Candidate(one), Candidate(other, store)
+    one, other = (models.load(path, device=device) for path in paths)
+    before, after = Candidate(one.untruncated()), Candidate(other)
     shots, rasterizer = _larger(load_dataset(scene).test, settings), engine_for(engine, device)
     larger = frame_times(
         [before, after], [shot.view.to(device) for shot in shots], rasterizer, repeats=_REPEATS
@@ -92,8 +92,8 @@ def write_page(
     report_page.save_banner(pictures / BANNER, before, after, shots[0], rasterizer)
     files = [*drawn.files, BANNER]
     learning = []
-    if curves and store is not None:
-        report_page.save_learning(pictures / report_page.LEARNING, curves, store.values)
+    if curves and other.falloff is not None:
+        report_page.save_learning(pictures / report_page.LEARNING, curves, other.falloff)
         files.append(report_page.LEARNING)
         source = f"pictures/{report_page.LEARNING}"
         said = "How it learned"

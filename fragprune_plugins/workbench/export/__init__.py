@@ -56,41 +56,27 @@ def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
     """
     from fragprune_plugins.files import sidecar
     from fragprune_plugins.files.atomic import put, staging
-    from fragprune_plugins.files.ply import THRESHOLD_COLUMN, write_ply
+    from fragprune_plugins.files.ply import THRESHOLD_COLUMN
     from fragprune_plugins.workbench.pruning.visibility import visible
 
     form = formats.named(out)
     require_place(out, model, thresholds=not no_truncation)
-    splat, store = models.load(model, truncation=not no_truncation)
-    thresholds = None
-    if not no_truncation:
-        if store is None:
-            raise SidecarError(
-                str(sidecar.path_beside(model)),
-                "no thresholds for this model",
-                "a sidecar beside it, written by fragprune, or a file that holds them",
-                "Run fragprune finetune first; --no-truncation writes a model without thresholds.",
-            )
-        thresholds = splat.thresholds  # a column keeps its bits
-        if thresholds is None or (formats.found(model).paired and sidecar.find(model)):
-            thresholds = store.values.detach()
-
-    def write(new: Path) -> None:
-        if form.paired:
-            write_ply(new, splat, thresholds)
-        else:
-            formats.write(form, new, splat, thresholds)
-
+    splat = models.load(model, truncation=not no_truncation)
+    if not no_truncation and splat.thresholds is None:
+        raise SidecarError(
+            str(sidecar.path_beside(model)),
+            "no thresholds for this model",
+            "a sidecar beside it, written by fragprune, or a file that holds them",
+            "Run fragprune finetune first; --no-truncation writes a model without thresholds.",
+        )
     dropped, lines, count = None, [], len(splat)
     with staging(out) as folder:
         new = folder / out.name
-        write(new)
+        formats.write(form, new, splat)
         size = new.stat().st_size
         if drop:
-            kept = visible(splat, thresholds)
-            splat = splat.keep(kept)
-            thresholds = None if thresholds is None else thresholds[kept]
-            write(new)
+            splat = splat.keep(visible(splat))
+            formats.write(form, new, splat)
         if form.paired:  # removes the sidecar of an earlier model under this name
             sidecar.replace_pair(out, new, None)
         else:
@@ -98,8 +84,8 @@ def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
     if drop:
         dropped = dropping(out, size, count, len(splat))
         lines.append(describe_dropped(dropped, "too faint for any view"))
-    held = "thresholds" if thresholds is not None else "no thresholds"
-    column = THRESHOLD_COLUMN if form.paired and thresholds is not None else None
+    held = "no thresholds" if no_truncation else "thresholds"
+    column = THRESHOLD_COLUMN if form.paired and not no_truncation else None
     lines.append(describe_written(out, f": {len(splat)} Gaussians with {column or held}"))
     return Report(
         {
@@ -108,7 +94,7 @@ def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
             "format": form.name,
             "keeps": form.keeps or None,
             "gaussians": len(splat),
-            "thresholds": thresholds is not None,
+            "thresholds": not no_truncation,
             "column": column,
             "dropped": dropped,
         },

@@ -6,44 +6,48 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import SQUARED_RADIUS
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 from fragprune_plugins.workbench.figures.clock import timed
 from fragprune_plugins.workbench.figures.extents import covered
 from fragprune_plugins.workbench.figures.metrics import lpips, psnr, ssim
-from fragprune_plugins.workbench.scenes.dataset import Shot
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 REPEATS = 9
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A splat to measure, and how to draw it.
+    """A model to measure, and how to draw it.
 
     Attributes:
-        model: the Gaussians.
-        thresholds: a store, for which plugins are asked at every view; (N,) thresholds to use as
-            they are; or None for no truncation.
+        model: the Gaussians. Plugins are asked for its thresholds at every view.
         drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
         gaussians: of the whole splat, where the model is this process' part of it.
+        cut: (N,) thresholds to draw with as they are, in place of the model's.
     """
 
-    model: SplatFile
-    thresholds: Tensor | ThresholdStore | None = None
+    model: Model
     drawing: Mapping[str, Any] = field(default_factory=dict)
     gaussians: int | None = None
+    cut: Tensor | None = None
 
     __repr__ = one_line
+
+    def thresholds(self, inputs: RasterInputs) -> Tensor | None:
+        """(N,) to draw a view with; None for no truncation."""
+        return thresholds_for(inputs, self.model.thresholds if self.cut is None else self.cut)
 
     def inputs(self, view: View, splats: Splats) -> RasterInputs:
         """The inputs of one view with the activated model; only the image is asked for."""
@@ -54,23 +58,44 @@ class Candidate:
     ) -> RasterOutputs:
         """Draw one view of the activated model, optionally with counts of fragments."""
         inputs = replace(self.inputs(view, splats), counts=counts)
-        return engine.rasterize(inputs, thresholds_for(inputs, self.thresholds))
+        return engine.rasterize(inputs, self.thresholds(inputs))
 
 
-def evaluate(
-    model: SplatFile,
-    thresholds: Tensor | ThresholdStore | None,
-    shots: Sequence[Shot],
+def measure(
+    model: Model | models.Trained | str | Path,
+    dataset: Dataset | Sequence[Shot],
     *,
     engine: str | Engine = "auto",
     repeats: int = REPEATS,
 ) -> dict[str, Any]:
-    """Measure one splat; see ``measure``."""
-    return measure([Candidate(model, thresholds)], shots, engine=engine, repeats=repeats)[0]
+    """Measure a model: its quality, what it draws, and the time of a frame.
+
+    A frame is one forward rasterization of activated Gaussians with given thresholds, without
+    reading or writing images. On a GPU it ends when the GPU is idle.
+
+    Args:
+        model: what to measure, the result of a training, or a file.
+        dataset: its held-out views count; or the views. Figures are means over them.
+        engine: a name or an engine.
+        repeats: number of timed frames for each view.
+
+    Returns:
+        target ("photographs", or "itself" for a model's own pictures), psnr (dB; infinite against
+        itself), ssim, lpips (None where not installed), fragments_per_pixel, evaluated_per_pixel,
+        entries_per_pixel (NaN from an engine that does not count them), area_per_pixel
+        (``covered_per_pixel``), gaussians, frame_ms (median over views and repeats), frame_ms_se
+        (standard error over repeats of the median over views), engine, device, views.
+
+    Raises:
+        EngineError: no such engine here.
+        InputError: pictures smaller than 11x11 pixels.
+    """
+    shots = dataset.test if isinstance(dataset, Dataset) else dataset
+    return measure_all([Candidate(models.of(model))], shots, engine=engine, repeats=repeats)[0]
 
 
 @torch.no_grad()
-def measure(
+def measure_all(
     candidates: Sequence[Candidate],
     shots: Sequence[Shot],
     *,
@@ -78,11 +103,9 @@ def measure(
     repeats: int = REPEATS,
     enlarge: int = 1,
 ) -> list[dict[str, Any]]:
-    """Measure splats against the same pictures, timing them in turns.
+    """Measure models against the same pictures, as ``measure`` does.
 
-    Frames of all candidates are timed in turns, so that a busy machine slows them alike. A frame is
-    one forward rasterization of activated Gaussians with given thresholds, without reading or
-    writing images. On a GPU it ends when the GPU is idle.
+    Frames of all are timed in turns, so that a busy machine slows them alike.
 
     Args:
         candidates: the splats to measure, all on one device; views move there.
@@ -92,13 +115,9 @@ def measure(
         enlarge: timed frames are this many times as wide and high as the pictures.
 
     Returns:
-        One dict a candidate: target ("photographs", or "itself" for a model's own pictures), psnr
-        (dB; infinite against itself), ssim, lpips (None where not installed), fragments_per_pixel,
-        evaluated_per_pixel, entries_per_pixel (NaN from an engine that does not count them),
-        area_per_pixel (``covered_per_pixel``), gaussians, frame_ms (median over views and repeats),
-        frame_ms_se (standard error over repeats of the median over views), engine, device, views.
+        The figures of each, as those of ``measure``.
     """
-    device = candidates[0].model.xyz.device
+    device = candidates[0].model.device
     if isinstance(engine, str):
         engine = engine_for(engine, device)
     shots = [shot.to(device) for shot in shots]
@@ -186,7 +205,7 @@ def frame_times(
     Returns:
         One dict a candidate: frame_ms and frame_ms_se, as those of ``measure``.
     """
-    device = candidates[0].model.xyz.device
+    device = candidates[0].model.device
     drawn = [candidate.model.splats() for candidate in candidates]
     times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
     turns = list(zip(candidates, drawn, times, strict=True))
@@ -197,9 +216,7 @@ def frame_times(
             turns.reverse()  # neither is always the one that finds a cold cache
             for candidate, splats, rounds in turns:
                 inputs = candidate.inputs(view, splats)
-                frame = partial(
-                    engine.rasterize, inputs, thresholds_for(inputs, candidate.thresholds)
-                )
+                frame = partial(engine.rasterize, inputs, candidate.thresholds(inputs))
                 rounds[-1].append(timed(frame, device)[1])
     reports = []
     for rounds in times:

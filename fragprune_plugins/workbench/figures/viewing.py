@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import rasterize
 from fragprune_plugins.types import RasterInputs, View
 from fragprune_plugins.workbench.figures.pictures import picture
-from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.generated import bounds
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def overview(
-    splat: SplatFile,
+    model: Model | models.Trained | str | Path,
     up: Sequence[float] = (0.0, -1.0, 0.0),
     *,
     width: int = 960,
@@ -35,7 +36,7 @@ def overview(
     and ``load_cameras`` reads the training's own cameras.
 
     Args:
-        splat: N Gaussians.
+        model: N Gaussians, the result of a training, or a file.
         up: (3,) what is up in its world; COLMAP's worlds have y down.
         width: pixels.
         height: pixels.
@@ -44,7 +45,7 @@ def overview(
     Raises:
         InputError: there is no such view.
     """
-    centre, radius = bounds(splat)
+    centre, radius = bounds(models.of(model))
     half = math.atan(math.tan(math.radians(fov_y) / 2) * min(1.0, width / height))
     above = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float32), dim=0)
     # As COLMAP's first camera looks: along z, or along y where z is up.
@@ -57,12 +58,15 @@ def overview(
 
 
 def render_view(
-    model: Model | SplatFile, view: View | None = None, *, engine: str | Engine = "auto"
+    model: Model | models.Trained | str | Path,
+    view: View | None = None,
+    *,
+    engine: str | Engine = "auto",
 ) -> Image:
     """A picture of a model, truncated as its thresholds say; ``rasterize`` gives more than that.
 
     Args:
-        model: what ``load`` gave, or a splat without thresholds.
+        model: what ``load`` gave, the result of a training, or a file.
         view: the camera; one that shows the splat from outside, ``overview``, when None.
         engine: a name ("auto", "reference", "cpu", "cuda", a plugin's) or an engine object.
 
@@ -70,12 +74,11 @@ def render_view(
         A Pillow image, RGB of 8 bits: ``.save("view.png")``.
 
     Raises:
-        InputError: splat and thresholds differ in length.
         EngineError: there is no such engine here.
         PluginError: a plugin raised, or its answer cannot be used.
     """
-    splat, store = (model, None) if isinstance(model, SplatFile) else model
-    view = (overview(splat) if view is None else view).to(splat.xyz.device)
+    model = models.of(model)
+    view = (overview(model) if view is None else view).to(model.device)
     with torch.no_grad():
-        inputs = RasterInputs(view, splat.splats(), planes=())
-        return picture(rasterize(inputs, store, engine=engine).image)
+        inputs = RasterInputs(view, model.splats(), planes=())
+        return picture(rasterize(inputs, model.thresholds, engine=engine).image)

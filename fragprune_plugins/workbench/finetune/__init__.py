@@ -39,6 +39,7 @@ from fragprune_plugins.workbench.models import model as models
 
 if TYPE_CHECKING:
     from fragprune_plugins.engines import Engine
+    from fragprune_plugins.files.model import Model
     from fragprune_plugins.workbench.finetune.loop import FinetuneResult
     from fragprune_plugins.workbench.finetune.resuming import Checkpoints
     from fragprune_plugins.workbench.finetune.searching import Bounded
@@ -191,8 +192,6 @@ def command(
         require_place(out, model, thresholds=settings.truncate and not settings.portable)
         click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
-    from copy import deepcopy
-
     from fragprune_plugins.workbench.figures.evaluate import Candidate
     from fragprune_plugins.workbench.finetune import finished as finetuned
     from fragprune_plugins.workbench.finetune import resuming
@@ -220,7 +219,7 @@ def command(
         dataset = load_photographs(photographs)
 
     checkpoints = Checkpoints(resuming.path_beside(out), every or None, tell=_say)
-    asked = resuming.configuration(*whole, dataset, settings, rasterizer.name)
+    asked = resuming.configuration(whole, dataset, settings, rasterizer.name)
     asked |= {"drop_invisible": drop, "keep": keep, "max_drop": max_drop}
     asked |= {"sharded": True} if shard else {}
     with sigterm_interrupts():
@@ -233,11 +232,10 @@ def command(
             if ranks.gather(finished is not None)[0]:
                 checkpoints.clear()
                 return finished
-            count = len(whole.splat)
+            count = len(whole)
             if shard:
                 whole, rasterizer = part_of(whole, ranks, where), ShardedEngine(rasterizer, ranks)
-            # learning changes the store
-            start = Candidate(whole.splat, deepcopy(whole.thresholds), gaussians=count)
+            start = Candidate(whole, gaussians=count)
             kept = _keep(whole, keep, dataset.to(where), rasterizer)
             result, found = _learn(
                 kept, dataset, settings, max_drop, rasterizer, checkpoints, ranks
@@ -245,14 +243,14 @@ def command(
             saved = _whole(result, ranks) if shard else result
             if ranks.first:
                 save(out, saved)
-            truncated = saved.thresholds is not None
+            truncated = saved.model.falloff is not None
             over = finetuned.Finetuned(
                 model=model,
                 out=out,
                 start=start,
                 result=result,
                 keep=keep,
-                removed=len(whole.splat) - len(kept.splat),
+                removed=len(whole) - len(kept),
                 found=found,
                 dropped=None,
                 seed=seed,
@@ -270,7 +268,8 @@ def command(
         saved, dropped = _drop_invisible(out, result, dataset, rasterizer)
         over = replace(over, result=saved, dropped=dropped)
     if curves is not None:
-        finetuned.draw_curves(curves, [asdict(point) for point in result.curves], saved.thresholds)
+        points = [asdict(point) for point in result.curves]
+        finetuned.draw_curves(curves, points, saved.model.falloff)
     figures = measured or over.measured(dataset, rasterizer)
     report = over.report(figures, dataset, photographs, asked)
     if not result.interrupted:
@@ -283,8 +282,8 @@ def _say(text: str) -> None:
 
 
 def _keep(
-    whole: models.Model, keep: float | Literal["auto"] | None, dataset: Dataset, engine: Engine
-) -> models.Model:
+    whole: Model, keep: float | Literal["auto"] | None, dataset: Dataset, engine: Engine
+) -> Model:
     """The Gaussians that --keep leaves."""
     from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
 
@@ -297,7 +296,7 @@ def _keep(
 
 
 def _learn(
-    model: models.Model,
+    model: Model,
     dataset: Dataset,
     settings: Settings,
     max_drop: float | None,
@@ -310,14 +309,12 @@ def _learn(
     from fragprune_plugins.workbench.finetune.searching import strongest
     from fragprune_plugins.workbench.prices.calibration import prices_of
 
-    splat, store = model
     if max_drop is not None:
         found = strongest(
-            splat,
+            model,
             dataset,
             settings,
             max_drop,
-            store=store,
             engine=engine,
             progress=True,
             say=_say,
@@ -326,11 +323,10 @@ def _learn(
         return found.result, found
     timed = settings.target_time is not None
     result = finetune(
-        splat,
+        model,
         dataset,
         settings,
-        store=store,
-        cost=prices_of(engine, splat.xyz.device, say=_say) if timed else None,
+        cost=prices_of(engine, model.device, say=_say) if timed else None,
         engine=engine,
         progress=True,
         checkpoints=checkpoints,
@@ -343,8 +339,8 @@ def _whole(result: FinetuneResult, ranks: Ranks) -> FinetuneResult:
     """The result with all Gaussians, in the first process; as it is in others."""
     from fragprune_plugins.workbench.finetune.processes import whole_of
 
-    splat, store = whole_of(result.model, result.store, ranks)
-    return replace(result, model=splat, store=store) if ranks.first else result
+    whole = whole_of(result.model, ranks)
+    return replace(result, model=whole) if ranks.first else result
 
 
 def _drop_invisible(
@@ -352,13 +348,12 @@ def _drop_invisible(
 ) -> tuple[FinetuneResult, dict[str, int]]:
     """Write the result again without Gaussians that no view shows; also give the counts."""
     from fragprune_plugins.workbench.finetune.loop import save
-    from fragprune_plugins.workbench.pruning.visibility import drop_invisible
+    from fragprune_plugins.workbench.pruning.visibility import visible
 
     size, views = out.stat().st_size, [shot.view for shot in (*dataset.train, *dataset.test)]
-    smaller, kept = drop_invisible(result.model, result.store, views, engine=engine)
-    left = replace(result, model=smaller, store=kept)
+    left = replace(result, model=result.model.keep(visible(result.model, views, engine=engine)))
     save(out, left)
-    return left, dropping(out, size, len(result.model), len(smaller))
+    return left, dropping(out, size, len(result.model), len(left.model))
 
 
 def _require_sense(
@@ -438,7 +433,7 @@ def _require_shards(
 
 
 def _own_pictures(
-    model: models.Model,
+    model: Model,
     data: Path | None,
     cameras: Path | None,
     resolution: int,
@@ -460,5 +455,5 @@ def _own_pictures(
     elif cameras is not None:
         views = load_cameras(cameras, white_background=white_background)
     else:
-        views = around(model.splat, background=torch.full((3,), float(white_background)), seed=seed)
+        views = around(model, background=torch.full((3,), float(white_background)), seed=seed)
     return own_pictures(model, divided(views, resolution), held_out, engine=engine, seed=seed)

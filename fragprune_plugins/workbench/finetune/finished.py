@@ -62,16 +62,16 @@ class Finetuned:
 
         The last two only where there are any.
         """
-        from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+        from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 
         result = self.result
         whole = result.progress.gaussians if self.shards > 1 else None
-        candidates = [self.start, Candidate(result.model, result.store, gaussians=whole)]
+        candidates = [self.start, Candidate(result.model, gaussians=whole)]
         if self.truncated:
-            candidates.append(Candidate(result.model, gaussians=whole))
+            candidates.append(Candidate(result.model.untruncated(), gaussians=whole))
         if self.found is not None:
             candidates.append(Candidate(self.found.control.model))
-        return measure(candidates, dataset.test, engine=engine)
+        return measure_all(candidates, dataset.test, engine=engine)
 
     def report(
         self,
@@ -217,9 +217,7 @@ def finished(model: Path, out: Path, asked: dict[str, Any], curves: Path | None)
         return None
     data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
     if curves is not None:
-        store = models.load(out).thresholds
-        learned = None if store is None else store.values.detach()
-        draw_curves(curves, record.data["curves"], learned)
+        draw_curves(curves, record.data["curves"], models.load(out).falloff)
     text = (
         f"{record.data['text']}\n{out} was finished before: nothing was done. "
         "--again fine-tunes again."

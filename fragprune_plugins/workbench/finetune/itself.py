@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import RasterInputs, View
-from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.generated import Named, around, between, hold_out
 
@@ -41,7 +42,7 @@ class OwnPicture(Shot):
 
 
 def own_pictures(
-    model: Model | SplatFile,
+    model: Model | models.Trained | str | Path,
     cameras: Named | None = None,
     held_out: Named | None = None,
     *,
@@ -53,7 +54,7 @@ def own_pictures(
     It is drawn as it came in: untruncated, or truncated by the thresholds that it has.
 
     Args:
-        model: what ``load`` gave, or a splat without thresholds. It is kept.
+        model: what ``load`` gave, the result of a training, or a file. It is kept.
         cameras: named views to learn from; views between near ones are added. None takes cameras
             all around the splat, which suit an object but no scene seen from within.
         held_out: named views for the figures; every eighth of ``cameras`` when None.
@@ -64,20 +65,19 @@ def own_pictures(
         DatasetError: fewer than two cameras.
         EngineError: no such engine here.
     """
-    splat, store = (model, None) if isinstance(model, SplatFile) else model
-    drawer = engine_for(engine, splat.xyz.device) if isinstance(engine, str) else engine
-    splats = splat.splats()
-    thresholds = None if store is None or store.neutral else store.values.detach().clone()
+    model = models.of(model)
+    drawer = engine_for(engine, model.device) if isinstance(engine, str) else engine
+    splats, thresholds = model.splats(), model.falloff
 
     @torch.no_grad()
     def draw(view: View) -> Tensor:
         return drawer.rasterize(RasterInputs(view, splats, planes=()), thresholds).image
 
-    views = around(splat, seed=seed) if cameras is None else cameras
+    views = around(model, seed=seed) if cameras is None else cameras
     if held_out is None:
         views, held_out = hold_out(views)
     train, test = (
         [OwnPicture(name, view, draw) for name, view in part]
         for part in ([*views, *between(views, seed=seed)], held_out)
     )
-    return Dataset(train, test).to(splat.xyz.device)
+    return Dataset(train, test).to(model.device)

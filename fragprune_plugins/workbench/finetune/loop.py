@@ -17,8 +17,8 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.losses import code_for, photometric_loss
-from fragprune_plugins.errors import AlignmentError, CheckpointError, UsageError
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.errors import CheckpointError, UsageError
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, Waiting, between_steps
@@ -36,7 +36,6 @@ from fragprune_plugins.workbench.finetune.processes import expect_divisible, pro
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
 from fragprune_plugins.workbench.finetune.timing import require_reach, times_faster
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.prices.cost import Cost, work_of
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
@@ -57,8 +56,8 @@ class FinetuneResult:
     """Result of a fine-tuning.
 
     Attributes:
-        model: the Gaussians; what ``train`` did not name is the very tensor that came in.
-        store: their thresholds, neutral when truncation was off.
+        model: the Gaussians with what they learned; what ``train`` did not name is the very tensor
+            that came in. A control and a portable model have no thresholds.
         settings: of the fine-tuning.
         curves: one point per step.
         progress: steps done, fragments before and after on the training views, the target.
@@ -69,8 +68,7 @@ class FinetuneResult:
         resumed_at: steps that came out of a checkpoint; 0 without one.
     """
 
-    model: SplatFile
-    store: ThresholdStore
+    model: Model
     settings: Settings
     curves: Sequence[StepStats]
     progress: Progress
@@ -82,18 +80,12 @@ class FinetuneResult:
 
     __repr__ = one_line
 
-    @property
-    def thresholds(self) -> Tensor | None:
-        """(N,) to render with; None when neutral."""
-        return None if self.store.neutral else self.store.values.detach()
-
 
 def finetune(
-    model: SplatFile,
+    model: Model | models.Trained | str | Path,
     dataset: Dataset,
     settings: Settings | None = None,
     *,
-    store: ThresholdStore | None = None,
     schedule: Schedule | None = None,
     rule: Callable[[Tensor], Tensor] | None = None,
     cost: Cost | None = None,
@@ -109,11 +101,12 @@ def finetune(
     random permutations; the global random streams are not touched.
 
     Args:
-        model: the trained splat; not changed. Everything happens on its device.
+        model: what ``load`` gave, the result of another fine-tuning, or a file; not changed.
+            Learning begins with its thresholds, or with neutral ones. Everything happens on its
+            device.
         dataset: its photographs; only training views are learned from. Pixels stay in main memory
             and follow the model one view at a time.
         settings: iterations, what moves, pressure or target; defaults when None.
-        store: thresholds to start from, changed in place; neutral ones when None.
         schedule: gives the plan of each step; when None a plugin's, or the default one.
         rule: gives thresholds (N,) from activated opacities (N,), instead of learning: in the steps
             that would learn, views are drawn with them. They get no gradient, and nothing presses
@@ -133,30 +126,21 @@ def finetune(
         EngineError: no such engine here.
         CheckpointError: the checkpoint is broken, or another fine-tuning's.
         PluginError: a plugin raised, or gave an answer that cannot be used.
-        AlignmentError: store and model differ in length.
         UsageError: a target time without prices, or one that no thresholds reach; portable with
-            thresholds, in the store or by a rule; a target time, or views that cannot be divided,
+            thresholds, the model's or by a rule; a target time, or views that cannot be divided,
             in several processes.
         RanksError: another process is gone, or differs.
         DivergedError: NaN or infinity in what trains.
     """
-    ranks = ranks or Ranks()
-    settings, device = settings or Settings(), model.xyz.device
+    ranks, model = ranks or Ranks(), models.of(model)
+    settings, device = settings or Settings(), model.device
     if rule is not None:
         settings = replace(
             settings, pressure=0.0, target_speedup=None, target_time=None, truncate=True
         )
     engine = engine_for(engine, device) if isinstance(engine, str) else engine
     dataset = dataset.to(device)
-    store = ThresholdStore(len(model), device) if store is None else store  # empty ones are false
-    if len(store) != len(model):
-        raise AlignmentError(
-            "finetune",
-            f"a store of {len(store)} thresholds",
-            f"{len(model)}, one per Gaussian",
-            "Pass the store of this very model.",
-        )
-    if settings.portable and (rule is not None or not store.neutral):
+    if settings.portable and (rule is not None or model.falloff is not None):
         raise UsageError(
             "finetune",
             "portable, and thresholds to draw with",
@@ -168,7 +152,6 @@ def finetune(
         model,
         dataset,
         settings,
-        store,
         schedule or schedule_for(settings),
         rule,
         cost,
@@ -188,7 +171,6 @@ def finetune(
     run.stage.check()
     return FinetuneResult(
         model=run.result_model(),
-        store=run.stage.store,
         settings=settings,
         curves=run.curves,
         progress=replace(
@@ -203,14 +185,12 @@ def finetune(
 
 
 @torch.no_grad()
-def mean_fragments(
-    model: SplatFile, thresholds: Tensor | None, shots: Sequence[Shot], engine: Engine
-) -> float:
+def mean_fragments(model: Model, shots: Sequence[Shot], engine: Engine) -> float:
     """Drawn fragments per pixel, averaged over views."""
     splats = model.splats()
     total = 0.0
     for shot in shots:
-        outputs = engine.rasterize(RasterInputs(shot.view, splats, planes=()), thresholds)
+        outputs = engine.rasterize(RasterInputs(shot.view, splats, planes=()), model.falloff)
         total += float(outputs.fragments_per_pixel)
     return total / len(shots)
 
@@ -224,10 +204,9 @@ def save(path: Path, result: FinetuneResult) -> Path | None:
         OutputError: the place cannot be written; existing files stay as they were.
     """
     if result.settings.portable:
-        models.save_plain(path, result.model)
+        models.save(path, result)
         return None
-    model = Model(result.model, result.store)
-    return models.save(path, model, settings=result.settings.as_dict())
+    return models.save(path, result, settings=result.settings.as_dict())
 
 
 class _Run:
@@ -235,10 +214,9 @@ class _Run:
 
     def __init__(
         self,
-        model: SplatFile,
+        model: Model,
         dataset: Dataset,
         settings: Settings,
-        store: ThresholdStore,
         schedule: Schedule,
         rule: Callable[[Tensor], Tensor] | None,
         cost: Cost | None,
@@ -269,6 +247,8 @@ class _Run:
         self.new = False  # a view of this step is drawn for the first time, here or elsewhere
         self._started = time.perf_counter()
         self.checkpoints: Checkpoints | None = None
+        known = model.thresholds if settings.truncate else None
+        store = ThresholdStore(len(model), model.device) if known is None else known.clone()
         again = {shot: partial(self._draw, shot) for shot in dataset.train}
         self.stage = Stage2(
             store,
@@ -296,11 +276,11 @@ class _Run:
             eps=1e-15,
         )
 
-    def result_model(self) -> SplatFile:
+    def result_model(self) -> Model:
         """The model as learned, free of gradients."""
-        return replace(
-            self.model, **{name: getattr(self.model, name).detach() for name in self.rates}
-        )
+        learned: dict[str, Any] = {n: getattr(self.model, n).detach() for n in self.rates}
+        store = self.stage.store
+        return replace(self.model, **learned, thresholds=None if store.neutral else store)
 
     @property
     def seconds(self) -> float:
@@ -315,12 +295,7 @@ class _Run:
         if checkpoints is None and not self.ranks.several:
             return
         self.asked = configuration(
-            self.start,
-            self.stage.store,
-            self.dataset,
-            self.settings,
-            self.engine.name,
-            self.stage.schedule,
+            self.start, self.dataset, self.settings, self.engine.name, self.stage.schedule
         )
         self.asked = self.processes.described(self.asked) | self.others
         del self.asked["nonfinite"]  # a run that such a step stopped may go on and skip it
@@ -332,7 +307,7 @@ class _Run:
     def _go_on(self, checkpoints: Checkpoints) -> None:
         """Take over what a checkpoint holds, if there is one; the first process writes the next."""
         self.checkpoints = checkpoints if self.ranks.first else None
-        device = "cpu" if self.processes.sharded else self.start.xyz.device
+        device = "cpu" if self.processes.sharded else self.start.device
         tensors, values = checkpoints.load(self.asked, device)
         if not values:
             return

@@ -6,7 +6,7 @@ Gaussians, which the ``ShardedEngine`` brings to them, and tell each other figur
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate
 from typing import Any
@@ -16,12 +16,11 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.ranks import Ranks, fingerprint
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
-from fragprune_plugins.workbench.models.model import Model
 
 
 class Replicas:
@@ -217,19 +216,14 @@ def part_of(model: Model, ranks: Ranks, device: torch.device | str) -> Model:
         ranks: the processes.
         device: where this one learns and draws.
     """
-    count = len(model.splat)
+    count = len(model)
     start, end = (count * rank // ranks.size for rank in (ranks.rank, ranks.rank + 1))
-    rows = torch.arange(count, device=model.splat.xyz.device)
+    rows = torch.arange(count, device=model.device)
     mask = (rows >= start) & (rows < end)
-    splat = model.splat.keep(mask).to(device)
-    if model.thresholds is None:
-        return Model(splat)
-    return Model(splat, _store_of(model.thresholds, lambda each: each[mask], device))
+    return model.keep(mask).to(device)
 
 
-def whole_of(
-    splat: SplatFile, store: ThresholdStore, ranks: Ranks
-) -> tuple[SplatFile, ThresholdStore]:
+def whole_of(model: Model, ranks: Ranks) -> Model:
     """The whole model, in the main memory of the first process, from everyone's part.
 
     Other processes get one without Gaussians.
@@ -237,18 +231,12 @@ def whole_of(
     Raises:
         RanksError: another process is gone.
     """
-    shards = Shards(ranks, len(splat))
-    parts = vars(splat).items()
-    rows = {name: shards.whole(each) for name, each in parts if isinstance(each, Tensor)}
-    return replace(splat, **rows), _store_of(store, shards.whole, "cpu")
-
-
-def _store_of(
-    store: ThresholdStore, rows: Callable[[Tensor], Tensor], device: torch.device | str
-) -> ThresholdStore:
-    """Thresholds with their moments, after a change of rows."""
-    known = store.state_dict().items()
-    state = {name: rows(each) if isinstance(each, Tensor) else each for name, each in known}
-    changed = ThresholdStore(len(state["logits"]), device)
-    changed.load_state_dict(state)
-    return changed
+    shards = Shards(ranks, len(model))
+    rows: dict[str, Any] = {name: shards.whole(each) for name, each in model.tensors.items()}
+    if any(ranks.gather(model.thresholds is not None)):
+        store = model.thresholds or ThresholdStore(len(model), model.device)
+        state = store.state_dict()
+        parts = {k: shards.whole(each) for k, each in state.items() if isinstance(each, Tensor)}
+        rows["thresholds"] = ThresholdStore(0)
+        rows["thresholds"].load_state_dict(state | parts)
+    return replace(model, **rows)

@@ -16,9 +16,8 @@ from torch import Tensor
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.files.atomic import digest
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.plugins.loading import installed
@@ -104,8 +103,7 @@ class Checkpoints:
 
 
 def configuration(
-    model: SplatFile,
-    store: ThresholdStore | None,
+    model: Model,
     dataset: Dataset,
     settings: Settings,
     engine: str,
@@ -114,24 +112,24 @@ def configuration(
     """What decides the result of a fine-tuning, as plain values.
 
     Args:
-        model: as it comes in.
-        store: the thresholds that it comes in with; None for neutral ones.
+        model: as it comes in, with its thresholds.
         dataset: its files are read whole, for their digest.
         settings: of the fine-tuning.
         engine: the engine's name.
         schedule: gives the plan of each step; when None a plugin's, or the default one.
     """
     shots = (*dataset.train, *dataset.test)
+    store = model.thresholds
     known = {} if store is None or store.neutral else store.numbers
     return {
         "version": VERSION,
-        "model": _digest(each for each in vars(model).values() if isinstance(each, Tensor)),
+        "model": _digest(model.tensors.values()),
         "thresholds": _digest(known.values()),
         "photographs": _digest(each for shot in shots for each in _of(shot)),
         "engine": engine,
         "plugins": deciding(),
         "schedule": (schedule or schedule_for(settings)).as_dict(),
-        "device": model.xyz.device.type,
+        "device": model.device.type,
         **settings.as_dict(),
     }
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -17,12 +16,11 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.pressure import FEWEST
 from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.metrics import psnr
@@ -86,12 +84,11 @@ class Bounded:
 
 
 def strongest(
-    model: SplatFile,
+    model: Model,
     dataset: Dataset,
     settings: Settings,
     bound: float,
     *,
-    store: ThresholdStore | None = None,
     engine: str | Engine = "auto",
     progress: bool = False,
     say: Callable[[str], None] = lambda _: None,
@@ -107,7 +104,6 @@ def strongest(
         dataset: training views to learn from, held-out views to measure the loss on.
         settings: of every training; without a pressure or a target.
         bound: dB, 0 or more.
-        store: thresholds to start from; not changed; neutral ones when None.
         engine: a name or an engine.
         progress: draw a bar for each training on stderr.
         say: called with a line of text before each training.
@@ -121,13 +117,10 @@ def strongest(
         raise UsageError("--max-drop", f"{bound:g}", "0 to 10 dB", "Change --max-drop.")
 
     if isinstance(engine, str):
-        engine = engine_for(engine, model.xyz.device)
+        engine = engine_for(engine, model.device)
 
     def train(each: Settings) -> FinetuneResult:
-        start = deepcopy(store)
-        return finetune(
-            model, dataset, each, store=start, engine=engine, progress=progress, ranks=ranks
-        )
+        return finetune(model, dataset, each, engine=engine, progress=progress, ranks=ranks)
 
     say("Training the control, without truncation.")
     control = train(replace(settings, truncate=False))
@@ -211,7 +204,7 @@ def _held_out(
     result: FinetuneResult, shots: Sequence[Shot], engine: Engine
 ) -> tuple[list[float], float]:
     """PSNR of each view, dB, and fragments per pixel, mean over views."""
-    candidate, splats = Candidate(result.model, result.store), result.model.splats()
+    candidate, splats = Candidate(result.model), result.model.splats()
     figures, fragments = [], []
     for shot in shots:
         shot = shot.to(splats.device)

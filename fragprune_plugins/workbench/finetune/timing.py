@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.pressure import CALIBRATION_VIEWS, FEWEST
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.types import RasterInputs
@@ -27,21 +27,21 @@ _ROUNDS, _SECONDS = 7, 1.5  # at least
 
 @torch.no_grad()
 def require_reach(
-    target: float, cost: Cost, splat: SplatFile, shots: Sequence[Shot], engine: Engine
+    target: float, cost: Cost, model: Model, shots: Sequence[Shot], engine: Engine
 ) -> None:
     """Refuse a target time that thresholds cannot reach: pixels and Gaussians stay.
 
     Args:
         target: ratio of frame times, before over after.
         cost: prices of the engine on this machine.
-        splat: as it comes in.
+        model: as it comes in.
         shots: the training views.
         engine: draws them.
 
     Raises:
         UsageError: it is out of reach.
     """
-    splats, total = splat.splats(), Counter[str]()
+    splats, total = model.splats(), Counter[str]()
     for shot in evenly(shots, CALIBRATION_VIEWS):
         inputs = RasterInputs(shot.view, splats, planes=())
         total.update(work_of(engine.rasterize(inputs, None)))
@@ -58,8 +58,8 @@ def require_reach(
 
 @torch.no_grad()
 def times_faster(
-    before: SplatFile,
-    now: SplatFile,
+    before: Model,
+    now: Model,
     thresholds: Callable[[RasterInputs], Tensor | None],
     shots: Sequence[Shot],
     engine: Engine,

@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     import torch
 
-    from fragprune_plugins.files.ply import SplatFile
-    from fragprune_plugins.learning.thresholds import ThresholdStore
-
+    from fragprune_plugins.files.model import Model
 
 DEFORMATION = "deformation.pth"
 """The network that 4DGaussians saves beside a PLY."""
 
 
-class Model(NamedTuple):
-    """A trained splat and how far each of its Gaussians reaches.
+class Trained(Protocol):
+    """The result of a training, such as ``FinetuneResult``."""
 
-    Attributes:
-        splat: the N Gaussians, as their file holds them.
-        thresholds: one for each; None where nothing is truncated.
+    @property
+    def model(self) -> Model:
+        """What was trained."""
+
+
+def of(given: Model | Trained | str | Path) -> Model:
+    """A model as it is, out of a result, or from its file.
+
+    Raises:
+        ModelFileError, SidecarError: as ``load``.
     """
+    from fragprune_plugins.files.model import Model
 
-    splat: SplatFile
-    thresholds: ThresholdStore | None = None
+    if isinstance(given, str | Path):
+        return load(given)
+    return given if isinstance(given, Model) else given.model
 
 
 def load(
@@ -49,7 +57,6 @@ def load(
     """
     from fragprune_plugins.errors import SidecarError
     from fragprune_plugins.files import sidecar
-    from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.workbench.models import formats
 
     path = Path(path)
@@ -58,18 +65,15 @@ def load(
     while True:  # until nobody replaced the pair meanwhile
         before = _versions(path)
         try:
-            splat = formats.read(path, filtered=filtered).to(device)
-            store = ThresholdStore(len(splat), device)
+            model = formats.read(path, filtered=filtered).to(device)
             if paired and sidecar.lies_beside(path):
-                store, _ = sidecar.load(path, len(splat), device)
-            elif truncation and splat.thresholds is not None:
-                store = ThresholdStore.from_falloff(splat.thresholds)
+                model = replace(model, thresholds=sidecar.load(path, len(model), device)[0])
         except SidecarError:
             if _versions(path) == before:
                 raise
         else:
             if _versions(path) == before:
-                return Model(splat, None if store.neutral else store)
+                return model if truncation and model.falloff is not None else model.untruncated()
 
 
 def _expect_whole(path: Path) -> None:
@@ -100,39 +104,15 @@ def _versions(path: Path) -> list[tuple[int, ...] | None]:
     return found
 
 
-def save_plain(path: str | Path, splat: SplatFile) -> None:
-    """Write a model that has no thresholds, for any viewer: no sidecar, no mark in the file.
-
-    The sidecar of an earlier PLY of this name goes with that model.
-
-    Raises:
-        OutputError: the place cannot be written, or its name is no model's; existing files stay as
-            they were.
-    """
-    from fragprune_plugins.files import sidecar
-    from fragprune_plugins.files.atomic import replacing, staging
-    from fragprune_plugins.files.ply import write_ply
-    from fragprune_plugins.workbench.models import formats
-
-    path = Path(path)
-    form = formats.named(path)
-    if not form.paired:
-        with replacing(path, durable=True) as new:
-            formats.write(form, new, splat, None)
-        return
-    with staging(path) as folder:
-        whole = folder / path.name
-        write_ply(whole, splat)
-        sidecar.replace_pair(path, whole, None)
-
-
-def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = None) -> Path:
+def save(
+    path: str | Path, model: Model | Trained, *, settings: dict[str, Any] | None = None
+) -> Path:
     """Write a model with its thresholds, whole or not at all, as ``fragprune finetune`` does.
 
     Args:
-        path: of the model; its suffix names the format. A PLY gets a sidecar beside it,
-            ``NAME.fragprune.safetensors``; other formats hold thresholds themselves.
-        model: what to write.
+        path: of the model; its suffix names the format. A PLY with thresholds gets a sidecar beside
+            it, ``NAME.fragprune.safetensors``; other formats hold thresholds themselves.
+        model: what to write, or the result of a training.
         settings: recorded in the sidecar, such as ``Settings.as_dict`` gives.
 
     Returns:
@@ -141,34 +121,24 @@ def save(path: str | Path, model: Model, *, settings: dict[str, Any] | None = No
     Raises:
         OutputError: the place cannot be written, its name is no model's, or the format cannot hold
             thresholds; existing files stay as they were.
-        AlignmentError: splat and thresholds differ in length.
         DivergedError: learned values are not finite.
     """
-    from fragprune_plugins.errors import AlignmentError
     from fragprune_plugins.files import sidecar
     from fragprune_plugins.files.atomic import replacing, staging
     from fragprune_plugins.files.ply import write_ply
     from fragprune_plugins.learning.finite import expect_finite
-    from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.workbench.models import formats
 
-    path, (splat, store) = Path(path), model
-    store = ThresholdStore(len(splat)) if store is None else store
-    form = formats.named(path)
-    if len(store) != len(splat):
-        raise AlignmentError(
-            str(path),
-            f"a store of {len(store)} thresholds",
-            f"{len(splat)}, one per Gaussian",
-            "Pass the store of this very model.",
-        )
-    if not form.paired:
+    path, model = Path(path), of(model)
+    form, store = formats.named(path), model.thresholds
+    if store is not None:
         expect_finite(store.numbers, str(path))
+    if not form.paired:
         with replacing(path, durable=True) as new:
-            formats.write(form, new, splat, None if store.neutral else store.values.detach())
+            formats.write(form, new, model)
         return path
     with staging(path) as folder:
-        whole = folder / path.name
-        write_ply(whole, splat, marked=not store.neutral)
-        sidecar.replace_pair(path, whole, store, settings=settings)
-    return sidecar.path_beside(path)
+        whole, pair = folder / path.name, model.falloff is not None
+        write_ply(whole, model.untruncated(), marked=pair)
+        sidecar.replace_pair(path, whole, store if pair else None, settings=settings)
+    return sidecar.path_beside(path) if pair else path

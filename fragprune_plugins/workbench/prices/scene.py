@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 
 SEED = 20240607
@@ -25,7 +25,7 @@ _SH_C0 = 0.28209479177387814
 Array = NDArray[np.float64]
 
 
-def make_scene(count: int = 100_000, seed: int = SEED) -> SplatFile:
+def make_scene(count: int = 100_000, seed: int = SEED) -> Model:
     """Gaussians of SH degree 3, raw as in a PLY; deterministic.
 
     Args:
@@ -64,7 +64,7 @@ def make_scene(count: int = 100_000, seed: int = SEED) -> SplatFile:
     def tensor(values: Array) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
-    return SplatFile(
+    return Model(
         xyz=tensor(world),
         f_dc=tensor((rgb.clip(0.02, 0.98) - 0.5)[:, None] / _SH_C0),
         f_rest=tensor(rest.transpose(0, 2, 1)),

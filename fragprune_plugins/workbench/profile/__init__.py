@@ -65,30 +65,30 @@ def command(
 
     from fragprune_plugins.files import records
     from fragprune_plugins.files.atomic import writable_folder
-    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
     from fragprune_plugins.workbench.figures.wording import describe, nothing_drawn
 
     rasterizer, where = open_engine(engine, device, threads)
     if out is not None:
         writable_folder(out)
-    splat, store = models.load(model, truncation=not no_truncation, device=where)
+    loaded = models.load(model, truncation=not no_truncation, device=where)
     photographs = photographs_for(model, data, images, resolution, white_background)
     shots = load_shots(photographs, views, where)
-    columns = {"untruncated": Candidate(splat)}
-    if store is not None:
-        columns["truncated"] = Candidate(splat, store)
+    columns = {"untruncated": Candidate(loaded.untruncated())}
+    if loaded.falloff is not None:
+        columns["truncated"] = Candidate(loaded)
     measured = dict(
-        zip(columns, measure(list(columns.values()), shots, engine=rasterizer), strict=True)
+        zip(columns, measure_all(list(columns.values()), shots, engine=rasterizer), strict=True)
     )
     last = list(measured)[-1]
-    report: dict[str, Any] = {"model": str(model), "truncated": store is not None}
+    report: dict[str, Any] = {"model": str(model), "truncated": loaded.falloff is not None}
     report |= measured[last] | {"columns": measured}
     warnings = nothing_drawn([each["fragments_per_pixel"] for each in measured.values()])
     report["warnings"] = warnings
     lines = [describe(measured), *(f"Warning: {each}" for each in warnings)]
-    if store is not None:
+    if loaded.falloff is not None:
         points = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
-        thresholds = store.values.detach().cpu()
+        thresholds = loaded.falloff.cpu()
         step = max(1, len(thresholds) // 100_000)
         quantiles = torch.quantile(thresholds[::step], points).tolist()
         report["threshold_quantiles"] = quantiles

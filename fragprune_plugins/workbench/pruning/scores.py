@@ -15,14 +15,12 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.reference import fragments
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.files.ply import SplatFile
-from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs, View
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
-Score = Callable[[SplatFile, Tensor | None, Iterable[View], Engine], Tensor]
+Score = Callable[[Model, Tensor | None, Iterable[View], Engine], Tensor]
 """Gives (N,) from N Gaussians, their thresholds (N,) in falloff or None, views, and an engine."""
 
 VOLUME_POWER = 0.1
@@ -69,8 +67,8 @@ def keep_best(
     """
     score = removal_error if score is None else score
     drawer = _drawer(engine, model)
-    scores = score(model.splat, _thresholds(model), _bar(views, progress), drawer)
-    return _rows(model, best(scores, share))
+    scores = score(model, model.falloff, _bar(views, progress), drawer)
+    return model.keep(best(scores, share))
 
 
 def keep_needed(
@@ -91,18 +89,18 @@ def keep_needed(
         engine: a name or an engine.
         progress: draw a bar on stderr.
     """
-    splat, thresholds = model.splat, _thresholds(model)
-    drawer, splats, error = _drawer(engine, model), splat.splats(), 0.0
+    thresholds = model.falloff
+    drawer, splats, error = _drawer(engine, model), model.splats(), 0.0
     with torch.no_grad():
         for shot in shots:
             image = drawer.rasterize(RasterInputs(shot.view, splats, planes=()), thresholds).image
             error += float((shot.looked_at(image).clamp(0, 1) - shot.image).square().sum())
     views = _bar([shot.view for shot in shots], progress)
-    each, least = removal_error(splat, thresholds, views, drawer).double().sort(stable=True)
+    each, least = removal_error(model, thresholds, views, drawer).double().sort(stable=True)
     spared = int((each.cumsum(0) <= SPARE * error).sum())
     kept = torch.ones_like(each, dtype=torch.bool)
     kept[least[: min(spared, len(each) - 1)]] = False
-    return _rows(model, kept)
+    return model.keep(kept)
 
 
 def best(scores: Tensor, share: float) -> Tensor:
@@ -123,14 +121,14 @@ def best(scores: Tensor, share: float) -> Tensor:
 
 @torch.no_grad()
 def opacity(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
+    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
 ) -> Tensor:
     """The opacity, by which 3DGS itself prunes."""
     return model.splats().opacities
 
 
 def total_weight(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
+    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
 ) -> Tensor:
     """Sum of the weights alpha T of all fragments: the light that it gives to all views.
 
@@ -141,7 +139,7 @@ def total_weight(
 
 
 def largest_weight(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
+    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
 ) -> Tensor:
     """The largest weight alpha T of any fragment in any view (RadSplat 2024; LP-3DGS ``mw_score``).
 
@@ -156,7 +154,7 @@ def largest_weight(
 
 
 def light_gaussian(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
+    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
 ) -> Tensor:
     """Opacity x fragments x volume^0.1: LightGaussian's score (2023), up to a common factor.
 
@@ -171,7 +169,7 @@ def light_gaussian(
 
 
 def mini_splatting(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
+    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
 ) -> Tensor:
     """Sum over views of the mean weight of its fragments, where it wins a pixel of the view.
 
@@ -190,7 +188,7 @@ def mini_splatting(
 
 
 def falloff_gradient(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
+    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
 ) -> Tensor:
     """Sum over fragments of the squared gradient by the falloff: Speedy-Splat's score (2024).
 
@@ -212,7 +210,7 @@ def falloff_gradient(
 
 
 def removal_error(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
+    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
 ) -> Tensor:
     """Squared change of all pictures if this Gaussian alone went, estimated; the same every time.
 
@@ -236,7 +234,7 @@ def removal_error(
 
 
 def removal_error_per_price(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
+    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
 ) -> Tensor:
     """``removal_error`` over ``price``: what it gives for what it costs."""
     views = list(views)
@@ -244,9 +242,7 @@ def removal_error_per_price(
     return worth / price(model, thresholds, views, engine)
 
 
-def price(
-    model: SplatFile, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
+def price(model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine) -> Tensor:
     """What a Gaussian costs in a frame, in fragments: those drawn, mean over views, and its own."""
     views = list(views)
     drawn = _summed(model, thresholds, views, engine, lambda drawn: drawn.fragments_per_gaussian)
@@ -254,7 +250,7 @@ def price(
 
 
 def _drawer(engine: str | Engine, model: Model) -> Engine:
-    return engine_for(engine, model.splat.xyz.device) if isinstance(engine, str) else engine
+    return engine_for(engine, model.device) if isinstance(engine, str) else engine
 
 
 def _bar(views: Sequence[View], progress: bool) -> Iterable[View]:
@@ -265,23 +261,6 @@ def _bar(views: Sequence[View], progress: bool) -> Iterable[View]:
         views, "scoring Gaussians", unit="view", leave=None, disable=not progress
     )
     return bar
-
-
-def _thresholds(model: Model) -> Tensor | None:
-    """(N,) to draw a model with; None where nothing is truncated."""
-    store = model.thresholds
-    return None if store is None or store.neutral else store.values.detach()
-
-
-def _rows(model: Model, kept: Tensor) -> Model:
-    """The rows where (N,) bool is True, in their order."""
-    splat, store = model
-    if store is None:
-        return Model(splat.keep(kept))
-    smaller = ThresholdStore(0, store.logits.device)
-    smaller.load_state_dict(store.state_dict())
-    smaller.keep(kept)
-    return Model(splat.keep(kept), smaller)
 
 
 SCORES: dict[str, Score] = {
@@ -297,7 +276,7 @@ SCORES: dict[str, Score] = {
 """Every score by its name."""
 
 
-def _inputs(model: SplatFile, views: Iterable[View]) -> Iterator[RasterInputs]:
+def _inputs(model: Model, views: Iterable[View]) -> Iterator[RasterInputs]:
     """The inputs of every view, with counts and weights."""
     splats = model.splats()
     for view in views:
@@ -306,7 +285,7 @@ def _inputs(model: SplatFile, views: Iterable[View]) -> Iterator[RasterInputs]:
 
 @torch.no_grad()
 def _summed(
-    model: SplatFile,
+    model: Model,
     thresholds: Tensor | None,
     views: Iterable[View],
     engine: Engine,

@@ -10,38 +10,14 @@ from torch import Tensor
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.files.ply import SplatFile
-from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.types import RasterInputs, View
 
 
-def drop_invisible(
-    model: SplatFile,
-    store: ThresholdStore,
-    views: Sequence[View] = (),
-    *,
-    engine: str | Engine = "auto",
-) -> tuple[SplatFile, ThresholdStore]:
-    """Copy a model and its thresholds without the rows that are not ``visible``.
-
-    Thresholds keep their moments. Visibility follows the thresholds in the store, not the answers
-    of plugins.
-
-    Raises:
-        InputError: no Gaussian is visible.
-    """
-    kept = visible(model, None if store.neutral else store.values.detach(), views, engine=engine)
-    smaller = ThresholdStore(0, store.logits.device)
-    smaller.load_state_dict(store.state_dict())
-    smaller.keep(kept)
-    return model.keep(kept), smaller
-
-
 @torch.no_grad()
 def visible(
-    model: SplatFile,
-    thresholds: Tensor | None = None,
+    model: Model,
     views: Sequence[View] = (),
     *,
     engine: str | Engine = "auto",
@@ -54,8 +30,7 @@ def visible(
     values are. (torch.sigmoid may round an opacity differently in another row.)
 
     Args:
-        model: N Gaussians.
-        thresholds: (N,) falloff in (0, 1), or None for no truncation.
+        model: N Gaussians. Its own thresholds count, not the answers of plugins.
         views: the views whose pictures must stay the same.
         engine: a name or an engine.
 
@@ -71,7 +46,7 @@ def visible(
             # Alpha capped at its least cuts and hides no Gaussian: light is left behind two
             # thousand Gaussians. So those count too that end a pixel without being drawn in it.
             inputs = RasterInputs(view, splats, counts=True, alpha_max=ALPHA_MIN, planes=())
-            counts = drawer.rasterize(inputs, thresholds).fragments_per_gaussian
+            counts = drawer.rasterize(inputs, model.falloff).fragments_per_gaussian
             assert counts is not None
             seen |= counts > 0
     if not seen.any():

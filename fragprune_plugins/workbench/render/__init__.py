@@ -179,24 +179,24 @@ def command(
     elif cameras is not None:
         named = load_cameras(cameras, white_background=white_background)
     else:
-        named = divided(filming.orbit(whole.splat, frames, up), resolution)
+        named = divided(filming.orbit(whole, frames, up), resolution)
         background = torch.full((3,), float(white_background))
         named = [(name, replace(view, background=background)) for name, view in named]
     if film and not orbit:
         named = filming.along(named, frames)
     files = [out / f"{stem}.png" for stem in stems([name for name, _ in named])]
     with joined(where) if shard else nullcontext(Ranks()) as ranks:
-        splat, store = part_of(whole, ranks, where) if shard else whole
+        part = part_of(whole, ranks, where) if shard else whole
         if shard:
             rasterizer = ShardedEngine(rasterizer, ranks)
-        splats = splat.splats()
+        splats = part.splats()
         drawn: dict[int, float] = {}
         maps: dict[int, Tensor] = {}
 
         def draw(index: int) -> RasterOutputs:
             inputs = RasterInputs(named[index][1].to(where), splats, counts=heatmap, planes=())
             with torch.no_grad():
-                outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, store))
+                outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, part.thresholds))
             drawn[index] = float(outputs.fragments_per_pixel)
             return outputs
 
@@ -232,7 +232,7 @@ def command(
             "model": str(model),
             "files": [str(file) for file in files],
             "fragments_per_pixel": mean,
-            "gaussians": len(whole.splat),
+            "gaussians": len(whole),
             "truncated": whole.thresholds is not None,
             "engine": rasterizer.name,
             "device": str(where),

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from fragprune_plugins.errors import OutputError, UsageError
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate
 
 
 def orbit(
-    splat: SplatFile,
+    splat: Model,
     count: int,
     up: tuple[float, float, float] = (0.0, -1.0, 0.0),
     *,

@@ -258,8 +258,7 @@ def _draw(
         engine, device = opened()
         loaded = [models.load(path, filtered=drawn.filtered, device=device) for path in allowed]
         if curves:
-            store = loaded[-1].thresholds if drawn.models[-1] in allowed else None
-            values = None if store is None else store.values
+            values = loaded[-1].falloff if drawn.models[-1] in allowed else None
             with DOOR.stated(record.path) as reading:
                 reading.place = "data.curves"
                 report_page.save_learning(folder / report_page.LEARNING, curves, values)
@@ -277,7 +276,7 @@ def _draw(
         if data is not None:  # the user asked for the views
             raise
         return None, learning, f"No views are shown: {error}"
-    before, after = (Candidate(*each, drawn.drawing) for each in loaded)
+    before, after = (Candidate(each, drawn.drawing) for each in loaded)
     views = report_page.draw_views(folder, before, after, dataset.test, engine)
     return views, learning, ""
 

@@ -228,15 +228,15 @@ def _measure(
         The measurements before and after; after joint learning only those.
     """
     from fragprune_plugins.hosts.photographs import Photographs
-    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure
+    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
     from fragprune_plugins.workbench.models import model as models
     from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
     rasterizer, where = open_engine(engine, "cpu" if device == "cpu" else "auto", None)
     dataset = load_photographs(Photographs.from_dict(photographs))
     left = [models.load(Path(path), filtered=True, device=where) for path in photographs["models"]]
-    candidates = [Candidate(*model, photographs["drawing"]) for model in left]
-    return measure(candidates, dataset.test, engine=rasterizer)
+    candidates = [Candidate(model, photographs["drawing"]) for model in left]
+    return measure_all(candidates, dataset.test, engine=rasterizer)
 
 
 def _describe(

@@ -37,12 +37,13 @@ _CAMERAS = Door(
 )
 
 
-def load_cameras(path: Path, *, white_background: bool = False) -> list[tuple[str, View]]:
+def load_cameras(path: str | Path, *, white_background: bool = False) -> list[tuple[str, View]]:
     """Read the named views of a cameras file.
 
     Raises:
         DatasetError: the file is missing, broken or empty.
     """
+    path = Path(path)
     content = load_json(path)
     if isinstance(content, dict) and "camera_path" in content:
         with _CAMERAS.stated(path) as reading:

@@ -180,7 +180,7 @@ def load_photographs(photographs: Photographs) -> Dataset:
 
 
 def load_dataset(
-    folder: Path,
+    folder: str | Path,
     *,
     resolution: int | Resolution = 1,
     white_background: bool = False,
@@ -205,7 +205,8 @@ def load_dataset(
     background = torch.full((3,), float(white_background))
     size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
     train, test = (
-        [make_shot(row, background, size) for row in part] for part in read_scene(folder, images)
+        [make_shot(row, background, size) for row in part]
+        for part in read_scene(Path(folder), images)
     )
     return Dataset(train, test)
 

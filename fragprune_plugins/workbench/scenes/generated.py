@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.pinhole import HOLD_OUT
 
@@ -36,7 +36,7 @@ _NEIGHBOURS = 4
 _BETWEEN = (0.1, 0.9)  # of the way; nearer to a camera is its own picture again
 
 
-def bounds(splat: SplatFile) -> tuple[Tensor, float]:
+def bounds(splat: Model) -> tuple[Tensor, float]:
     """Where most of a splat is: the median of the means, and the radius of nine tenths around it.
 
     Args:
@@ -53,7 +53,7 @@ def bounds(splat: SplatFile) -> tuple[Tensor, float]:
 
 
 def around(
-    splat: SplatFile,
+    splat: Model,
     count: int = ORBIT_VIEWS,
     *,
     width: int = 800,

@@ -90,14 +90,14 @@ def command(
     if shown:
         start = shown[0].view
     else:
-        start = overview(loaded[0].splat)
+        start = overview(loaded[0])
         start.background.copy_(torch.full((3,), float(white_background)))
     site = make_site(model.name, loaded, layers, shown, start)
     size = sum(map(len, site.values()))
     facts: dict[str, Any] = {
         "model": str(model),
         "compare": None if compare is None else str(compare),
-        "gaussians": [len(each.splat) for each in loaded],
+        "gaussians": [len(each) for each in loaded],
         "truncated": truncated,
         "cameras": len(shown),
         "bytes": size,

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from fragprune_plugins.constants import ALPHA_MIN
-from fragprune_plugins.workbench.models.model import Model
+from fragprune_plugins.files.model import Model
 
 Words = NDArray[np.uint32]
 
@@ -49,21 +49,17 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
         The bytes, and: ``gaussians``, ``degree``, ``truncated`` (has thresholds), ``scales`` (least
         and largest logarithm of a scale).
     """
-    splat, store = model
-    drawn = splat.splats()
-    count, degree = len(splat), splat.sh_degree
+    drawn, falloff = model.splats(), model.falloff
+    count, degree = len(model), model.sh_degree
     assert drawn.scales is not None
     scales = drawn.scales.log()
     low, high = float(scales.min()), float(scales.max())
     share = (scales - low) / max(high - low, 1e-6)
-    if store is None:
-        cutoffs = torch.ones(count)
-    else:
-        cutoffs = -2 * store.values.detach().double().log() / CUTOFF_MAX
-    rotation = torch.nn.functional.normalize(splat.rotation)
+    cutoffs = torch.ones(count) if falloff is None else -2 * falloff.double().log() / CUTOFF_MAX
+    rotation = torch.nn.functional.normalize(model.rotation)
 
     geometry = np.empty((count, 8), dtype="<u4")
-    geometry[:, :3] = _array(splat.xyz, "<f4").view("<u4")
+    geometry[:, :3] = _array(model.xyz, "<f4").view("<u4")
     geometry[:, 3] = _pair(_unsigned(drawn.opacities), _unsigned(cutoffs))
     turns = np.round(_array(rotation, "<f8") * 32767).astype("<i2").view("<u2")
     geometry[:, 4] = _pair(turns[:, 0], turns[:, 1])
@@ -73,12 +69,12 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
     geometry[:, 7] = sizes[:, 2]
 
     harmonics = np.zeros((count, _texels(degree) * 8), dtype="<f2")
-    values = _array(torch.cat([splat.f_dc, splat.f_rest], dim=1).flatten(1), "<f4")
+    values = _array(torch.cat([model.f_dc, model.f_rest], dim=1).flatten(1), "<f4")
     harmonics[:, : values.shape[1]] = values.clip(-_HALF_MAX, _HALF_MAX)
     facts = {
         "gaussians": count,
         "degree": degree,
-        "truncated": store is not None,
+        "truncated": falloff is not None,
         "scales": [low, max(high, low + 1e-6)],
     }
     return geometry.tobytes() + harmonics.tobytes(), facts

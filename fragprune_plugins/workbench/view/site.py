@@ -15,10 +15,10 @@ import torch
 
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.page import allowed
 from fragprune_plugins.workbench.figures.pictures import picture
-from fragprune_plugins.workbench.models.model import Model
 from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.scenes.generated import bounds
 from fragprune_plugins.workbench.view.packing import pack
@@ -93,7 +93,7 @@ def make_site(
         file = f"model-{number}.splats"
         site[file], facts = pack(model)
         described.append({"file": file, **facts})
-    centre, radius = bounds(models[0].splat)
+    centre, radius = bounds(models[0])
     listed = []
     for number, each in enumerate(cameras):
         entry = {"name": each.name, **camera(each.view), "photograph": None}

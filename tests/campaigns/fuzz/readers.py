@@ -54,10 +54,10 @@ def _view() -> View:
 
 
 def _ply(file: Path) -> None:
-    splat, store = models.load(file)
+    model = models.load(file)
     with torch.no_grad():
-        thresholds = None if store is None else store.values
-        drawn = _engine().rasterize(RasterInputs(_view(), splat.splats(), planes=()), thresholds)
+        inputs = RasterInputs(_view(), model.splats(), planes=())
+        drawn = _engine().rasterize(inputs, model.falloff)
     _sound("a picture that is not finite", bool(drawn.image.isfinite().all()))
 
 

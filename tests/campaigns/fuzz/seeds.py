@@ -89,7 +89,7 @@ def model(degree: int = 0, count: int = GAUSSIANS) -> bytes:
     """A splat of a few Gaussians as a binary PLY."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "m.ply"
-        write_ply(path, tiny.random_model(count, degree), torch.full((count,), 0.2))
+        write_ply(path, tiny.cut(tiny.random_model(count, degree), 0.2))
         return path.read_bytes()
 
 
@@ -102,9 +102,8 @@ def _formats(folder: Path) -> dict[str, dict[str, bytes]]:
         files = made.setdefault(form.suffix[1:], {})
         for degree in (0, 1):
             path = folder / f"degree{degree}{form.suffix}"
-            thresholds = torch.full((GAUSSIANS,), 0.2) if form.carries else None
             splat = tiny.random_model(GAUSSIANS, degree)
-            formats.write(form, path, splat, thresholds)
+            formats.write(form, path, tiny.cut(splat, 0.2) if form.carries else splat)
             files[path.name] = path.read_bytes()
     header, parts = spz_parts(made["spz"]["degree1.spz"])
     made["spz"]["version3.spz"] = gzip.compress(

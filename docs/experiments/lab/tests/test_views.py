@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from cli.commands import run_json as fragprune
@@ -20,9 +22,9 @@ from fragprune_plugins.types import RasterInputs
 def words(tmp_path):
     """A model, the same one truncated, and where experiments on them are to lie."""
     data, model, _ = tiny.scene(tmp_path)
-    splat = fp.load(model).splat
+    splat = fp.load(model)
     store = ThresholdStore.from_falloff(torch.full((len(splat),), 0.3))
-    fp.save(tmp_path / "cut.ply", fp.Model(splat, store))
+    fp.save(tmp_path / "cut.ply", replace(splat, thresholds=store))
     return [model, tmp_path / "cut.ply", "--data", data, "--out", tmp_path / "out"]
 
 

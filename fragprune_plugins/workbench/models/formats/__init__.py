@@ -15,9 +15,7 @@ from fragprune_plugins.errors import ModelFileError, OutputError
 from fragprune_plugins.files.reading import Door
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from fragprune_plugins.files.ply import SplatFile
+    from fragprune_plugins.files.model import Model
 
 
 @dataclass(frozen=True)
@@ -27,8 +25,8 @@ class Format:
     Attributes:
         name: for messages.
         suffix: the end of a file's name.
-        module: of this package, with ``read(reading) -> SplatFile`` and ``write(file, splat,
-            thresholds)``; "" for PLY.
+        module: of this package, with ``read(reading) -> Model`` and ``write(file, model)``; "" for
+            PLY.
         carries: whether a file can hold thresholds.
         keeps: what of a model the format keeps, as words for the user; "" if it keeps every bit.
     """
@@ -126,7 +124,7 @@ def found(path: Path) -> Format:
     return next((each for each in others if path.name.lower().endswith(each.suffix)), PLY)
 
 
-def read(path: Path, *, filtered: bool = False) -> SplatFile:
+def read(path: Path, *, filtered: bool = False) -> Model:
     """Read a model of any format; thresholds that the file itself holds are in the result.
 
     Args:
@@ -142,26 +140,30 @@ def read(path: Path, *, filtered: bool = False) -> SplatFile:
     if form.paired:
         return read_ply(path, filtered=filtered)
     with _DOOR.reading(path) as reading:
-        splat: SplatFile = _module(form).read(reading)
-        expect_drawable(path, splat)
-        return splat
+        model: Model = _module(form).read(reading)
+        expect_drawable(path, model)
+        return model
 
 
-def write(form: Format, new: Path, splat: SplatFile, thresholds: Tensor | None) -> None:
+def write(form: Format, new: Path, model: Model) -> None:
     """Write a model into a file that does not exist yet.
 
     Args:
-        form: the format, not PLY.
+        form: the format.
         new: the file, in a folder that ``atomic.staging`` or ``atomic.replacing`` gave.
-        splat: the Gaussians.
-        thresholds: (N,) in (0, 1), or None.
+        model: the Gaussians, and their thresholds if they have any.
 
     Raises:
         OutputError: the format cannot hold the model or its thresholds.
     """
-    if thresholds is not None:
+    from fragprune_plugins.files.ply import write_ply
+
+    if model.falloff is not None:
         expect_carrier(form, new)
-    if splat.filter_3d is not None:
+    if form.paired:
+        write_ply(new, model)
+        return
+    if model.filter_3d is not None:
         raise OutputError(
             new.name,
             f"a {form.name} file, which cannot hold Mip-Splatting's 3D filter",
@@ -170,8 +172,7 @@ def write(form: Format, new: Path, splat: SplatFile, thresholds: Tensor | None) 
         )
     with open(new, "wb") as file:
         try:
-            held = None if thresholds is None else thresholds.cpu()
-            _module(form).write(file, splat.to("cpu"), held)
+            _module(form).write(file, model.to("cpu"))
         except ValueError as error:
             found = f"a {form.name} file, which cannot hold {error}"
             raise OutputError(

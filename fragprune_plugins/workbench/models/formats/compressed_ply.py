@@ -11,9 +11,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, header_lines, read_elements
 from fragprune_plugins.files.reading import Reading
 from fragprune_plugins.workbench.models.formats.values import (
@@ -54,7 +53,7 @@ def lies_at(path: Path) -> bool:
     return any(line.strip().endswith(b" packed_position") for line in lines)
 
 
-def read(reading: Reading) -> SplatFile:
+def read(reading: Reading) -> Model:
     """The Gaussians of an open file."""
     elements = read_elements(reading, ("chunk", "vertex", "sh"))
     chunk, vertex = elements["chunk"], elements["vertex"]
@@ -87,7 +86,7 @@ def read(reading: Reading) -> SplatFile:
     )
 
 
-def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
+def write(file: BinaryIO, splat: Model) -> None:
     """Write the Gaussians along a Z-order curve; the registry has refused thresholds."""
     splat = splat.keep(morton_order(splat))
     count, starts = len(splat), np.arange(0, len(splat), _CHUNK)

@@ -13,10 +13,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Reading, parse_json
 from fragprune_plugins.workbench.models.formats.values import (
     SH_C0,
@@ -42,7 +41,7 @@ _SH = [f"{BASE}:SH_DEGREE_{l}_COEF_{n}" for l in range(4) for n in range(2 * l +
 _COUNTS = {1: 0, 4: 1, 9: 2, 16: 3}
 
 
-def read(reading: Reading) -> SplatFile:
+def read(reading: Reading) -> Model:
     """The Gaussians of the file's one primitive of splats."""
     magic, version, _ = struct.unpack("<III", reading.take(12))
     if magic != _MAGIC or version != 2:
@@ -136,7 +135,7 @@ def _accessor(
     return rows
 
 
-def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
+def write(file: BinaryIO, splat: Model) -> None:
     """Write one primitive; the extension is there only with thresholds."""
     splat = turned(splat, _AXES)
     xyz, base, rest = array(splat.xyz), array(splat.f_dc)[:, 0], array(splat.f_rest)
@@ -157,8 +156,8 @@ def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
         "projection": "perspective",
     }
     used = [BASE]
-    if thresholds is not None:
-        columns[f"{CUTOFF}:THRESHOLD"] = array(thresholds)[:, None]
+    if (falloff := splat.falloff) is not None:
+        columns[f"{CUTOFF}:THRESHOLD"] = array(falloff)[:, None]
         extension["extensions"] = {CUTOFF: {}}
         used.append(CUTOFF)
     views: list[dict[str, Any]] = []

@@ -17,11 +17,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import ModelFileError
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Door, Reading, parse_json
 from fragprune_plugins.workbench.models.formats.palette import codebook, nearest, palette
 from fragprune_plugins.workbench.models.formats.values import (
@@ -53,7 +52,7 @@ _DOOR = Door(ModelFileError, "not readable as WebP", "an image of a SOG", "Copy 
 Load = Callable[[str], bytes]
 
 
-def read(reading: Reading) -> SplatFile:
+def read(reading: Reading) -> Model:
     """The Gaussians of an open ``.sog``, or of an open ``meta.json`` and the images beside it."""
     if reading.path.name == _META:
         return _read(parse_json(reading.take(_bounded(reading.size)).decode()), _beside(reading))
@@ -90,7 +89,7 @@ def _beside(reading: Reading) -> Load:
     return load
 
 
-def _read(meta: dict[str, Any], load: Load) -> SplatFile:
+def _read(meta: dict[str, Any], load: Load) -> Model:
     if meta.get("version") != 2:
         raise ValueError(f"version {meta.get('version')!r} of SOG")
     count = meta["count"]
@@ -175,11 +174,10 @@ def _rotations(texels: Bytes) -> npt.NDArray[Any]:
     return full
 
 
-def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
+def write(file: BinaryIO, splat: Model) -> None:
     """Write a bundle along a Z-order curve; the extra image is there only if it cuts something."""
-    order = morton_order(splat)
-    splat = splat.keep(order)
-    codes = codes_of(None if thresholds is None else thresholds[order])
+    order, codes = morton_order(splat), codes_of(splat)
+    splat = splat.untruncated().keep(order)
     count = len(splat)
     width = 4 * math.ceil(count**0.5 / 4)
     height = 4 * math.ceil(count / width / 4)
@@ -236,7 +234,7 @@ def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
             "files": ["shN_centroids.webp", *plane("shN_labels.webp", two)],
         }
     if codes is not None:
-        grey = np.repeat(codes[:, None], 3, axis=1)
+        grey = np.repeat(codes[order.numpy(), None], 3, axis=1)
         meta["extras"] = {EXTRA: {"files": plane(f"{EXTRA}.webp", grey)}}
     files[_META] = json.dumps(meta, separators=(",", ":")).encode()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:

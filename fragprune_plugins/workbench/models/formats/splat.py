@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import BinaryIO
 
 import numpy as np
-from torch import Tensor
 
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import Reading
 from fragprune_plugins.workbench.models.formats.values import (
     SH_C0,
@@ -26,7 +25,7 @@ _ROW = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("ro
 _SCALE_MIN = 1e-30  # some writers leave 0, which has no logarithm
 
 
-def read(reading: Reading) -> SplatFile:
+def read(reading: Reading) -> Model:
     """The Gaussians of an open file."""
     if reading.size % _ROW.itemsize:
         raise EOFError(f"{reading.size} bytes are no multiple of {_ROW.itemsize}")
@@ -44,7 +43,7 @@ def read(reading: Reading) -> SplatFile:
     )
 
 
-def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
+def write(file: BinaryIO, splat: Model) -> None:
     """Write the Gaussians; the registry has refused thresholds."""
     data = np.zeros(len(splat), _ROW)
     data["xyz"] = array(splat.xyz)

@@ -16,9 +16,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import Reading
 from fragprune_plugins.workbench.models.formats.values import (
     Bytes,
@@ -60,7 +59,7 @@ _NAMED = 8  # extensions in a warning
 _SQRT_HALF = np.float32(0.5**0.5)
 
 
-def read(reading: Reading) -> SplatFile:
+def read(reading: Reading) -> Model:
     """The Gaussians of an open file."""
     magic = reading.take(4)
     reading.file.seek(0)
@@ -157,7 +156,7 @@ def _axes(payload: bytes | None) -> tuple[int, int, int]:
     return x, y, z
 
 
-def _splat(header: _Header, parts: list[bytes], codes: bytes | None) -> SplatFile:
+def _splat(header: _Header, parts: list[bytes], codes: bytes | None) -> Model:
     count = header.count
     if codes is not None and len(codes) != count:
         raise ValueError(f"{len(codes)} thresholds for {count} Gaussians")
@@ -195,7 +194,7 @@ def _smallest_three(data: Bytes) -> npt.NDArray[Any]:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
+def write(file: BinaryIO, splat: Model) -> None:
     """Write version 4; the extension record is there only if a threshold cuts something."""
     xyz, sh, bits = array(splat.xyz), array(splat.f_rest), _FRACTION_BITS
     while bits and np.abs(xyz).max() * (1 << bits) >= (1 << 23) - 1:
@@ -215,7 +214,7 @@ def write(file: BinaryIO, splat: SplatFile, thresholds: Tensor | None) -> None:
         np.clip(quantised, 0, 255).astype(np.uint8),
     ]
     streams = [np.ascontiguousarray(part).tobytes() for part in parts if part.size]
-    codes = codes_of(thresholds)
+    codes = codes_of(splat)
     zone = b"" if codes is None else _RECORD.pack(CUTOFFS, len(codes)) + codes.tobytes()
     flags = _EXTENDED if zone else 0
     header = _HEADER.pack(_MAGIC, 4, len(splat), splat.sh_degree, bits, flags, len(streams))

@@ -1,4 +1,4 @@
-"""What formats share: arrays to and from a ``SplatFile``, activations, order, bounded streams."""
+"""What formats share: arrays to and from a ``Model``, activations, order, bounded streams."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
-from fragprune_plugins.files.ply import SplatFile
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE
+from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.models import cutoffs
 
 Floats = npt.NDArray[np.float32]
@@ -38,7 +39,7 @@ def splat_of(
     log_scales: npt.NDArray[Any],
     rotations: npt.NDArray[Any],
     thresholds: Tensor | None = None,
-) -> SplatFile:
+) -> Model:
     """A splat of arrays.
 
     Args:
@@ -48,13 +49,15 @@ def splat_of(
         opacities: (N,) in [0, 1], activated.
         log_scales: (N, 3) logarithms of standard deviations.
         rotations: (N, 4) quaternions w, x, y, z; one of length 0 becomes no rotation.
-        thresholds: (N,), or None.
+        thresholds: (N,) in (0, 1), or None.
 
     Raises:
-        ValueError: there are no Gaussians.
+        ValueError: there are no Gaussians, or thresholds are outside (0, 1).
     """
     if not len(xyz):
         raise ValueError("0 Gaussians")
+    if thresholds is not None and not ((thresholds > 0) & (thresholds < 1)).all():
+        raise ValueError("thresholds outside (0, 1)")
     inside = np.clip(np.asarray(opacities, np.float64), _ALPHA_EDGE, 1 - _ALPHA_EDGE)
     rotations = np.array(rotations, np.float32)
     rotations[(rotations == 0).all(axis=1), 0] = 1
@@ -63,14 +66,14 @@ def splat_of(
         with np.errstate(over="ignore"):
             return torch.from_numpy(np.array(values, np.float32))
 
-    return SplatFile(
+    return Model(
         xyz=tensor(xyz),
         f_dc=tensor(colours)[:, None],
         f_rest=tensor(rest),
         opacity=tensor(np.log(inside / (1 - inside)))[:, None],
         scaling=tensor(log_scales),
         rotation=torch.from_numpy(rotations),
-        thresholds=thresholds,
+        thresholds=None if thresholds is None else ThresholdStore.from_falloff(thresholds),
     )
 
 
@@ -84,11 +87,11 @@ def of_codes(codes: Bytes) -> Tensor | None:
     )
 
 
-def codes_of(thresholds: Tensor | None) -> Bytes | None:
-    """The codes of thresholds; None where nothing is cut, so that nothing need be written."""
-    if thresholds is None:
+def codes_of(splat: Model) -> Bytes | None:
+    """The codes of its thresholds; None where nothing is cut, so that nothing need be written."""
+    if (falloff := splat.falloff) is None:
         return None
-    codes = cutoffs.encode(thresholds.detach().numpy())
+    codes = cutoffs.encode(falloff.numpy())
     return codes if codes.any() else None
 
 
@@ -97,12 +100,12 @@ def array(values: Tensor) -> Floats:
     return values.detach().float().numpy()
 
 
-def opacities_of(splat: SplatFile) -> Floats:
+def opacities_of(splat: Model) -> Floats:
     """(N,) activated opacities."""
     return array(torch.sigmoid(splat.opacity[:, 0]))
 
 
-def quaternions_of(splat: SplatFile) -> Floats:
+def quaternions_of(splat: Model) -> Floats:
     """(N, 4) unit quaternions w, x, y, z."""
     return array(torch.nn.functional.normalize(splat.rotation))
 
@@ -112,7 +115,7 @@ def byte(values: npt.NDArray[Any]) -> Bytes:
     return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
 
 
-def morton_order(splat: SplatFile) -> Tensor:
+def morton_order(splat: Model) -> Tensor:
     """(N,) rows along a Z-order curve: near ones in space are near in the file."""
     xyz = array(splat.xyz).astype(np.float64)
     low, high = xyz.min(axis=0), xyz.max(axis=0)
@@ -122,7 +125,7 @@ def morton_order(splat: SplatFile) -> Tensor:
     return torch.from_numpy(np.argsort(cells @ np.array([1, 2, 4], np.uint32), kind="stable"))
 
 
-def turned(splat: SplatFile, signs: tuple[int, int, int]) -> SplatFile:
+def turned(splat: Model, signs: tuple[int, int, int]) -> Model:
     """The same scene with axes negated: means, rotations and SH of degrees 1 to 3.
 
     Args:
@@ -134,7 +137,7 @@ def turned(splat: SplatFile, signs: tuple[int, int, int]) -> SplatFile:
     turn = torch.tensor([1, y * z, x * z, x * y], dtype=torch.float32)
     sh = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]
     rest = splat.f_rest.shape[1]
-    return SplatFile(
+    return Model(
         xyz=splat.xyz * per_axis,
         f_dc=splat.f_dc,
         f_rest=splat.f_rest * torch.tensor(sh[:rest], dtype=torch.float32)[None, :, None],

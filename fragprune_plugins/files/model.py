@@ -1,0 +1,145 @@
+"""A trained splat as its file holds it, with the thresholds that truncate it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import AlignmentError, InputError
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import Splats
+
+REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
+"""The SH degree by the number of values in a row of ``f_rest``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A trained splat: N Gaussians before activation, float32, and how far each of them reaches.
+
+    Attributes:
+        xyz: (N, 3) means, world.
+        f_dc: (N, 1, 3) first SH coefficient.
+        f_rest: (N, K - 1, 3) the other coefficients, K = (degree + 1)^2.
+        opacity: (N, 1) logits.
+        scaling: (N, 3) logarithms of standard deviations; (N, 2) of surfels.
+        rotation: (N, 4) quaternions w, x, y, z of any length.
+        thresholds: N truncation thresholds; None where nothing is truncated.
+        filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units. It widens
+            every axis and lowers the opacity accordingly.
+
+    Raises:
+        InputError: a tensor has another shape.
+        AlignmentError: Gaussians and thresholds differ in number.
+    """
+
+    xyz: Tensor
+    f_dc: Tensor
+    f_rest: Tensor
+    opacity: Tensor
+    scaling: Tensor
+    rotation: Tensor
+    thresholds: ThresholdStore | None = None
+    filter_3d: Tensor | None = None
+
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz)
+        shapes = {
+            "xyz": (n, 3),
+            "f_dc": (n, 1, 3),
+            "f_rest": (n, self.f_rest.shape[1] if self.f_rest.ndim == 3 else 0, 3),
+            "opacity": (n, 1),
+            "scaling": (n, 2 if tuple(self.scaling.shape[1:]) == (2,) else 3),
+            "rotation": (n, 4),
+            "filter_3d": (n, 1),
+        }
+        for name, shape in shapes.items():
+            if (part := getattr(self, name)) is not None and tuple(part.shape) != shape:
+                found = tuple(part.shape)
+                raise InputError(f"Model.{name}", f"shape {found}", f"{shape}", "Check it.")
+        if 3 * self.f_rest.shape[1] not in REST_COUNTS:
+            raise InputError(
+                "Model.f_rest",
+                f"{self.f_rest.shape[1]} coefficients",
+                "0, 3, 8 or 15 (SH degree 0 to 3)",
+                "Check it.",
+            )
+        if self.thresholds is not None and len(self.thresholds) != n:
+            raise AlignmentError(
+                "Model.thresholds",
+                f"a store of {len(self.thresholds)} thresholds",
+                f"{n}, one per Gaussian",
+                "Pass the store of this very model.",
+            )
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def sh_degree(self) -> int:
+        """The SH degree, 0 to 3, from the number of coefficients."""
+        return REST_COUNTS[3 * self.f_rest.shape[1]]
+
+    @property
+    def device(self) -> torch.device:
+        """Where its tensors are."""
+        return self.xyz.device
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors of the Gaussians by name, without the thresholds."""
+        held = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: each for name, each in held.items() if isinstance(each, Tensor)}
+
+    @property
+    def falloff(self) -> Tensor | None:
+        """(N,) thresholds in (0, 1) to draw with, without gradient; None if nothing is truncated.
+
+        Plugins are not asked; ``rasterize`` asks them.
+        """
+        store = self.thresholds
+        return None if store is None or store.neutral else store.values.detach()
+
+    def untruncated(self) -> Model:
+        """The same Gaussians without thresholds."""
+        return replace(self, thresholds=None)
+
+    def to(self, device: torch.device | str) -> Model:
+        """The same model on a device; tensors that are there already are not copied."""
+        moved: dict[str, Any] = {name: each.to(device) for name, each in self.tensors.items()}
+        if self.thresholds is not None and self.thresholds.logits.device != torch.device(device):
+            moved["thresholds"] = self.thresholds.clone(device)
+        return replace(self, **moved)
+
+    def keep(self, mask: Tensor) -> Model:
+        """A copy of the rows where mask (N,) bool is True, in their order.
+
+        Thresholds keep their moments.
+        """
+        kept: dict[str, Any] = {name: rows[mask] for name, rows in self.tensors.items()}
+        if self.thresholds is not None:
+            kept["thresholds"] = self.thresholds.clone()
+            kept["thresholds"].keep(mask)
+        return replace(self, **kept)
+
+    def splats(self) -> Splats:
+        """The Gaussians after activation, for engines; differentiable."""
+        opacities, scales = torch.sigmoid(self.opacity[:, 0]), torch.exp(self.scaling)
+        if self.filter_3d is not None:
+            wider = (scales.square() + self.filter_3d.square()).sqrt()
+            opacities = opacities * (scales / wider).prod(dim=1)
+            scales = wider
+        return Splats(
+            means=self.xyz,
+            opacities=opacities,
+            scales=scales,
+            rotations=torch.nn.functional.normalize(self.rotation),
+            sh=torch.cat([self.f_dc, self.f_rest], dim=1),
+            sh_degree=self.sh_degree,
+        )
