@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import make_scene
 
 
 @pytest.fixture(autouse=True)
@@ -14,5 +14,5 @@ def _one_thread(single_thread):
 def photographs(tmp_path_factory):
     """The demo's room, very small."""
     folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, SceneSettings(views=6, width=40, height=30, supersample=1, points=150))
+    make_scene(folder, views=6, width=40, points=150)
     return folder

@@ -18,7 +18,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
 from fragprune_plugins.testing import mutations
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import make_scene
 
 WORDS = ["--device", "cpu", "--iters", 6]
 
@@ -31,7 +31,7 @@ def _one_thread(single_thread):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, SceneSettings(views=6, width=40, height=30, supersample=1, points=150))
+    make_scene(folder, views=6, width=40, points=150)
     return folder
 
 
@@ -140,7 +140,8 @@ def test_compare_follows_the_run_that_left_the_models(trained):
 def test_photographs_wider_than_1600_pixels_are_read_as_the_host_reads_them(tmp_path):
     """Its model is trained on 1,600 pixels, whatever is in the files."""
     folder = tmp_path / "scene"
-    make_scene(folder, SceneSettings(views=6, width=40, height=3, supersample=1, points=150))
+    make_scene(folder, views=6, width=40, points=150)
+    (folder / "sparse" / "0" / "cameras.txt").write_text("1 PINHOLE 40 3 36 36 20 1.5\n")
     for path in (folder / "images").iterdir():
         Image.open(path).resize((2000, 150)).save(path)
     out = tmp_path / "out"

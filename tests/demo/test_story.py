@@ -19,11 +19,9 @@ from fragprune_plugins.workbench.figures.wording import outcome
 TINY = """
 import json, sys
 from pathlib import Path
-from fragprune_plugins.workbench.demo.scene import SceneSettings
 from fragprune_plugins.workbench.demo import folder
 from fragprune_plugins.workbench.demo.demo import DemoSettings, run_demo
-scene = SceneSettings(views=9, width=48, height=36, supersample=1, points=400)
-settings = DemoSettings(iterations=60, finetune=30, scene=scene)
+settings = DemoSettings(iterations=60, finetune=30, views=9, width=48, points=400)
 print(json.dumps(run_demo(Path(sys.argv[1]), settings)))
 """
 
@@ -85,8 +83,8 @@ def test_pictures_and_page_are_there(demo):
     page = (out / "index.html").read_text()
     for file in report["files"]:
         assert file in page or file in ("index.html", f"pictures/{BANNER}")
-    assert report["larger"]["size"] == "144x108"
-    assert f"{report['larger']['before']['frame_ms']:.2f} -&gt; " in page
+    assert report["larger"]["size"] == "96x72"
+    assert f"frames of 96x72 of {report['larger']['before']['frame_ms']:.2f} → " in page
     assert Path(report["model_after"]).exists()
 
 
@@ -109,7 +107,6 @@ def test_all_of_it_is_the_next_demos_to_delete(demo, tmp_path):
 
 def test_progress_is_on_stderr_throughout(demo):
     _, _, stderr = demo
-    assert "Photographs" in stderr
     assert stderr.count("Training") >= 2
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import make_scene
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "write-an-adapter.md"
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
@@ -70,9 +70,7 @@ def test_the_page_has_every_file_and_command():
 def workplace(tmp_path_factory):
     """Where the reader sits: their checkouts and their data beside nothing else."""
     folder = tmp_path_factory.mktemp("reader")
-    make_scene(
-        folder / "scene", SceneSettings(views=9, width=40, height=30, supersample=1, points=150)
-    )
+    make_scene(folder / "scene", views=9, width=40, points=150)
     hosts = [(name, text) for name, text in files() if name.endswith("_host.py")]
     for name, text in hosts:
         (folder / name).write_text(text)

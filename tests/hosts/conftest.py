@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import make_scene
 
 
 @pytest.fixture(scope="session")
@@ -21,7 +21,7 @@ def dataset(tmp_path_factory):
         if (candidate / "sparse").is_dir():
             shutil.copytree(candidate, target)
             return target
-    make_scene(target, SceneSettings(views=12, width=80, height=60, supersample=1, points=600))
+    make_scene(target, views=12, width=80, points=600)
     return target
 
 

@@ -9,7 +9,7 @@ from installed.gsplat_host import GsplatHost
 
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.testing.host import running
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import make_scene
 
 DRIVERS = {"gaussian-splatting": GaussianSplattingHost, "gsplat": GsplatHost}
 
@@ -23,7 +23,7 @@ def _one_thread(single_thread):
 def photographs(tmp_path_factory):
     """The demo's room, very small."""
     folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, SceneSettings(views=6, width=40, height=30, supersample=1, points=150))
+    make_scene(folder, views=6, width=40, points=150)
     return folder
 
 

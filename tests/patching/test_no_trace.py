@@ -25,7 +25,7 @@ from fragprune_plugins.errors import FragpruneError, HostFailed, Interrupted
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing import Host
 from fragprune_plugins.testing.fresh import fresh
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import make_scene
 
 STEP = "        loss.backward()\n"
 FAIL = "        if iteration == 9:\n            note()\n            raise ValueError('theirs')\n"
@@ -60,7 +60,7 @@ OBJECTS = 50_000
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, SceneSettings(views=6, width=40, height=30, supersample=1, points=150))
+    make_scene(folder, views=6, width=40, points=150)
     return folder
 
 

@@ -16,7 +16,7 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing import Host
 from fragprune_plugins.testing.fresh import fresh
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import make_scene
 
 WORKERS = """
 import json
@@ -71,7 +71,7 @@ JOINT = RunOptions(stage="joint", from_iter=4, device="cpu", settings=OPTIONS.se
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, SceneSettings(views=6, width=40, height=30, supersample=1, points=150))
+    make_scene(folder, views=6, width=40, points=150)
     return folder
 
 

@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import make_scene
 
 
 def pytest_collection_modifyitems(items):
@@ -19,6 +19,5 @@ def pytest_collection_modifyitems(items):
 def scene(tmp_path_factory):
     """The demo's room as COLMAP text, small."""
     folder = tmp_path_factory.mktemp("scene")
-    settings = SceneSettings(views=16, width=64, height=48, supersample=1, points=400)
-    make_scene(folder, settings)
+    make_scene(folder, views=16, width=64, points=400)
     return folder

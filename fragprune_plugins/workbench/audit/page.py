@@ -19,6 +19,8 @@ MEASURED = (
 )
 """What pruning without photographs gained; docs/how-to/without-photographs.md has the table."""
 
+_TEMPLATE = Path(__file__).with_name("audit.html")
+
 _KINDS = ("", "_fragments", "_overdraw")
 
 
@@ -57,9 +59,9 @@ def sentence(figures: Mapping[str, Any]) -> str:
         f"{figures['gaussians']:,} Gaussians draw {figures['fragments_per_pixel']:.1f} fragments "
         f"per pixel, {figures['frame_ms']:.1f} ms a frame on our {figures['engine']} engine; a "
         f"viewer of fixed √8 sigma quads shades {quads:.1f} pixels per pixel. "
-        f"{idle['alone']:.0%} of the fragments are each invisible alone, and "
-        f"{idle['together']:.0%} could all go at once without moving any pixel by half an 8-bit "
-        f"level ({figures['views']} {_from(cameras['kind'], figures['views'])})."
+        f"{idle['together']:.0%} of the fragments can be left out together, and no pixel "
+        f"changes by half an 8-bit level "
+        f"({figures['views']} {_from(cameras['kind'], figures['views'])})."
     )
 
 
@@ -68,8 +70,8 @@ def pruning(figures: Mapping[str, Any]) -> str:
     if not figures["truncated"]:
         return (
             "What learned thresholds would save on this model is not known before they are "
-            f"learned: fragprune finetune {figures['model']} --self --out pruned.ply. {MEASURED} "
-            "It needs no photographs."
+            f"learned: fragprune finetune {figures['model']} --self --out pruned.ply, which "
+            f"needs no photographs. {MEASURED}"
         )
     with_, without = figures["cuts"][0], figures["cuts"][-1]
     fragments = fewer(without["fragments_per_pixel"], with_["fragments_per_pixel"])
@@ -83,11 +85,12 @@ def pruning(figures: Mapping[str, Any]) -> str:
 def text(figures: Mapping[str, Any]) -> str:
     """What a terminal shows."""
     lines = [sentence(figures), "", figures["cameras"]["why"], ""]
-    for head, rows, _, words in _tables(figures):
-        widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-        for row in (head, *rows):
+    for table in _tables(figures):
+        lines_of = (table.head, *table.rows)
+        widths = [max(map(len, column)) for column in zip(*lines_of, strict=True)]
+        for row in lines_of:
             cells = [
-                cell.ljust(width) if at < words else cell.rjust(width)
+                cell.ljust(width) if at < table.words else cell.rjust(width)
                 for at, (cell, width) in enumerate(zip(row, widths, strict=True))
             ]
             lines.append("  ".join(cells).rstrip())
@@ -102,60 +105,23 @@ def compose(figures: Mapping[str, Any], folder: Path) -> str:
         figures: of ``audit``, with "model", "cameras" and "maps".
         folder: of the pictures.
     """
-    cuts, viewers, idle, kinds = (page.table(*each) for each in _tables(figures))
-    maps = figures["maps"]
-    return page.compose(
+    cuts, viewers, idle, kinds = _tables(figures)
+    return page.render(
+        _TEMPLATE,
         title=f"What {Path(figures['model']).name} costs to draw",
         quote=sentence(figures),
-        parts=[
-            page.paragraph(f"{_SIDES[figures['cameras']['kind']]} {figures['cameras']['why']}"),
-            page.heading("Where the fragments are"),
-            page.paragraph(_MAPS),
-            page.legend("in a pixel: fragments drawn, or ellipses over it", maps["limit"]),
-            *(_view(view, folder) for view in maps["views"]),
-            page.heading("What changes nothing"),
-            page.paragraph(_IDLE.format(pixels=figures["idle"]["pixels"])),
-            idle,
-            kinds,
-            page.heading("What simple cuts save, and cost"),
-            page.paragraph(_CUTS),
-            cuts,
-            page.heading("What learned pruning saves"),
-            page.paragraph(pruning(figures)),
-            page.heading("Which viewer pays what"),
-            page.paragraph(_VIEWERS),
-            viewers,
-        ],
+        source=lambda file: page.embedded(folder / file),
+        figures=figures,
+        pruning=pruning(figures),
+        measured=MEASURED,
+        cuts=cuts,
+        viewers=viewers,
+        idle=idle,
+        kinds=kinds,
     )
 
 
-def _view(view: Mapping[str, Any], folder: Path) -> str:
-    size = (view["width"], view["height"])
-    drawn, fragments, overdraw = (page.embedded(folder / file) for file in view["files"])
-    return page.section(
-        view["name"],
-        page.split(
-            drawn,
-            fragments,
-            f"{view['fragments_per_pixel']:.1f} fragments per pixel",
-            size,
-            ("picture", "fragments"),
-        ),
-        page.split(
-            fragments,
-            overdraw,
-            f"{view['overdraw']:.1f} ellipses of √8 sigma over a pixel",
-            size,
-            ("fragments", "overdraw"),
-        ),
-    )
-
-
-Table = tuple[list[str], list[list[str]], str, int]
-"""Head, rows, caption, columns of words."""
-
-
-def _tables(figures: Mapping[str, Any]) -> list[Table]:
+def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
     """Cuts, viewers, where idle fragments sit, and of which Gaussians they are."""
     idle = figures["idle"]
     known = any(cut["foreseen_ms"] is not None for cut in figures["cuts"])
@@ -211,14 +177,14 @@ def _tables(figures: Mapping[str, Any]) -> list[Table]:
     every, together = 1.0, idle["together"]
     reasons.append(["all", f"{every:.1%}", f"{together:.1%}", _part(together, every)])
     return [
-        ([*head, *(["foreseen, ms"] if known else [])], cuts, said, 1),
-        (["viewer", "draws", "shaded/pixel", "against √8 quads"], viewers, shaded, 2),
-        (["fragments", "of all", "idle together, of all", "of these"], reasons, _REASONS, 1),
+        page.Table([*head, *(["foreseen, ms"] if known else [])], cuts, said),
+        page.Table(["viewer", "draws", "shaded/pixel", "against √8 quads"], viewers, shaded, 2),
+        page.Table(["fragments", "of all", "idle together, of all", "of these"], reasons, _REASONS),
         _kinds(idle),
     ]
 
 
-def _kinds(idle: Mapping[str, Any]) -> Table:
+def _kinds(idle: Mapping[str, Any]) -> page.Table:
     low, high = idle["opacities"]
     opacities = (f"opacity below {low:g}", f"{low:g} to {high:g}", f"over {high:g}")
     small, large = idle["radii"]
@@ -229,7 +195,7 @@ def _kinds(idle: Mapping[str, Any]) -> Table:
         [name, *(f"{share:.1%} ({part:.1%})" for share, part in zip(*both, strict=True))]
         for name, *both in zip(opacities, shares, spared, strict=True)
     ]
-    return ["Gaussians", *(f"radius {name}" for name in radii)], rows, _KINDS_SAID, 1
+    return page.Table(["Gaussians", *(f"radius {name}" for name in radii)], rows, _KINDS_SAID)
 
 
 def _from(kind: str, count: int) -> str:
@@ -250,34 +216,11 @@ _FROM = {
     "given": "given {}",
 }
 
-_SIDES = {
-    "orbit": "Generated cameras look at it from all around.",
-    "inside": "Generated cameras look around from inside of it.",
-    "given": "The cameras were given.",
-}
-
-_MAPS = """One scale for all maps. A fragment is a Gaussian that is drawn in a pixel: it ends where
-its alpha falls below 1/255, and a pixel ends where it is opaque. Overdraw is what viewers blend
-that know neither: all ellipses of √8 standard deviations over a pixel. Drag a divider."""
-
-_IDLE = """{pixels:,} pixels of evenly spread tiles were looked into, every fragment with its exact
-weight. A fragment is invisible alone if no channel of its pixel moves by half an 8-bit level
-without it. Fragments are idle together if all of them can go at once and no channel moves by more
-than that. A cut for a whole Gaussian finds only a part of them, and takes more if it may move
-pixels a little."""
-
 _REASONS = f"""Each fragment counts where the first of these holds. Behind what is opaque: less than
 {DARK:.0%} of the light is left for it."""
 
 _KINDS_SAID = """Share of all fragments, and in brackets of those idle together. The radius is 3
 sigma, on the screen."""
-
-_CUTS = """No training, the same for all Gaussians. The picture is compared with the model's own, as
-it is: below about 35 dB the change can be seen."""
-
-_VIEWERS = """Most viewers rasterize more than they blend. The figure is how many pixels they are
-asked to shade for a pixel of the picture. It is what a fill-bound frame pays; milliseconds depend
-on the machine, and no browser was timed here. Sorting, and each Gaussian itself, come on top."""
 
 _SHADED = """Quads: their area. Tiles: the pixels of all (Gaussian, tile) pairs; tiles that are
 opaque early spare some. The last row is counted by our engine, with what it spares."""

@@ -1,4 +1,4 @@
-"""Runs the demo: photographs, training, fine-tuning, measurement, pictures."""
+"""Runs the demo: training, fine-tuning, measurement, pictures."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.workbench.demo.folder import claiming, clear
-from fragprune_plugins.workbench.demo.scene import SceneSettings, make_scene
+from fragprune_plugins.workbench.demo.scene import POINTS, VIEWS, WIDTH, make_scene
 
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
@@ -37,10 +37,10 @@ class DemoSettings:
         iterations: number of iterations of the host's own training.
         finetune: number of iterations of stage 2.
         pressure: weight of drawn fragments per pixel; None for the default.
-        seed: seed of the scene and of the training.
+        seed: seed of the training.
         engine: name of the engine that rasterizes.
         device: "cpu" or a CUDA device.
-        scene: settings of the photographs.
+        views, width, points: of the scene, as ``make_scene`` takes them.
     """
 
     iterations: int = 2000
@@ -49,7 +49,9 @@ class DemoSettings:
     seed: int = 0
     engine: str = "auto"
     device: str = "cpu"
-    scene: SceneSettings = field(default_factory=SceneSettings)
+    views: int = VIEWS
+    width: int = WIDTH
+    points: int = POINTS
 
 
 def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
@@ -87,7 +89,7 @@ def run_demo(
     settings: DemoSettings | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Make a scene, train the host on it, fine-tune, measure and draw. Progress goes to stderr.
+    """Train the host on the room, fine-tune, measure and draw. Progress goes to stderr.
 
     Args:
         out: folder for ``scene/``, ``model/``, ``pictures/``, ``index.html`` and ``report.json``.
@@ -108,10 +110,8 @@ def run_demo(
     clear(out)
     clock = _Clock()
     scene, model = out / "scene", out / "model"
-    views = settings.scene.views
-    with clock.part("scene"), claiming(out, "scene"):
-        say(f"1/5  Photographing a room from {views} sides (ray-traced, nothing is downloaded)")
-        _photograph(scene, settings)
+    with claiming(out, "scene"):
+        make_scene(scene, views=settings.views, width=settings.width, points=settings.points)
     with (
         clock.part("train"),
         claiming(out, "model"),
@@ -119,21 +119,20 @@ def run_demo(
     ):
         command = host_command(scene.resolve(), model.resolve(), settings)
         say(
-            f"2/5  Training for {settings.iterations} iterations, then with thresholds "
+            f"1/4  Training for {settings.iterations} iterations, then with thresholds "
             f"for {settings.finetune}"
         )
         summary = run(command, _run_options(settings))
     with clock.part("control"):
-        say(f"3/5  The control: the same {settings.finetune} iterations without truncation")
+        say(f"2/4  The control: the same {settings.finetune} iterations without truncation")
         control = _control(scene, summary, settings)
     with clock.part("measure"):
-        say("4/5  Measuring on the held-out views")
+        say("3/4  Measuring on the held-out views")
         report = _measure(scene, summary, control, settings)
     with clock.part("pictures"), claiming(out, "pictures", "index.html", "model"):
-        say("5/5  Drawing the pictures")
-        made = replace(settings.scene, seed=settings.seed)
+        say("4/4  Drawing the pictures")
         report["files"] = write_page(
-            out, report, scene, made, summary.curves, settings.engine, settings.device
+            out, report, scene, summary.curves, settings.engine, settings.device
         )
         _record(report, scene, summary)
     report["seconds_by_part"] = clock.seconds
@@ -141,17 +140,6 @@ def run_demo(
     with claiming(out, REPORT), replacing(out / REPORT) as path:
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
-
-
-def _photograph(folder: Path, settings: DemoSettings) -> None:
-    from tqdm import tqdm
-
-    with tqdm(total=settings.scene.views, desc="Photographs", unit="view") as bar:
-        make_scene(
-            folder,
-            replace(settings.scene, seed=settings.seed),
-            lambda done, _: bar.update(done - bar.n) and None,
-        )
 
 
 def _run_options(settings: DemoSettings) -> RunOptions:

@@ -1,238 +1,57 @@
-"""Makes posed photographs of the demo room, as a COLMAP data set in text form."""
+"""The demo's photographs of a small room, with their cameras and points, as COLMAP writes them."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+import shutil
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fragprune_plugins.files.atomic import replacing, writable_folder
-from fragprune_plugins.workbench.demo.room import CENTRE, furnish
-from fragprune_plugins.workbench.demo.textures import displayed
-from fragprune_plugins.workbench.demo.tracer import FAR, Array, World, times
 
+ROOM = Path(__file__).with_name("room")
+"""``images/`` and ``sparse/0/``. ``python -m lab.room`` in docs/experiments made them."""
 
-@dataclass(frozen=True)
-class Photo:
-    """The camera of one photograph.
-
-    Attributes:
-        name: name of the image file.
-        width: width in pixels.
-        height: height in pixels.
-        focal: focal length in pixels, in x and y; the principal point is the image's centre.
-        rotation: (3, 3) world to camera; x right, y down, z forward.
-        translation: (3,) world to camera.
-    """
-
-    name: str
-    width: int
-    height: int
-    focal: float
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-
-    @property
-    def centre(self) -> NDArray[np.float64]:
-        """(3,) position of the camera in the world."""
-        centre: NDArray[np.float64] = -self.rotation.T @ self.translation
-        return centre
-
-    def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Pixel coordinates (n, 2) and depths (n,) of points (n, 3); pixel centres end in .5."""
-        local = points @ self.rotation.T + self.translation
-        flat = local[:, :2] / local[:, 2:] * self.focal
-        return flat + np.array([self.width / 2, self.height / 2]), local[:, 2]
-
-    def rays(self, pixels: NDArray[np.float64]) -> Array:
-        """Unit directions (3, n) through pixel coordinates (n, 2)."""
-        offset = (pixels - np.array([self.width / 2, self.height / 2])) / self.focal
-        local = np.concatenate([offset, np.ones((len(pixels), 1))], axis=1)
-        local /= np.linalg.norm(local, axis=1, keepdims=True)
-        return times(self.rotation.T.astype(np.float32), local.T.astype(np.float32))
-
-
-@dataclass(frozen=True)
-class SceneSettings:
-    """Settings of a scene.
-
-    Attributes:
-        views: number of photographs.
-        width: width in pixels.
-        height: height in pixels.
-        supersample: square root of the number of rays per pixel.
-        points: number of surface points, which stand for COLMAP's triangulated points.
-        seed: seed of textures, cameras and points.
-    """
-
-    views: int = 56
-    width: int = 160
-    height: int = 120
-    supersample: int = 3
-    points: int = 4000
-    seed: int = 0
-
-
-def photos(settings: SceneSettings) -> list[Photo]:
-    """Cameras on a quarter of a sphere around the still life.
-
-    The positions are an additive low-discrepancy sequence. Every eighth position, a held-out view,
-    is such a sequence too, so held-out views cover the same arc.
-    """
-    rng = np.random.default_rng([settings.seed, 1])
-    focal = settings.width / 2 / math.tan(math.radians(29))
-    cameras = []
-    for index in range(settings.views):
-        azimuth = math.radians(2 + 86 * ((0.5 + index * math.sqrt(2)) % 1))
-        elevation = math.radians(9 + 40 * ((0.5 + index * math.sqrt(3)) % 1))
-        radius = 3.4 + rng.uniform(-0.3, 0.3)
-        target = np.array(CENTRE) + rng.uniform(-0.12, 0.12, 3)
-        back = np.array(
-            [
-                math.cos(elevation) * math.cos(azimuth),
-                math.cos(elevation) * math.sin(azimuth),
-                math.sin(elevation),
-            ]
-        )
-        right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-        rotation = np.stack([right, np.cross(right, back), -back])
-        cameras.append(
-            Photo(
-                name=f"view_{index:03d}.png",
-                width=settings.width,
-                height=settings.height,
-                focal=focal,
-                rotation=rotation,
-                translation=-rotation @ (target + radius * back),
-            )
-        )
-    return cameras
-
-
-def photograph(world: World, photo: Photo, supersample: int) -> NDArray[np.uint8]:
-    """The picture (height, width, 3), with a box filter over supersample^2 rays per pixel."""
-    n = supersample
-    x = (np.arange(photo.width * n) + 0.5) / n
-    y = (np.arange(photo.height * n) + 0.5) / n
-    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    origin = photo.centre.astype(np.float32)[:, None]
-    light = world.colour(origin, photo.rays(pixels)).T.reshape(photo.height, n, photo.width, n, 3)
-    shown = displayed(light.mean(axis=(1, 3), dtype=np.float32))
-    return (shown * 255 + 0.5).astype(np.uint8)
-
-
-def surface_points(
-    world: World, cameras: list[Photo], count: int, seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points (n, 3) that the cameras see, spread evenly over pixels, and their colours (n, 3)."""
-    rng = np.random.default_rng([seed, 2])
-    positions, colours = [], []
-    for index, photo in enumerate(cameras):
-        share = count // len(cameras) + (index < count % len(cameras))
-        pixels = rng.uniform(0, 1, (share, 2)) * (photo.width, photo.height)
-        direction = photo.rays(pixels)
-        origin = photo.centre.astype(np.float32)[:, None]
-        distance, _ = world.hit(origin, direction)
-        seen = distance < FAR
-        positions.append((origin + direction * distance)[:, seen].T)
-        colours.append(displayed(world.colour(origin, direction[:, seen])).T)
-    points = np.concatenate(positions).astype(np.float64)
-    return points, (np.concatenate(colours) * 255 + 0.5).astype(np.uint8)
+VIEWS, WIDTH, POINTS = 48, 320, 4000
+"""Number of photographs, their width in pixels, and number of points."""
 
 
 def make_scene(
-    folder: Path,
-    settings: SceneSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Photo]:
-    """Write ``images/`` and ``sparse/0/`` in COLMAP's text form, and the points also as PLY.
+    folder: Path, *, views: int = VIEWS, width: int = WIDTH, points: int = POINTS
+) -> None:
+    """Copy the photographs, their cameras and points to ``images/`` and ``sparse/0/`` of a folder.
 
     Args:
-        folder: folder of the scene; made if it is missing.
-        settings: the scene's settings; None for the defaults.
-        progress: called with (done, total) after each photograph.
-
-    Returns:
-        The cameras, in the order of their names.
+        folder: the scene's folder; made if it is missing.
+        views: how many photographs, of 48.
+        width: width of the photographs in pixels, of 320; the height is three quarters of it.
+        points: how many points, of 4000.
 
     Raises:
         OutputError: the folder cannot be written.
     """
     from PIL import Image
 
-    settings = settings or SceneSettings()
     images, sparse = writable_folder(folder / "images"), writable_folder(folder / "sparse" / "0")
-    world, cameras = furnish(settings.seed), photos(settings)
-    with ThreadPoolExecutor(2) as pool:
-        pictures = pool.map(lambda p: photograph(world, p, settings.supersample), cameras)
-        for done, (photo, picture) in enumerate(zip(cameras, pictures, strict=True), start=1):
-            with replacing(images / photo.name) as path:
-                Image.fromarray(picture).save(path)
-            if progress:
-                progress(done, len(cameras))
-    points, colours = surface_points(world, cameras, settings.points, settings.seed)
-    _write(sparse / "cameras.txt", _cameras_text(cameras[0]))
-    _write(sparse / "images.txt", _images_text(cameras))
-    _write(sparse / "points3D.txt", _points_text(points, colours))
-    _write_point_cloud(sparse / "points3D.ply", points, colours)
-    return cameras
+    for photograph in sorted((ROOM / "images").iterdir())[:views]:
+        with replacing(images / photograph.name) as path:
+            if width == WIDTH:
+                shutil.copyfile(photograph, path)
+                continue
+            with Image.open(photograph) as picture:
+                size = width, picture.height * width // WIDTH
+                picture.resize(size, Image.Resampling.LANCZOS).save(path, "WEBP", lossless=True)
+    number, model, *numbers = _lines("cameras")[0].split()
+    lens = [f"{float(each) * width / WIDTH:.10g}" for each in numbers]
+    kept = {
+        "cameras": [" ".join([number, model, *lens])],
+        "images": _lines("images")[: 2 * views],
+        "points3D": _lines("points3D")[:: max(1, POINTS // points)][:points],
+    }
+    for name, lines in kept.items():
+        with replacing(sparse / f"{name}.txt") as path:
+            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _write(path: Path, text: str) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-def _cameras_text(photo: Photo) -> str:
-    x, y = photo.width / 2, photo.height / 2
-    size = f"{photo.width} {photo.height}"
-    return (
-        "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n"
-        f"1 PINHOLE {size} {photo.focal!r} {photo.focal!r} {x!r} {y!r}\n"
-    )
-
-
-def _images_text(cameras: list[Photo]) -> str:
-    """Two lines for each image; the second line, for 2D points, is empty."""
-    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] (none)"]
-    for number, photo in enumerate(cameras, start=1):
-        numbers = [*quaternion(photo.rotation), *photo.translation]
-        pose = " ".join(repr(float(x)) for x in numbers)
-        lines += [f"{number} {pose} 1 {photo.name}", ""]
-    return "\n".join(lines) + "\n"
-
-
-def _points_text(points: NDArray[np.float64], colours: NDArray[np.uint8]) -> str:
-    lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
-    for number, (point, colour) in enumerate(zip(points, colours, strict=True), start=1):
-        x, y, z = (f"{c:.6f}" for c in point)
-        r, g, b = (int(c) for c in colour)
-        lines.append(f"{number} {x} {y} {z} {r} {g} {b} 0.5")
-    return "\n".join(lines) + "\n"
-
-
-def _write_point_cloud(path: Path, points: NDArray[np.float64], colours: NDArray[np.uint8]) -> None:
-    """The columns that hosts read: position, normal (zero), 8-bit colour."""
-    from plyfile import PlyData, PlyElement
-
-    kinds = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    rows = np.zeros(len(points), dtype=[*kinds, ("red", "u1"), ("green", "u1"), ("blue", "u1")])
-    for index, name in enumerate(("x", "y", "z")):
-        rows[name] = points[:, index]
-    for index, name in enumerate(("red", "green", "blue")):
-        rows[name] = colours[:, index]
-    with replacing(path) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
-
-
-def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternion (4,) w, x, y, z of a rotation matrix (3, 3), with w >= 0."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return np.array([w, x, y, z])
+def _lines(name: str) -> list[str]:
+    """A file of COLMAP's text form without comments; after an image comes a line of 2D points."""
+    text = (ROOM / "sparse" / "0" / f"{name}.txt").read_text(encoding="utf-8")
+    return [line for line in text.splitlines() if not line.startswith("#")]

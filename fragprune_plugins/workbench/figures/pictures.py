@@ -23,8 +23,12 @@ LABEL = "drawn fragments per pixel"
 BESIDE = tuple(
     f"_{kind}"
     for kind in (
-        *("fragments", "panel", "photograph", "before", "after", "overdraw"),
-        *(f"{model}_{shown}" for model in ("before", "after") for shown in ("fragments", "error")),
+        *("fragments", "panel", "photograph", "original", "pruned", "overdraw"),
+        *(
+            f"{model}_{shown}"
+            for model in ("original", "pruned")
+            for shown in ("fragments", "error")
+        ),
     )
 )
 """What commands add to a view's name for further pictures of it."""

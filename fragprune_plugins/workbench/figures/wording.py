@@ -158,9 +158,52 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
             f"{gained}. The control, as many iterations without truncation, has "
             f"{control['fragments_per_pixel']:.1f} fragments per pixel and "
             f"{control['psnr'] - before['psnr']:+.2f} dB: pruning itself makes "
-            f"{after['psnr'] - control['psnr']:+.2f} dB."
+            f"{_by_pruning(before, after, control):+.2f} dB."
         )
     return said + missed(data) + _fell(before, after, control)
+
+
+def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """Three figures of a fine-tuning in plain words: fragments, frame time, picture.
+
+    Args:
+        data: its figures, including "before" and "after"; frames of "larger" pictures, if there.
+        control: the measurement after as many iterations without truncation; None if not run.
+
+    Returns:
+        (the figure, what it says) of each.
+    """
+    before, after = data["before"], data["after"]
+    larger = data.get("larger", data)
+    (was, now), (slow, fast) = (
+        (first[key], second[key])
+        for first, second, key in (
+            (before, after, "fragments_per_pixel"),
+            (larger["before"], larger["after"], "frame_ms"),
+        )
+    )
+    of = f" of {larger['size']}" if "size" in larger else ""
+    if after.get("target") == ITSELF:
+        picture = f"{after['psnr']:.1f} dB", "PSNR of the picture against the original's own"
+    elif control is not None:
+        gained = _by_pruning(before, after, control)
+        picture = f"{gained:+.2f} dB", "PSNR against the same training without pruning"
+    else:
+        picture = (
+            f"{after['psnr'] - before['psnr']:+.2f} dB",
+            "PSNR against the original; more training may be a part of it",
+        )
+    return [
+        (f"{was / max(now, 1e-9):.1f}x", f"fewer fragments to draw: {was:.1f} → {now:.1f} a pixel"),
+        (f"{slow / max(fast, 1e-9):.2f}x", f"as fast: frames{of} of {slow:.2f} → {fast:.2f} ms"),
+        picture,
+    ]
+
+
+def _by_pruning(before: dict[str, Any], after: dict[str, Any], control: dict[str, Any]) -> float:
+    """What pruning changes of the PSNR, dB: the difference of the two rounded gains."""
+    gained, without = (round(float(each["psnr"] - before["psnr"]), 2) for each in (after, control))
+    return gained - without
 
 
 def missed(data: dict[str, Any]) -> str:

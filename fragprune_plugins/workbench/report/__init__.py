@@ -22,6 +22,7 @@ from fragprune_plugins.workbench.commands.common import (
     engine_options,
     open_engine,
 )
+from fragprune_plugins.workbench.figures.page import Table
 from fragprune_plugins.workbench.models import model as models
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def command(
     """
     from fragprune_plugins.files.atomic import replacing
     from fragprune_plugins.files.records import find
-    from fragprune_plugins.workbench.figures import page
+    from fragprune_plugins.workbench.figures.page import embedded
     from fragprune_plugins.workbench.report import page as report_page
 
     records = find(folder)
@@ -94,23 +95,25 @@ def command(
             main, folder, pictures, data, partial(open_engine, engine, device, threads)
         )
         more = [*learning, *_files(records, folder, pictures)]
-
-        def source(file: str) -> str:
-            return page.embedded(pictures / file)
-
-        text = page.compose(
-            title=f"fragprune report: {folder.resolve().name}",
+        text = report_page.compose(
+            report_page.TEMPLATE,
+            drawn,
+            lambda file: embedded(pictures / file),
+            title=f"{_heading(main)} of {folder.resolve().name}",
+            facts=_facts(main, files),
             quote=line,
-            parts=[
-                _table(main),
-                page.paragraph(_ONLY_CONTROLS if control else ""),
-                page.paragraph(portable(missing, folder)),
-                *(report_page.views(drawn, source) if drawn else ()),
-                *(block for record in others for block in _block(record, files)),
-                *(page.heading(name) + page.wide(source(file), name) for name, file in more),
-                page.heading("Settings"),
-                page.table(["", ""], _facts(main), words=2),
+            notes=filter(None, [_ONLY_CONTROLS if control else "", portable(missing, folder)]),
+            table=_table(main),
+            plots=more,
+            others=[
+                {
+                    "heading": _heading(each),
+                    "sentence": _sentence(each, files),
+                    "table": _table(each),
+                }
+                for each in others
             ],
+            settings=Table(["", ""], _settings(main), words=2),
         )
     target = out or folder / PAGE
     with replacing(target) as path:
@@ -121,7 +124,7 @@ def command(
         "command": main.command,
         "control": control,
         "record": str(main.path),
-        "views": list(drawn.names) if drawn else [],
+        "views": [view.name for view in drawn.views] if drawn else [],
         "pictures": (len(drawn.files) if drawn else 0) + len(more),
     }
     report |= {key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")}
@@ -138,7 +141,8 @@ def _check(record: Record) -> None:
         settings.get("truncate")
         _table(record)
         _sentence(record, [])
-        _facts(record)
+        _settings(record)
+        _facts(record, [])
         for name in record.data.get("files", ()):
             Path(name)
 
@@ -151,19 +155,19 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
     if record.command == "profile":
         columns: dict[str, dict[str, Any]] = data["columns"]
         return columns
-    return {name: data[name] for name in ("before", "after") if data.get(name)}
+    names = {"original": "before", "pruned": "after"}
+    return {name: data[key] for name, key in names.items() if data.get(key)}
 
 
-def _table(record: Record) -> str:
-    """A table of the measurements, else of the figures on training views, as HTML."""
-    from fragprune_plugins.workbench.figures import page
-    from fragprune_plugins.workbench.report import page as report_page
+def _table(record: Record) -> Table:
+    """A table of the measurements, else of the figures on training views."""
+    from fragprune_plugins.workbench.report.page import figures
 
     columns = _columns(record)
     if columns:
-        return report_page.figures(columns)
+        return figures(columns)
     seen = record.data["training_views"].items()
-    return page.table(["", "training views"], [[key, _number(value)] for key, value in seen])
+    return Table(["", "training views"], [[key, _number(value)] for key, value in seen])
 
 
 def _number(value: float | None) -> str:
@@ -196,18 +200,27 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     return f"{said}.{missed(data)}"
 
 
-def _block(record: Record, among: Sequence[Path]) -> list[str]:
-    """A record as HTML: heading, sentence and table."""
-    from fragprune_plugins.workbench.figures import page
-
-    return [
-        page.heading(f"{record.command}: {record.path.name}"),
-        page.paragraph(_sentence(record, among)),
-        _table(record),
-    ]
+def _heading(record: Record) -> str:
+    """What a record is about, in words."""
+    if record.command in ("compare", "profile"):
+        return {"compare": "Comparison", "profile": "Profile"}[record.command]
+    if record.data.get("settings", {}).get("truncate") is False:
+        return "The control: the same training without pruning"
+    return "Pruning"
 
 
-def _facts(record: Record) -> list[list[str]]:
+def _facts(record: Record, among: Sequence[Path]) -> list[tuple[str, str]]:
+    """The three figures of a fine-tuning that was measured; else none."""
+    from fragprune_plugins.files.records import control_of
+    from fragprune_plugins.workbench.figures.wording import headlines
+
+    data = record.data
+    if record.command not in ("run", "finetune") or not (data.get("before") and data.get("after")):
+        return []
+    return headlines(data, data.get("control") or control_of(data, among))
+
+
+def _settings(record: Record) -> list[list[str]]:
     """The settings and files of a record, one a row."""
     keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
     facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})

@@ -1,9 +1,9 @@
-"""What pages of results show: views before and after under dividers, tables, learning curves."""
+"""Pages of results: views of the original and the pruned model, figures, learning curves."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,11 +17,31 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.figures.evaluate import Candidate
     from fragprune_plugins.workbench.scenes.dataset import Shot
 
+TEMPLATE = Path(__file__).with_name("report.html")
+
 LEARNING = "learning.png"
 SHOWN = 3
 """Views on the page."""
 
-_MODELS = ("before", "after")
+NAMES = ("original", "pruned")
+"""Of the two models of a page, and of their pictures."""
+
+_GREY = "#888888"  # can be read on white and on black
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A view that was drawn for a page.
+
+    Attributes:
+        name: how its files begin.
+        size: of its photograph: width and height, pixels.
+        fragments: drawn per pixel, of each model.
+    """
+
+    name: str
+    size: page.Size
+    fragments: tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -29,102 +49,144 @@ class Drawn:
     """Views that were drawn for a page, on shared scales.
 
     Attributes:
-        names: of the views: how their files begin.
-        sizes: of their pictures: width and height, pixels.
-        fragments: of each view, drawn per pixel before and after.
+        views: the views.
+        target: what they were compared with: "Photograph", or the model's own picture.
         most_fragments: per pixel, at the top of the scale.
         most_error: difference to the photograph at the top of the scale, 8-bit levels.
     """
 
-    names: Sequence[str]
-    sizes: Sequence[page.Size]
-    fragments: Sequence[tuple[float, float]]
+    views: Sequence[Shown]
+    target: str
     most_fragments: float
     most_error: float
 
     @property
     def files(self) -> list[str]:
         """Names of all pictures."""
-        kinds = ["photograph", *_MODELS]
-        kinds += [f"{model}_{shown}" for model in _MODELS for shown in ("fragments", "error")]
-        return [f"{name}_{kind}.png" for name in self.names for kind in kinds]
+        kinds = [f"{model}{kind}" for model in NAMES for kind in ("", "_fragments", "_error")]
+        return [f"{view.name}_{kind}.png" for view in self.views for kind in ("photograph", *kinds)]
+
+
+def compose(
+    template: Path,
+    drawn: Drawn | None,
+    source: Callable[[str], str],
+    **values: Any,
+) -> str:
+    """A page of a result as HTML.
+
+    Args:
+        template: ``TEMPLATE``, or one that extends it.
+        drawn: the views that ``draw_views`` drew; None where there are none.
+        source: turns a picture's file name into its ``src``, a relative path or a data URL.
+        values: title; facts, (number, words) of each; quote, a sentence; notes; table; plots,
+            (heading, file) of each; others, with heading, sentence and table; settings, a table.
+    """
+    shown = drawn or Drawn((), "", 1.0, 1.0)
+    return page.render(
+        template,
+        TEMPLATE.parent,
+        source=source,
+        names=NAMES,
+        views=shown.views,
+        target=shown.target,
+        most_fragments=shown.most_fragments,
+        most_error=shown.most_error,
+        **values,
+    )
 
 
 def draw_views(
-    folder: Path, before: Candidate, after: Candidate, shots: Sequence[Shot], engine: Engine
+    folder: Path,
+    original: Candidate,
+    pruned: Candidate,
+    shots: Sequence[Shot],
+    engine: Engine,
+    enlarge: int = 1,
 ) -> Drawn:
-    """Draw some evenly spread views: photograph, before, after, and maps of both.
+    """Draw some evenly spread views: photograph, both models, and maps of both.
 
     The maps show the fragments of each pixel, and the largest difference of a channel to the
     photograph.
 
     Args:
         folder: for the PNGs, which ``Drawn.files`` names.
-        before: the model before fine-tuning.
-        after: the model to compare with ``before``.
+        original: the model before fine-tuning.
+        pruned: the model to compare with it.
         shots: the views; they move to the models' device.
         engine: draws the views.
+        enlarge: how many times as wide and high as the photograph both models are drawn.
     """
     import torch
 
     from fragprune_plugins.learning.stage2 import evenly
     from fragprune_plugins.workbench.figures.pictures import save_image, save_map, stems
 
-    models = [(before, before.model.splats()), (after, after.model.splats())]
-    chosen = [shot.to(before.model.xyz.device) for shot in evenly(shots, SHOWN)]
+    models = [(original, original.model.splats()), (pruned, pruned.model.splats())]
+    chosen = [shot.to(original.model.xyz.device) for shot in evenly(shots, SHOWN)]
     names = stems([shot.name for shot in chosen])
     maps: dict[str, dict[str, Tensor]] = {"fragments": {}, "error": {}}
-    counted = []
+    views = []
     for name, shot in zip(names, chosen, strict=True):
+        size = shot.view.width, shot.view.height
+        large = replace(shot.view, width=enlarge * size[0], height=enlarge * size[1])
         save_image(folder / f"{name}_photograph.png", shot.image)
         per_pixel = []
-        for model, (each, splats) in zip(_MODELS, models, strict=True):
+        for model, (each, splats) in zip(NAMES, models, strict=True):
             with torch.no_grad():
-                out = each.draw(engine, shot.view, splats, counts=True)
+                out = each.draw(engine, large, splats, counts=True)
+                image = out.image if enlarge == 1 else each.draw(engine, shot.view, splats).image
             assert out.fragments is not None
             save_image(folder / f"{name}_{model}.png", out.image)
-            seen = shot.looked_at(out.image)
-            error = (seen.clamp(0, 1) - shot.image.clamp(0, 1)).abs().amax(dim=0)
+            error = shot.looked_at(image).clamp(0, 1) - shot.image.clamp(0, 1)
             maps["fragments"][f"{name}_{model}"] = out.fragments
-            maps["error"][f"{name}_{model}"] = 255 * error
-            per_pixel.append(float(out.fragments_per_pixel))
-        counted.append((per_pixel[0], per_pixel[1]))
+            maps["error"][f"{name}_{model}"] = 255 * error.abs().amax(dim=0)
+            per_pixel.append(f"{float(out.fragments_per_pixel):.1f}")
+        views.append(Shown(name, size, (per_pixel[0], per_pixel[1])))
     limits = {}
     for kind, values in maps.items():
         limits[kind] = shared_limit(list(values.values()))
         for stem, each_map in values.items():
             save_map(folder / f"{stem}_{kind}.png", each_map, limits[kind])
-    sizes = [(shot.view.width, shot.view.height) for shot in chosen]
-    return Drawn(names, sizes, counted, limits["fragments"], limits["error"])
+    target = "Photograph" if chosen[0].target == "photograph" else "The original's own picture"
+    return Drawn(views, target, limits["fragments"], limits["error"])
 
 
-def save_banner(
-    path: Path, before: Candidate, after: Candidate, shot: Shot, engine: Engine
-) -> None:
-    """Draw one view before and after, and the fragments of both, side by side.
+def save_banner(path: Path, folder: Path, drawn: Drawn) -> None:
+    """Write one view and its fragments side by side, left of a line the original, right the pruned.
 
     Args:
-        path: the PNG or JPG.
-        before: the model before fine-tuning.
-        after: the model after it.
-        shot: the view.
-        engine: draws it.
+        path: the JPG.
+        folder: of the pictures that ``draw_views`` drew.
+        drawn: what it gave; the first view is taken.
     """
-    import torch
+    from PIL import Image, ImageDraw, ImageFont
 
-    from fragprune_plugins.workbench.figures.pictures import save_panel
+    view = drawn.views[0]
+    halves = []
+    for kind, said in (("", NAMES), ("_fragments", _per_pixel(view))):
+        files = [folder / f"{view.name}_{model}{kind}.png" for model in NAMES]
+        left, right = (Image.open(file).convert("RGB") for file in files)
+        width, height = left.size
+        left.paste(right.crop((width // 2, 0, width, height)), (width // 2, 0))
+        pen = ImageDraw.Draw(left)
+        pen.line([(width // 2, 0), (width // 2, height)], "white", 2)
+        font = ImageFont.load_default(height / 22)
+        for at, anchor, words in ((0.02, "la", said[0]), (0.98, "ra", said[1])):
+            place = (at * width, 0.02 * height)
+            pen.rectangle(pen.textbbox(place, words, font, anchor), "black")
+            pen.text(place, words, "white", font, anchor)
+        halves.append(left)
+    banner = Image.new("RGB", (2 * width + 8, height), "white")
+    for at, half in enumerate(halves):
+        banner.paste(half, (at * (width + 8), 0))
+    with replacing(path) as temporary:
+        banner.save(temporary, format="JPEG", quality=88)
 
-    with torch.no_grad():
-        was, now = (
-            each.draw(engine, shot.view, each.model.splats(), counts=True)
-            for each in (before, after)
-        )
-    assert was.fragments is not None
-    assert now.fragments is not None
-    panels = [("before", was.image), ("after", now.image)]
-    for name, out, counts in (("before", was, was.fragments), ("after", now, now.fragments)):
-        panels.append((f"{name}: {float(out.fragments_per_pixel):.1f} fragments/pixel", counts))
-    save_panel(path, panels, shared_limit([was.fragments, now.fragments]))
+
+def _per_pixel(view: Shown) -> tuple[str, str]:
+    first, second = view.fragments
+    return f"{first} fragments per pixel", f"{second}"
 
 
 def shared_limit(maps: Sequence[Tensor]) -> float:
@@ -136,57 +198,20 @@ def shared_limit(maps: Sequence[Tensor]) -> float:
     return max(1.0, float(values.kthvalue(at).values))
 
 
-def views(drawn: Drawn, source: Callable[[str], str]) -> list[str]:
-    """The drawn views as parts of a page.
-
-    Args:
-        drawn: what ``draw_views`` gave.
-        source: turns a picture's file name into its ``src``, a relative path or a data URL.
-    """
-    if not drawn.names:
-        return []
-    parts = []
-    for name, size, (was, now) in zip(drawn.names, drawn.sizes, drawn.fragments, strict=True):
-
-        def both(kind: str, caption: str, name: str = name, size: page.Size = size) -> str:
-            left, right = (source(f"{name}_{model}{kind}.png") for model in _MODELS)
-            return page.split(left, right, caption, size, _MODELS)
-
-        photograph = source(f"{name}_photograph.png")
-        parts.append(
-            page.section(
-                name,
-                both("", "Drawn before and after"),
-                page.picture(photograph, "Photograph", size),
-                both("_fragments", f"Fragments per pixel: {was:.1f} before, {now:.1f} after"),
-                both("_error", "Difference to the photograph"),
-            )
-        )
-    zoom = max(map(page.zoom, drawn.sizes))
-    shown = f" Pixels are shown {zoom} times as large." if zoom > 1 else ""
-    return [
-        page.heading("Before and after"),
-        page.paragraph(f"{_DIVIDERS}{shown}"),
-        page.legend("fragments drawn in a pixel", drawn.most_fragments),
-        page.legend(
-            "difference to the photograph, 8-bit levels, largest channel", drawn.most_error
-        ),
-        *parts,
-    ]
-
-
-def figures(columns: Mapping[str, dict[str, Any]]) -> str:
+def figures(columns: Mapping[str, dict[str, Any]]) -> page.Table:
     """A table of measurements by name of the model, with the change between the last two."""
     from fragprune_plugins.workbench.figures.wording import measured_with, tabulate
 
     head, *rows = tabulate(columns)
-    return page.table(head, rows, measured_with(columns))
+    return page.Table(head, rows, measured_with(columns))
 
 
 def save_learning(
     path: Path, curves: Sequence[dict[str, float]], thresholds: Tensor | None
 ) -> None:
     """Draw loss, fragments and median threshold over the steps, and all thresholds at the end.
+
+    Lines and words are grey and the rest is transparent: a page may be light or dark.
 
     Args:
         path: the PNG.
@@ -197,10 +222,10 @@ def save_learning(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    shown = 2 if thresholds is None else 4
-    figure = Figure(figsize=(3.75 * shown, 3.2), layout="constrained")
+    rows = 1 if thresholds is None else 2
+    figure = Figure(figsize=(8, 2.8 * rows), layout="constrained", facecolor="none")
     FigureCanvasAgg(figure)
-    loss, fragments, *others = figure.subplots(1, shown)
+    loss, fragments, *others = figure.subplots(rows, 2).flat
     steps = np.array([row["step"] for row in curves])
     window = max(1, min(50, len(steps) // 4))
     for axes, key, color, label in (
@@ -222,9 +247,11 @@ def save_learning(
         spread.set(xscale="log", xlabel="threshold (falloff)", ylabel="Gaussians")
     for axes in (loss, fragments, *others):
         axes.grid(alpha=0.25)
+        axes.set_facecolor("none")
+        axes.tick_params(which="both", colors=_GREY)
+        axes.xaxis.label.set_color(_GREY)
+        axes.yaxis.label.set_color(_GREY)
+        for spine in axes.spines.values():
+            spine.set_color(_GREY)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
-
-
-_DIVIDERS = """Held-out views. Drag a divider: the model before is left of it, the model after is
-right of it. The dividers of a view move together."""
+        figure.savefig(temporary, format="png", dpi=120)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fragprune_plugins.workbench.demo.textures import (
+from lab.room.textures import (
     Texture,
     checker,
     colour,
@@ -14,12 +14,12 @@ from fragprune_plugins.workbench.demo.textures import (
     planks,
     stripes,
 )
-from fragprune_plugins.workbench.demo.tracer import Ball, Box, Material, Pole, Shape, World
+from lab.room.tracer import Ball, Box, Material, Pole, Shape, World
 
 CENTRE = (-0.15, -0.15, 0.6)
 """The point at which the cameras look, in world units; z is up."""
 
-_TEXELS = 192  # per repeat: about the resolution of the views, so that nothing shimmers
+_TEXELS = 96  # per repeat: not much finer than the photographs' pixels, so that nothing shimmers
 
 
 def furnish(seed: int = 0) -> World:

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fragprune_plugins.workbench.demo.textures import Texture, sample
+from lab.room.textures import Texture, sample
 
 Array = NDArray[np.float32]
 FAR = np.float32(1e6)
