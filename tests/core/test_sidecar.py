@@ -1,10 +1,11 @@
 from __future__ import annotations
 
-import json
+from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from fragprune_plugins.errors import DivergedError, OutputError, SidecarError
 from fragprune_plugins.files import sidecar
@@ -76,73 +77,57 @@ def test_thresholds_of_other_rows_than_the_models_are_refused_with_both_counts(
     assert str(rows) in caught.value.expected
 
 
-def broken(path, how: str) -> None:
-    data = path.read_bytes()
-    zero = torch.zeros
-    full = {"logits": zero(6), "exp_avg": zero(6), "exp_avg_sq": zero(6)}
-    header = int.from_bytes(data[:8], "little")
-    metadata = json.loads(data[8 : 8 + header])["__metadata__"]
-    if how == "truncated":
-        path.write_bytes(data[:-5])
-    elif how == "empty":
-        path.write_bytes(b"")
-    elif how == "corrupted header":
-        path.write_bytes(data[:9] + b"\xff\xff" + data[11:])
-    elif how == "not safetensors":
-        path.write_bytes(b"PK\x03\x04 some zip")
-    elif how == "foreign safetensors":
-        save_file({"weight": zero(3)}, path)
-    elif how == "another format":
-        save_file(full, path, metadata=metadata | {"format": "fragprune-thresholds-999"})
-    elif how == "no thresholds":
-        save_file({"weight": zero(3)}, path, metadata=metadata)
-    elif how == "metadata not numbers":
-        save_file(full, path, metadata=metadata | {"rows": "six"})
-    elif how == "metadata not json":
-        save_file(full, path, metadata=metadata | {"settings": "{"})
-    elif how == "fewer rows than stated":
-        save_file({k: v[:4].clone() for k, v in full.items()}, path, metadata=metadata)
-    elif how == "a scalar":
-        save_file({k: zero(()) for k in full}, path, metadata=metadata)
-    elif how == "unequal parts":
-        save_file(full | {"exp_avg": zero(2)}, path, metadata=metadata)
-    elif how == "not a number":
-        save_file(full | {"logits": zero(6) / 0}, path, metadata=metadata)
-    elif how == "infinite moments":
-        save_file(full | {"exp_avg": zero(6) + float("inf")}, path, metadata=metadata)
-    elif how == "negative second moments":
-        save_file(full | {"exp_avg_sq": zero(6) - 1}, path, metadata=metadata)
-    elif how == "a folder":
-        path.unlink()
-        path.mkdir()
-    elif how == "missing":
-        path.unlink()
+def bytes_of(change):
+    """Break a sidecar by its bytes."""
+
+    def act(path):
+        path.write_bytes(change(path.read_bytes()))
+
+    return act
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        "truncated",
-        "empty",
-        "corrupted header",
-        "not safetensors",
-        "foreign safetensors",
-        "another format",
-        "no thresholds",
-        "metadata not numbers",
-        "metadata not json",
-        "fewer rows than stated",
-        "a scalar",
-        "unequal parts",
-        "not a number",
-        "infinite moments",
-        "negative second moments",
-        "a folder",
-        "missing",
-    ],
-)
+def parts(metadata=(), **tensors):
+    """Break a sidecar by some of its tensors, or of its metadata."""
+
+    def act(path):
+        with safe_open(path, framework="pt") as file:
+            kept = file.metadata() | dict(metadata)
+        save_file(load_file(path) | tensors, path, metadata=kept)
+
+    return act
+
+
+def folder(path):
+    path.unlink()
+    path.mkdir()
+
+
+ZERO = torch.zeros(6)
+BROKEN = {
+    "truncated": bytes_of(lambda data: data[:-5]),
+    "empty": bytes_of(lambda data: b""),
+    "corrupted header": bytes_of(lambda data: data[:9] + b"\xff\xff" + data[11:]),
+    "not safetensors": bytes_of(lambda data: b"PK\x03\x04 some zip"),
+    "foreign safetensors": lambda path: save_file({"weight": ZERO}, path),
+    "another format": parts({"format": "fragprune-thresholds-999"}),
+    "metadata not numbers": parts({"rows": "six"}),
+    "metadata not json": parts({"settings": "{"}),
+    "fewer rows than stated": parts(
+        logits=torch.ones(4), exp_avg=torch.zeros(4), exp_avg_sq=torch.zeros(4)
+    ),
+    "a scalar": parts(logits=ZERO[0].clone()),
+    "unequal parts": parts(exp_avg=ZERO[:2].clone()),
+    "not a number": parts(logits=ZERO / 0),
+    "infinite moments": parts(exp_avg=ZERO + float("inf")),
+    "negative second moments": parts(exp_avg_sq=ZERO - 1),
+    "a folder": folder,
+    "missing": Path.unlink,
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
 def test_a_broken_sidecar_is_one_stated_error(model, trained, how):
-    broken(sidecar.save(model, trained), how)
+    BROKEN[how](sidecar.save(model, trained))
     with pytest.raises(SidecarError) as caught:
         sidecar.load(model, 6)
     assert "\n" not in str(caught.value)

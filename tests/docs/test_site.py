@@ -18,6 +18,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 
+pytestmark = pytest.mark.slow
+
 for needed in ("material", "nbclient", "ipykernel"):
     pytest.importorskip(needed, reason="needs fragprune-plugins[docs]")
 

@@ -103,81 +103,80 @@ def test_extent_is_the_hosts(tmp_path, images):
     assert dataset.extent == pytest.approx(1.1 * float(farthest))
 
 
-def break_scene(folder: Path, images, how: str) -> None:
-    sparse = folder / "sparse" / "0"
-    if how == "no folder":
-        return
-    if how == "empty":
-        folder.mkdir()
-        return
-    if how in ("no test file", "no frames", "not json", "unknown lens of transforms"):
-        tiny.write_blender(folder, images)
-        path = folder / "transforms_test.json"
-        content = json.loads(path.read_text())
-        if how == "no test file":
-            path.unlink()
-        elif how == "no frames":
-            del content["frames"]
-            path.write_text(json.dumps(content))
-        elif how == "not json":
-            path.write_text("{")
-        else:
-            path.write_text(json.dumps(content | {"camera_model": "EQUIRECTANGULAR"}))
-        return
-    binary = "binary" in how
-    tiny.write_colmap(
-        folder, images, binary=binary, model="FOV" if "unknown lens" in how else "PINHOLE"
-    )
-    if how == "both":
-        tiny.write_blender(folder, images)
-    elif how == "image missing":
-        (folder / "images" / "view03.png").unlink()
-    elif how == "image broken":
-        (folder / "images" / "view03.png").write_bytes(b"not a picture")
-    elif how == "image size":
-        Image.new("RGB", (32, 24)).save(folder / "images" / "view03.png")
-    elif how == "binary cut off":
-        path = sparse / "images.bin"
-        path.write_bytes(path.read_bytes()[:-30])
-    elif how == "text cut off":
-        path = sparse / "images.txt"
-        path.write_text(path.read_text()[:60])
-    elif how == "no cameras":
-        (sparse / "cameras.txt").unlink()
-    elif how == "other cameras":
-        (sparse / "cameras.txt").write_text("3 PINHOLE 32 32 36 36 16 16\n")
-    elif how == "one view":
-        path = sparse / "images.txt"
-        path.write_text("\n".join(path.read_text().splitlines()[:3]) + "\n")
+VIEW, SPARSE, TEST = Path("images/view03.png"), Path("sparse/0"), Path("transforms_test.json")
 
 
-MESSAGES = {
-    "no folder": "no such folder",
-    "empty": "neither layout",
-    "both": "both COLMAP's and a transforms layout",
-    "unknown lens": "model FOV.*image_undistorter",
-    "unknown lens binary": "model FOV.*image_undistorter",
-    "image missing": "view03.png: no such image",
-    "image broken": "view03.png: not readable",
-    "image size": "32x24 pixels.*32x32",
-    "binary cut off": "images.bin: cut off",
-    "text cut off": "images.txt: cut off",
-    "no cameras": "cameras.txt: no such file",
-    "other cameras": "of camera 7",
-    "one view": "no training view",
-    "no test file": "transforms_test.json: no such file",
-    "no frames": "not a transforms file",
-    "not json": "not readable as JSON",
-    "unknown lens of transforms": "camera_model 'EQUIRECTANGULAR'",
+def without_frames(folder):
+    (folder / TEST).write_text("{}")
+
+
+def of_a_lens(folder):
+    content = json.loads((folder / TEST).read_text())
+    (folder / TEST).write_text(json.dumps(content | {"camera_model": "EQUIRECTANGULAR"}))
+
+
+def of_one_image(folder):
+    path = folder / SPARSE / "images.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:3]) + "\n")
+
+
+def cut(name, end):
+    def act(folder):
+        path = folder / SPARSE / name
+        path.write_bytes(path.read_bytes()[:end])
+
+    return act
+
+
+OTHER = "3 PINHOLE 32 32 36 36 16 16\n"
+BLENDER = {
+    "no test file": (lambda f: (f / TEST).unlink(), "transforms_test.json: no such file"),
+    "no frames": (without_frames, "not a transforms file"),
+    "not json": (lambda f: (f / TEST).write_text("{"), "not readable as JSON"),
+    "unknown lens": (of_a_lens, "camera_model 'EQUIRECTANGULAR'"),
+}
+COLMAP = {
+    "image missing": (lambda f: (f / VIEW).unlink(), "view03.png: no such image"),
+    "image broken": (lambda f: (f / VIEW).write_bytes(b"none"), "view03.png: not readable"),
+    "image size": (lambda f: Image.new("RGB", (32, 24)).save(f / VIEW), "32x24 pixels.*32x32"),
+    "cut off": (cut("images.txt", 60), "images.txt: cut off"),
+    "no cameras": (lambda f: (f / SPARSE / "cameras.txt").unlink(), "cameras.txt: no such file"),
+    "other cameras": (lambda f: (f / SPARSE / "cameras.txt").write_text(OTHER), "of camera 7"),
+    "one view": (of_one_image, "no training view"),
 }
 
 
-@pytest.mark.parametrize("how", MESSAGES)
-def test_bad_scenes_are_refused_by_name(tmp_path, images, how):
-    folder = tmp_path / "scene"
-    break_scene(folder, images, how)
-    with pytest.raises(DatasetError, match=MESSAGES[how]):
-        load_dataset(folder)
+@pytest.mark.parametrize("how", BLENDER)
+def test_bad_blender_scenes_are_refused_by_name(tmp_path, images, how):
+    break_it, words = BLENDER[how]
+    tiny.write_blender(tmp_path, images)
+    break_it(tmp_path)
+    with pytest.raises(DatasetError, match=words):
+        load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("how", COLMAP)
+def test_bad_colmap_scenes_are_refused_by_name(tmp_path, images, how):
+    break_it, words = COLMAP[how]
+    tiny.write_colmap(tmp_path, images)
+    break_it(tmp_path)
+    with pytest.raises(DatasetError, match=words):
+        load_dataset(tmp_path)
+
+
+def test_what_is_no_scene_or_two_is_refused_by_name(tmp_path, images):
+    with pytest.raises(DatasetError, match="no such folder"):
+        load_dataset(tmp_path / "none")
+    with pytest.raises(DatasetError, match="neither layout"):
+        load_dataset(tmp_path)
+    for binary in (False, True):
+        tiny.write_colmap(tmp_path / str(binary), images, binary=binary, model="FOV")
+        with pytest.raises(DatasetError, match=r"model FOV.*image_undistorter"):
+            load_dataset(tmp_path / str(binary))
+    tiny.write_colmap(tmp_path / "both", images)
+    tiny.write_blender(tmp_path / "both", images)
+    with pytest.raises(DatasetError, match="both COLMAP's and a transforms layout"):
+        load_dataset(tmp_path / "both")
 
 
 def host_cameras() -> list[dict[str, object]]:

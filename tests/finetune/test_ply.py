@@ -142,75 +142,64 @@ def without(path: Path, *names: str) -> None:
     PlyData([PlyElement.describe(table, "vertex")]).write(path)
 
 
-def spoil(path: Path, how: str) -> None:
-    """Make a broken model file."""
-    write_ply(path, tiny.random_model(8, degree=1))
-    content = path.read_bytes()
-    if how == "missing":
-        path.unlink()
-    elif how == "folder":
-        path.unlink()
-        path.mkdir()
-    elif how == "cut off":
-        path.write_bytes(content[:-100])
-    elif how == "cut in the header":
-        path.write_bytes(content[:90])
-    elif how == "nothing":
-        path.write_bytes(b"")
-    elif how == "a picture":
-        path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
-    elif how == "points":
-        without(path, "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_3")
-    elif how == "compact":
-        without(path, "f_dc_0", "f_dc_1", "f_dc_2")
-    elif how == "odd sh":
-        without(path, "f_rest_8")
-    elif how == "mip":
-        rows = PlyData.read(path)["vertex"].data
-        table = np.zeros(
-            len(rows), dtype=[*((n, "f4") for n in rows.dtype.names), ("filter_3D", "f4")]
-        )
-        for name in rows.dtype.names:
-            table[name] = rows[name]
-        PlyData([PlyElement.describe(table, "vertex")]).write(path)
-    elif how == "faces only":
-        faces = np.array([(1,)], dtype=[("a", "i4")])
-        PlyData([PlyElement.describe(faces, "face")]).write(path)
-    elif how == "empty":
-        rows = PlyData.read(path)["vertex"].data[:0]
-        PlyData([PlyElement.describe(rows, "vertex")]).write(path)
-    elif how == "nan":
-        write_ply(path, nan_in_two_rows(tiny.random_model(8, degree=1)))
-    elif how == "thresholds":
-        write_ply(path, tiny.cut(tiny.random_model(8, degree=1), 0.5))
-        content = PlyData.read(path, mmap=False)
-        content["vertex"]["trunc_threshold"][:] = np.linspace(0.5, 1.2, 8)
-        content.write(path)
+def rewritten(change):
+    """Break a PLY by its table."""
+
+    def act(path):
+        rows = change(PlyData.read(path)["vertex"].data)
+        kind = "face" if rows.dtype.names == ("a",) else "vertex"
+        PlyData([PlyElement.describe(rows, kind)]).write(path)
+
+    return act
 
 
-MESSAGES = {
-    "missing": "no such file",
-    "folder": "a folder",
-    "cut off": "not readable as PLY",
-    "cut in the header": "not readable as PLY",
-    "nothing": "not readable as PLY",
-    "a picture": "not readable as PLY",
-    "points": "without f_dc_0, f_dc_1, f_dc_2, opacity, rot_3",
-    "compact": "keeps colours in a network",
-    "odd sh": "8 f_rest columns",
-    "mip": "Mip-Splatting model",
-    "faces only": "without a vertex element",
-    "empty": "0 Gaussians",
-    "nan": r"NaN or infinity in 2 of 8 rows \(scale_2\)",
-    "thresholds": "trunc_threshold outside",
+def filtered(rows):
+    table = np.zeros(len(rows), dtype=[*((n, "f4") for n in rows.dtype.names), ("filter_3D", "f4")])
+    for name in rows.dtype.names:
+        table[name] = rows[name]
+    return table
+
+
+def outside(path):
+    """Put thresholds into a column, one of them above 1."""
+    write_ply(path, tiny.cut(tiny.random_model(8, degree=1), 0.5))
+    content = PlyData.read(path, mmap=False)
+    content["vertex"]["trunc_threshold"][:] = np.linspace(0.5, 1.2, 8)
+    content.write(path)
+
+
+BAD = {
+    "missing": (Path.unlink, "no such file"),
+    "a folder": (lambda path: (path.unlink(), path.mkdir()), "a folder"),
+    "cut off": (lambda path: path.write_bytes(path.read_bytes()[:-100]), "not readable as PLY"),
+    "cut in its header": (lambda p: p.write_bytes(p.read_bytes()[:90]), "not readable as PLY"),
+    "a picture": (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n"), "not readable as PLY"),
+    "points": (
+        lambda path: without(path, "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_3"),
+        "without f_dc_0, f_dc_1, f_dc_2, opacity, rot_3",
+    ),
+    "compact": (
+        lambda path: without(path, "f_dc_0", "f_dc_1", "f_dc_2"),
+        "keeps colours in a network",
+    ),
+    "odd sh": (lambda path: without(path, "f_rest_8"), "8 f_rest columns"),
+    "mip": (rewritten(filtered), "Mip-Splatting model"),
+    "faces": (rewritten(lambda _: np.array([(1,)], dtype=[("a", "i4")])), "without a vertex"),
+    "empty": (rewritten(lambda rows: rows[:0]), "0 Gaussians"),
+    "nan": (
+        lambda path: write_ply(path, nan_in_two_rows(tiny.random_model(8, degree=1))),
+        r"NaN or infinity in 2 of 8 rows \(scale_2\)",
+    ),
+    "thresholds": (outside, "trunc_threshold outside"),
 }
 
 
-@pytest.mark.parametrize("how", MESSAGES)
+@pytest.mark.parametrize("how", BAD)
 def test_bad_files_are_refused_by_name(tmp_path, how):
-    path = tmp_path / "bad.ply"
-    spoil(path, how)
-    with pytest.raises(ModelFileError, match=MESSAGES[how]) as error:
+    path, (spoil, words) = tmp_path / "bad.ply", BAD[how]
+    write_ply(path, tiny.random_model(8, degree=1))
+    spoil(path)
+    with pytest.raises(ModelFileError, match=words) as error:
         read_ply(path)
     assert error.value.where == str(path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -15,10 +16,14 @@ from fragprune_plugins.engines.cuda.engine import CudaEngine
 @pytest.fixture(scope="session")
 def device(tmp_path_factory: pytest.TempPathFactory) -> EmulatedDevice:
     """One for all tests: each set of macros is built once. Skips where there is no g++."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # of all workers
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("no g++ here")
-    return EmulatedDevice(compiler, tmp_path_factory.mktemp("emulated"))
+    (folder / "emulated").mkdir(exist_ok=True)
+    return EmulatedDevice(compiler, folder / "emulated")
 
 
 @pytest.fixture

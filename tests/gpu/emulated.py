@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
+import os
 import subprocess
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +28,7 @@ FLAGS = (
 
 
 class EmulatedDevice:
-    """Builds a source once per set of macros.
+    """Builds a source once per set of macros, for all processes that share the folder.
 
     Args:
         compiler: a C++17 compiler for ELF systems.
@@ -72,10 +74,12 @@ class EmulatedDevice:
     def _open(self, source: str, macros: dict[str, int]) -> ctypes.CDLL:
         key = (source, tuple(sorted(macros.items())))
         if key not in self.opened:
-            path = self._folder / f"{source}{len(self.opened)}.so"
+            name = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+            path = self._folder / f"{source}-{name}.so"
             defined = [f"-D{name}={value}" for name, value in macros.items()]
             kernels = ("-x", "c++", "-include", str(HERE / "emulation.h"), self.source(source))
-            self._build(path, "-shared", *self._flags, *defined, self._machine, *kernels)
+            if not path.exists():
+                self._build(path, "-shared", *self._flags, *defined, self._machine, *kernels)
             library = ctypes.CDLL(str(path))
             library.emulated_message.restype = ctypes.c_char_p
             self.opened[key] = library
@@ -89,8 +93,11 @@ class EmulatedDevice:
     def _machine(self) -> str:
         """The emulation itself, compiled once."""
         path = self._folder / "emulation.o"
-        self._build(path, "-c", str(HERE / "emulation.cpp"))
+        if not path.exists():
+            self._build(path, "-c", str(HERE / "emulation.cpp"))
         return str(path)
 
     def _build(self, path: Path, *arguments: str) -> None:
-        subprocess.run([self.compiler, *FLAGS, *arguments, "-o", str(path)], check=True)
+        mine = path.with_name(f"{os.getpid()}-{path.name}")  # others may be at the same
+        subprocess.run([self.compiler, *FLAGS, *arguments, "-o", str(mine)], check=True)
+        mine.replace(path)

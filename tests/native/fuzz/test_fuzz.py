@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import random
 
+import pytest
 from native.sanitize import building
 from native.sanitize.building import MEMORY, Toolchain
+
+pytestmark = pytest.mark.slow
 
 
 def test_any_bytes_are_survived(toolchain: Toolchain) -> None:

@@ -1,4 +1,6 @@
-"""``cd tests && python -m browser.bridges OUT --scene ...``: what the bridges save in each engine.
+"""What the bridges save in each engine.
+
+    cd tests; PYTHONPATH=../docs/experiments python -m lab.bridges OUT --scene ...
 
 Three pages are drawn in turns in one headless Chromium: the engine alone with the unpruned model,
 the engine alone with the pruned one, and the pruned one through the bridge. Engines have their
@@ -131,7 +133,7 @@ def table(report: dict[str, Any]) -> str:
 
 def main() -> None:
     """Measure, print the table, and write bridges.json, bridges.md and the pictures."""
-    parser = argparse.ArgumentParser(prog="python -m browser.bridges", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m lab.bridges", description=__doc__)
     parser.add_argument("out", type=Path, help="folder to write into")
     parser.add_argument(
         "--scene",

@@ -1,4 +1,6 @@
-"""``cd tests && python -m browser.reach``: the viewer against itself and against usual quads.
+"""The viewer against itself and against usual quads.
+
+    cd tests; PYTHONPATH=../docs/experiments python -m lab.reach OUT --scene ...
 
 Everything is drawn in turns in one run, in one headless Chromium: a pruned model with its
 thresholds, the unpruned one, and the unpruned one as most viewers draw it (every quad reaches the
@@ -178,7 +180,7 @@ def table(report: dict[str, Any]) -> str:
 
 def main() -> None:
     """Measure, print the table, and write reach.json and reach.md."""
-    parser = argparse.ArgumentParser(prog="python -m browser.reach", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m lab.reach", description=__doc__)
     parser.add_argument("out", type=Path, help="folder for reach.json and reach.md")
     parser.add_argument(
         "--scene",
