@@ -20,7 +20,7 @@ settings.register_profile(
     "fragprune",
     deadline=None,  # a first call may build or import something
     derandomize=True,
-    max_examples=50,
+    max_examples=30,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("fragprune")

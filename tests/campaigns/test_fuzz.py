@@ -15,7 +15,7 @@ from campaigns.fuzz.running import BAD, GOOD, Nonsense, inputs, judge, run
 
 from fragprune_plugins.errors import RecordError
 
-INPUTS = 60
+INPUTS = 30
 
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)

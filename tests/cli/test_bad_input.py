@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 
 import pytest
 import torch
@@ -53,21 +54,22 @@ def untouched(out):
     )
 
 
-@pytest.mark.parametrize(
-    ("how", "code", "words"),
-    [
-        ("model missing", "model-file", "no such file"),
-        ("model cut off", "model-file", "not readable as PLY"),
-        ("a checkpoint", "model-file", "(4D models)"),
-        ("data missing", "dataset", "no such folder"),
-        ("image missing", "dataset", "no such image"),
-        ("stale sidecar", "sidecar", "thresholds of another model"),
-        ("broken sidecar", "sidecar", "unreadable"),
-        ("sidecar of one row", "sidecar", "thresholds of 1 Gaussian"),
-    ],
-)
-@pytest.mark.parametrize("command", ["finetune", "profile", "render", "compare"])
-def test_refused(scene, tmp_path, how, code, words, command):
+BAD = {
+    "model missing": ("model-file", "no such file"),
+    "model cut off": ("model-file", "not readable as PLY"),
+    "a checkpoint": ("model-file", "(4D models)"),
+    "data missing": ("dataset", "no such folder"),
+    "image missing": ("dataset", "no such image"),
+    "stale sidecar": ("sidecar", "thresholds of another model"),
+    "broken sidecar": ("sidecar", "unreadable"),
+    "sidecar of one row": ("sidecar", "thresholds of 1 Gaussian"),
+}
+EACH = ("model missing", "image missing", "stale sidecar")  # refused by every command
+CASES = [*((how, "finetune") for how in BAD), *product(EACH, ("profile", "render", "compare"))]
+
+
+@pytest.mark.parametrize(("how", "command"), CASES)
+def test_refused(scene, tmp_path, how, command):
     data, path, out = scene
     if how == "model missing":
         path.unlink()
@@ -92,7 +94,7 @@ def test_refused(scene, tmp_path, how, code, words, command):
         "render": ("render", path, "--data", data, "--out", tmp_path / "pictures"),
         "compare": ("compare", path, path, "--data", data),
     }[command]
-    refused(arguments, code, words)
+    refused(arguments, *BAD[how])
     assert untouched(out)
 
 

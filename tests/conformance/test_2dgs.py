@@ -1,10 +1,9 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.surfels import SurfelHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class TestSurfels(AdapterConformance):
+class TestSurfels(RelativeConformance):
     adapter = "2dgs"
     host = SurfelHost

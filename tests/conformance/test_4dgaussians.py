@@ -1,10 +1,9 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.moving import MovingHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class Test4DGaussians(AdapterConformance):
+class Test4DGaussians(RelativeConformance):
     adapter = "4dgaussians"
     host = MovingHost

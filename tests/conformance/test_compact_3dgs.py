@@ -1,10 +1,9 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.compact_3dgs import CompactHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class TestCompact3DGS(AdapterConformance):
+class TestCompact3DGS(RelativeConformance):
     adapter = "compact-3dgs"
     host = CompactHost

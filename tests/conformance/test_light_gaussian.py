@@ -1,10 +1,9 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.light_gaussian import LightGaussianHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class TestLightGaussian(AdapterConformance):
+class TestLightGaussian(RelativeConformance):
     adapter = "light-gaussian"
     host = LightGaussianHost

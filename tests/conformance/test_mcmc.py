@@ -1,10 +1,9 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.mcmc import MCMCHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class TestMCMC(AdapterConformance):
+class TestMCMC(RelativeConformance):
     adapter = "mcmc"
     host = MCMCHost

@@ -1,10 +1,9 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.mini_splatting import MiniSplattingHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class TestMiniSplatting(AdapterConformance):
+class TestMiniSplatting(RelativeConformance):
     adapter = "mini-splatting"
     host = MiniSplattingHost

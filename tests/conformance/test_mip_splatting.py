@@ -1,10 +1,9 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.mip_splatting import MipHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class TestMipSplatting(AdapterConformance):
+class TestMipSplatting(RelativeConformance):
     adapter = "mip-splatting"
     host = MipHost

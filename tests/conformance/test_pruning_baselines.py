@@ -1,16 +1,15 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.lp_3dgs import LPHost
 from miniatures.speedy_splat import SpeedyHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class TestSpeedySplat(AdapterConformance):
+class TestSpeedySplat(RelativeConformance):
     adapter = "speedy-splat"
     host = SpeedyHost
 
 
-class TestLP3DGS(AdapterConformance):
+class TestLP3DGS(RelativeConformance):
     adapter = "lp-3dgs"
     host = LPHost

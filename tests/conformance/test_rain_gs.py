@@ -1,10 +1,9 @@
 from __future__ import annotations
 
+from conformance.relatives import RelativeConformance
 from miniatures.rain_gs import RainHost
 
-from fragprune_plugins.testing import AdapterConformance
 
-
-class TestRainGS(AdapterConformance):
+class TestRainGS(RelativeConformance):
     adapter = "rain-gs"
     host = RainHost

@@ -1,0 +1,11 @@
+"""Hosts that share their patches with vanilla 3DGS, or with another variant of themselves."""
+
+from __future__ import annotations
+
+from fragprune_plugins.testing import AdapterConformance
+
+
+class RelativeConformance(AdapterConformance):
+    """All invariants, in fewer orders of import: vanilla's test tries the longer ones."""
+
+    longest_order = 2
