@@ -580,6 +580,11 @@ class Footprints:
         return self.means2d.device
 
 
+def is_stop(value: object) -> bool:
+    """Whether a value can be the ``stop`` of ``RasterInputs``."""
+    return value is None or (isinstance(value, float | int) and TRANSMITTANCE_MIN <= value <= 1)
+
+
 @dataclass(frozen=True)
 class RasterInputs:
     """The inputs of one rasterization, for any dialect that the engines support.
@@ -640,7 +645,7 @@ class RasterInputs:
         checks = (
             ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),
             ("near", self.near >= 0, "0 or more"),
-            ("stop", stop is None or TRANSMITTANCE_MIN <= stop <= 1, "None, or 1e-4 to 1"),
+            ("stop", is_stop(stop), "None, or 1e-4 to 1"),
             ("alpha_max", ALPHA_MIN <= self.alpha_max <= highest, f"1/255 to {highest}"),
             ("planes", set(self.planes) <= set(get_args(Plane)), f"of {get_args(Plane)}"),
         )

@@ -28,7 +28,7 @@ class Model:
         opacity: (N, 1) logits.
         scaling: (N, 3) logarithms of standard deviations; (N, 2) of surfels.
         rotation: (N, 4) quaternions w, x, y, z of any length.
-        thresholds: N truncation thresholds; None where nothing is truncated.
+        thresholds: N truncation thresholds, and the stop; None for a model that has neither.
         filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units. It widens
             every axis and lowers the opacity accordingly.
 
@@ -106,9 +106,26 @@ class Model:
         store = self.thresholds
         return None if store is None or store.neutral else store.values.detach()
 
+    @property
+    def stop(self) -> float | None:
+        """The share of light at which its pixels stop, see ``RasterInputs``; None: as hosts do."""
+        return None if self.thresholds is None else self.thresholds.stop
+
+    @property
+    def pruned(self) -> bool:
+        """Whether thresholds or a stop decide anything: others draw another picture of it."""
+        return self.thresholds is not None and self.thresholds.cuts
+
     def untruncated(self) -> Model:
-        """The same Gaussians without thresholds."""
+        """The same Gaussians without thresholds and stop."""
         return replace(self, thresholds=None)
+
+    def with_stop(self, stop: float) -> Model:
+        """The same model with another stop, from 1e-4 to 1."""
+        known = self.thresholds
+        store = ThresholdStore(len(self), self.device) if known is None else known.clone()
+        store.stop = float(stop)
+        return replace(self, thresholds=store)
 
     def to(self, device: torch.device | str) -> Model:
         """The same model on a device; tensors that are there already are not copied."""

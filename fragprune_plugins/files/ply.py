@@ -3,7 +3,8 @@
 One ``vertex`` element of float32 columns, values before activation: x y z, nx ny nz (zeros),
 f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
 (logit), scale_0..2 (log), rot_0..3 (w x y z, any length). ``fragprune export`` adds one column,
-``trunc_threshold``: the threshold itself, in falloff, in (0, 1). Unknown columns are ignored,
+``trunc_threshold``: the threshold itself, in falloff, in (0, 1). A model's stop is a comment of the
+header, ``fragprune stop 0.01``. Unknown columns are ignored,
 except Mip-Splatting's ``filter_3D``: such a model is refused unless the caller draws by the rules
 of Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaussians are flat.
 """
@@ -22,13 +23,17 @@ from fragprune_plugins.errors import ModelFileError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import REST_COUNTS, Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
-from fragprune_plugins.files.reading import Door
+from fragprune_plugins.files.reading import Door, Reading
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.types import is_stop
 
 THRESHOLD_COLUMN = "trunc_threshold"
 
 MARK = "fragprune thresholds lie beside this file (.fragprune.safetensors)"
 """A comment in the header of each PLY of ours that is half of a pair."""
+
+STOP = "fragprune stop"
+"""Begins the comment that holds a model's stop."""
 
 _XYZ = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -74,12 +79,27 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
             "script, with fragprune run.",
         )
     with _DOOR.reading(path) as reading:
+        stop = _stop_in(reading)
+        reading.file.seek(0)
         try:
             columns = read_vertices(reading)
         except KeyError as error:
             found = "a PLY without a vertex element"
             raise ModelFileError(str(path), found, "a Gaussian splat", _REMEDY) from error
-        return _splat(path, columns, filtered)
+        model = _splat(path, columns, filtered)
+        return model if stop is None else model.with_stop(stop)
+
+
+def _stop_in(reading: Reading) -> float | None:
+    """The stop that a PLY's header names; None if it names none."""
+    words = f"comment {STOP} ".encode()
+    for line in header_lines(reading.file.read(HEADER_MAX))[0]:
+        if line.startswith(words):
+            stop = float(line.removeprefix(words))
+            if not is_stop(stop):
+                raise ValueError(f"a stop of {stop:g}, which is 1e-4 to 1")
+            return stop
+    return None
 
 
 def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
@@ -160,7 +180,8 @@ def write_ply(path: Path, model: Model, *, marked: bool = False) -> None:
 
     Args:
         path: the file; an existing one is replaced only when the new one is complete.
-        model: the Gaussians; thresholds that cut become the last column, ``trunc_threshold``.
+        model: the Gaussians; thresholds that cut become the last column, ``trunc_threshold``, and
+            a stop a comment.
         marked: note in the header that a sidecar with thresholds belongs to the file.
 
     Raises:
@@ -188,7 +209,10 @@ def write_ply(path: Path, model: Model, *, marked: bool = False) -> None:
     rows = np.ascontiguousarray(table.numpy()).view([(name, "<f4") for name in names])[:, 0]
     # An element's comments come after its line: some viewers read the number of Gaussians off the
     # header's third line, whatever it says.
-    vertices = PlyElement.describe(rows, "vertex", comments=[MARK] if marked else [])
+    comments = [MARK] if marked else []
+    if model.stop is not None:
+        comments.append(f"{STOP} {model.stop!r}")
+    vertices = PlyElement.describe(rows, "vertex", comments=comments)
     with replacing(path) as temporary:
         PlyData([vertices], byte_order="<").write(str(temporary))
 

@@ -35,6 +35,7 @@ from fragprune_plugins.files.ply import is_marked
 from fragprune_plugins.files.reading import Door, parse_json
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.types import is_stop
 
 SUFFIX = ".fragprune.safetensors"
 FORMAT = "fragprune-thresholds-1"
@@ -204,6 +205,8 @@ def _write(path: Path, store: ThresholdStore, info: SidecarInfo) -> None:
         "host_commit": info.host_commit,
         "settings": json.dumps(info.settings, sort_keys=True),
     }
+    if store.stop is not None:
+        metadata["stop"] = repr(store.stop)
     try:
         save_file(tensors, path, metadata=metadata)
     except SafetensorError as error:  # that is how it says that the disk is full
@@ -273,6 +276,9 @@ def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
             state = {"adam_step": float(metadata["adam_step"]), "steps": int(metadata["steps"])}
             if not isinstance(info.settings, dict):
                 raise ValueError("settings that are no object")
+            stop = float(metadata["stop"]) if "stop" in metadata else None
+            if not is_stop(stop):
+                raise ValueError(f"a stop of {stop}")
             if not (0 <= state["adam_step"] < math.inf and 0 <= state["steps"] < 1 << 63):
                 raise ValueError(f"{state['adam_step']:g} and {state['steps']} steps")
             tensors: dict[str, torch.Tensor] = {}
@@ -281,4 +287,4 @@ def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
                 tensors[name] = file.get_tensor(name)
                 if tensors[name].dtype != torch.float32:
                     raise ValueError(f"{tensors[name].dtype}, not torch.float32")
-    return tensors | state, info
+    return tensors | state | {"stop": stop}, info

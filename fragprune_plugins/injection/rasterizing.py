@@ -133,7 +133,7 @@ def draw_view(
 
 
 def on_rasterize(session: SessionState, call: SeamCall) -> Any:
-    """Draw with thresholds. Without thresholds the host's rasterizer draws.
+    """Draw with thresholds and the stop. Without either the host's rasterizer draws.
 
     Raises:
         AlignmentError: the call's Gaussians and the thresholds differ in number.
@@ -157,14 +157,15 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
         )
     stage = state.stage
     presses = stage is not None and stage.learning and session.settings.portable
-    if state.store.neutral and not presses:
+    if not state.store.cuts and not presses:
         return by_host()
     with directly():
         inputs, engine = unpack(session, drawn)
+        inputs = replace(inputs, stop=state.store.stop)
         thresholds = (
             session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
         )
-        if thresholds is not None or presses:
+        if thresholds is not None or inputs.stop is not None or presses:
             if thresholds is not None and rows is not None:
                 thresholds = thresholds[rows]
             truncated = partial(rasterize, engine, state, rendering[1], thresholds)
@@ -209,7 +210,9 @@ def rasterize(
         return outputs
 
     def untruncated() -> RasterOutputs:
-        return outputs if thresholds is None else engine.rasterize(inputs, None)
+        if thresholds is None and inputs.stop is None:
+            return outputs
+        return engine.rasterize(replace(inputs, stop=None), None)
 
     area = area_per_pixel(inputs) if state.stage.settings.portable else None
     pressure = state.stage.drew(view, outputs, untruncated, part, area)

@@ -69,7 +69,7 @@ def on_pack(session: SessionState, call: SeamCall) -> Any:
     if packed is None:
         return result
     path, which = packed
-    if state is None or state.store.neutral:  # loading would refuse an earlier file's as stale
+    if state is None or not state.store.cuts:  # loading would refuse an earlier file's as stale
         sidecar.path_beside(path).unlink(missing_ok=True)
         return result
     rows = which
@@ -135,7 +135,7 @@ def on_capture(session: SessionState, call: SeamCall) -> Any:
     check_learned(session, model)
     result = call.run()
     state = session.models.get(model)
-    if state is not None and (session.standing_still(model) or not state.store.neutral):
+    if state is not None and (session.standing_still(model) or state.store.cuts):
         session.expect_rows(model, state, str(call.seam))
         session.adapter.checkpoint_state(result)[CHECKPOINT_KEY] = state.store.state_dict()
     return result

@@ -163,7 +163,7 @@ class Session(SessionState):
         if model is None or self.output is None or not isinstance(self.adapter, ScriptAdapter):
             return None
         state = self.models[model]
-        learned = not state.store.neutral or (self.settings.portable and state.steps > 0)
+        learned = state.store.cuts or (self.settings.portable and state.steps > 0)
         if not learned:
             return None
         return self.adapter.save_model(model, self.output, self.start + state.steps)

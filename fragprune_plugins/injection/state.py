@@ -217,7 +217,7 @@ class SessionState:
                 "save()", "a model without thresholds", "a trained model", "Train the model first."
             )
         self.expect_rows(model, state, str(path))
-        if state.store.neutral and not self.standing_still(model):
+        if not state.store.cuts and not self.standing_still(model):
             # Loading would refuse the sidecar of an earlier model with this name as stale.
             if whole is None:
                 sidecar.path_beside(path).unlink(missing_ok=True)

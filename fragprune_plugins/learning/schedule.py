@@ -19,6 +19,7 @@ from fragprune_plugins.learning.pressure import (
     PressureController,
     numbers_of,
 )
+from fragprune_plugins.types import is_stop
 
 Train = Literal["opacity", "appearance", "all"]
 
@@ -72,6 +73,8 @@ class Settings:
             area of the Gaussians' ellipses instead (``area.area_per_pixel``), from the first step
             on, and shapes must move.
         truncate: False trains without thresholds or pressure: the control to compare with.
+        stop: the share of a pixel's light at which the model is drawn and trained from the first
+            step on that counts, see ``RasterInputs``; None keeps what the model has.
         seed: of the order of views in ``finetune``; hosts have their own.
         views_per_step: that ``finetune`` draws in each step, whose loss is their mean; hosts have
             their own.
@@ -89,6 +92,7 @@ class Settings:
     itself: bool = False
     portable: bool = False
     truncate: bool = True
+    stop: float | None = None
     seed: int = 0
     views_per_step: int = 1
     nonfinite: Literal["stop", "skip"] = "stop"
@@ -119,7 +123,20 @@ class Settings:
                 "1 < X <= 20, frame time before over after",
                 "Change --target-time.",
             )
-
+        if not is_stop(self.stop):
+            raise UsageError(
+                "stop",
+                f"{self.stop:g}",
+                "1e-4 to 1, a share of a pixel's light (0.01 is usual)",
+                "Change --stop.",
+            )
+        if self.portable and self.stop is not None:
+            raise UsageError(
+                "options",
+                "--portable with --stop",
+                "one of the two: viewers that know no thresholds know no stop",
+                "Drop one of the two.",
+            )
         if self.portable and self.train != "all":
             raise UsageError(
                 "options",

@@ -238,6 +238,8 @@ class Stage2:
         self._views.begin()
         self._pictures, self._visited = [], (len(self._before), len(self._after))
         self._open |= self.plan.learn
+        if self.plan.counted and self.settings.stop is not None:
+            self.store.stop = self.settings.stop
         if self.plan.learn and self.settings.opens:
             if not self.store.opened:
                 known = opacities()
@@ -268,7 +270,10 @@ class Stage2:
         log.warning("%s", error)  # the host's training goes on, and may recover
 
     def thresholds(self, inputs: RasterInputs) -> Tensor | None:
-        """(N,) to draw a rasterization with, or None; with gradients where they will be used."""
+        """(N,) to draw a rasterization with, or None; with gradients where they will be used.
+
+        The driver draws it with the store's ``stop``, too.
+        """
         if not self.settings.opens:
             return None
         values = self._truncate(inputs, self.store)
@@ -289,7 +294,7 @@ class Stage2:
         Args:
             view: tells views apart.
             outputs: of the engine.
-            untruncated: draws the same without thresholds, at the view's first visit.
+            untruncated: draws the same without thresholds and stop, at the view's first visit.
             part: of a view whose driver draws several pictures at once.
             area: the ellipses' area per pixel (``area_per_pixel``) for the pressure to act on; the
                 drawn fragments when None.
@@ -467,7 +472,9 @@ class Stage2:
         self.close()
         number = {view: index for index, view in enumerate(self._ordered(order))}
         tensors = self.store.state_dict()
-        plain: dict[str, Any] = {"store": [tensors.pop("adam_step"), tensors.pop("steps")]}
+        plain: dict[str, Any] = {
+            "store": [tensors.pop(name, None) for name in ("adam_step", "steps", "stop")]
+        }
         for name, figures in (("before", self._before), ("after", self._after)):
             known = {(number[v], part): each for (v, part), each in figures.items() if v in number}
             plain[name] = list(known)
@@ -492,8 +499,9 @@ class Stage2:
             SidecarError: the thresholds' parts do not fit together, or are not finite.
             ValueError: a plain value is none that ``state_dict`` gives.
         """
-        adam_step, steps = plain["store"]
-        self.store.load_state_dict({**tensors, "adam_step": adam_step, "steps": steps})
+        adam_step, steps, stop = plain["store"]
+        state = {**tensors, "adam_step": adam_step, "steps": steps, "stop": stop}
+        self.store.load_state_dict(state)
         views = self._ordered(order)
         for name, figures in (("before", self._before), ("after", self._after)):
             for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):

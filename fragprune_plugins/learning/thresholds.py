@@ -1,4 +1,4 @@
-"""The threshold store: one truncation threshold per Gaussian of one model, and its optimizer.
+"""The threshold store: one truncation threshold per Gaussian of one model, its optimizer, the stop.
 
 Hosts index their optimizer's groups by name and fail on a foreign one, so the store owns its own
 Adam. Row operations mirror what hosts do to theirs, moments included.
@@ -14,6 +14,7 @@ from torch import Tensor
 from fragprune_plugins.constants import ALPHA_MIN, LOGIT_MAX, LOGIT_MIN, NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError, InputError, SidecarError
 from fragprune_plugins.reprs import short
+from fragprune_plugins.types import is_stop
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99
@@ -31,10 +32,14 @@ class ThresholdStore:
         device: where the model lives.
         lr: initial learning rate on the logits (0.05 to 0.1 works; a much smaller one
             has no visible effect).
+
+    Attributes:
+        stop: the model's, as ``RasterInputs`` has it; None for the hosts' rule. It is not learned.
     """
 
     def __init__(self, count: int, device: torch.device | str = "cpu", lr: float = 0.05) -> None:
         self.steps = 0
+        self.stop: float | None = None
         self._bind(torch.full((count,), NEUTRAL_LOGIT, device=device), lr)
 
     def _bind(self, logits: Tensor, lr: float) -> None:
@@ -49,7 +54,8 @@ class ThresholdStore:
         return len(self.logits)
 
     def __repr__(self) -> str:
-        return f"ThresholdStore(logits={short(self.logits)}, steps={self.steps})"
+        stop = "" if self.stop is None else f", stop={self.stop:g}"
+        return f"ThresholdStore(logits={short(self.logits)}, steps={self.steps}{stop})"
 
     @classmethod
     def from_falloff(cls, thresholds: Tensor, lr: float = 0.05) -> ThresholdStore:
@@ -131,6 +137,11 @@ class ThresholdStore:
         if not self._is_known():
             self._look()
         return self._neutral
+
+    @property
+    def cuts(self) -> bool:
+        """True if thresholds or the stop decide anything."""
+        return self.stop is not None or not self.neutral
 
     @property
     def opened(self) -> bool:
@@ -277,7 +288,7 @@ class ThresholdStore:
         return {"thresholds": self.logits.detach(), **named}
 
     def state_dict(self) -> dict[str, Any]:
-        """Copies of logits, moments and counters, for ``load_state_dict``."""
+        """Copies of logits, moments and counters, and the stop, for ``load_state_dict``."""
         state = self.optimizer.state.get(self.logits, {})
         zeros = torch.zeros_like(self.logits)
         return {
@@ -286,6 +297,7 @@ class ThresholdStore:
             "exp_avg_sq": state.get("exp_avg_sq", zeros).detach().clone(),
             "adam_step": float(state.get("step", 0.0)),
             "steps": self.steps,
+            **({} if self.stop is None else {"stop": self.stop}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -311,6 +323,10 @@ class ThresholdStore:
                     "finite numbers, and second moments that are not negative",
                     remedy,
                 )
+        stop = state.get("stop")  # absent from those of earlier versions
+        if not is_stop(stop):
+            raise SidecarError("threshold state", f"a stop of {stop}", "1e-4 to 1", remedy)
+        self.stop = stop
         device, lr = self.logits.device, self.optimizer.param_groups[0]["lr"]
         self._bind(rows["logits"].to(device), lr)
         self.steps = int(state["steps"])

@@ -6,6 +6,7 @@ Every command, the session of a host and the functions of the package ask here a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
 import torch
@@ -137,8 +138,9 @@ def rasterize(
 
     Args:
         inputs: camera and Gaussians; or a model, which has its thresholds.
-        thresholds: (N,) falloff in (0, 1), used as they are; a store, for which plugins are asked;
-            or None for no truncation. For a model, the view: ``rasterize(model, view)``.
+        thresholds: (N,) falloff in (0, 1), used as they are; a store, for which plugins are asked,
+            and whose stop holds where the inputs have none; or None for no truncation. For a model,
+            the view: ``rasterize(model, view)``.
         engine: a name ("auto", "reference", "cpu", "cuda", a plugin's) or an engine object.
 
     Raises:
@@ -148,6 +150,8 @@ def rasterize(
     """
     if isinstance(inputs, Model) or isinstance(thresholds, View):
         inputs, thresholds = _of_model(inputs, thresholds)
+    if isinstance(thresholds, ThresholdStore) and inputs.stop is None:
+        inputs = replace(inputs, stop=thresholds.stop)
     thresholds = thresholds_for(inputs, thresholds)
     inputs.check_thresholds(thresholds)  # also for engines that are not ours
     if isinstance(engine, str):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pytest
+import torch
 from miniatures.vanilla_3dgs import joint
 
 from fragprune_plugins.errors import OutputError, SidecarError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.learning.schedule import Settings
 
 
 def trained(host, count=20):
@@ -24,6 +26,37 @@ def test_a_neutral_model_saved_over_a_pruned_one_takes_the_old_sidecar_away(tmp_
         assert sidecar.path_beside(path).exists()
         host.model(8).save_ply(str(path))
         assert not sidecar.path_beside(path).exists()
+
+
+def recorded(monkeypatch, host):
+    """The stops that views are drawn with from now on."""
+    seen = []
+    engine = type(host.session.engine(torch.device("cpu")))
+    draw = engine.rasterize
+    monkeypatch.setattr(
+        engine,
+        "rasterize",
+        lambda self, each, *more: seen.append(each.stop) or draw(self, each, *more),
+    )
+    return seen
+
+
+@pytest.mark.parametrize("truncate", [True, False], ids=["thresholds", "control"])
+def test_a_stop_is_drawn_with_and_saved_and_drawn_with_again(tmp_path, monkeypatch, truncate):
+    path, settings = tmp_path / "stopped.ply", Settings(iterations=3, stop=0.3, truncate=truncate)
+    with joint(settings) as host:
+        seen = recorded(monkeypatch, host)
+        model = trained(host)
+        assert seen == [0.3, None, 0.3, 0.3]  # None counts the fragments before, at the first visit
+        model.save_ply(str(path))
+        before = host.render(host.camera(), model)["render"]
+    assert sidecar.load(path)[0].stop == 0.3
+    with joint(learn=False) as host:
+        seen = recorded(monkeypatch, host)
+        again = host.model(5)
+        again.load_ply(str(path))
+        assert torch.equal(host.render(host.camera(), again)["render"], before)
+        assert seen == [0.3]
 
 
 def test_a_model_loaded_without_a_sidecar_forgets_the_thresholds_it_had(tmp_path):

@@ -8,6 +8,7 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
+import fragprune_plugins as fp
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -62,6 +63,18 @@ def test_over_a_pair_leaves_no_stale_sidecar(tmp_path):
     assert run("export", path, "--out", out).exit_code == 0
     assert torch.equal(read_ply(out).falloff, store.values)
     assert models.load(out).thresholds is not None  # a neutral sidecar would have hidden the column
+
+
+def test_any_model_may_get_a_stop(tmp_path):
+    model, out = tmp_path / "model.ply", tmp_path / "stopped.ply"
+    write_ply(model, tiny.random_model())
+    data = run_json("export", model, "--out", out, "--stop", 0.3)
+    assert (data["thresholds"], data["stop"], data["column"]) == (False, 0.3, None)
+    stopped, view = fp.load(out), tiny.cameras()[0].view()
+    drawn, whole = (fp.rasterize(each, view) for each in (stopped, fp.load(model)))
+    assert stopped.stop == 0.3
+    assert drawn.fragments_per_pixel < whole.fragments_per_pixel
+    assert run("export", out, "--out", tmp_path / "model.splat").exit_code != 0
 
 
 def test_nothing_to_export(tmp_path):

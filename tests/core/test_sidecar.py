@@ -30,8 +30,9 @@ def model(tmp_path):
     return path
 
 
-def test_what_is_saved_is_loaded_bit_for_bit(model, trained):
-    before = model.read_bytes()
+@pytest.mark.parametrize("stop", [None, 0.01])
+def test_what_is_saved_is_loaded_bit_for_bit(model, trained, stop):
+    before, trained.stop = model.read_bytes(), stop
     path = sidecar.save(
         model, trained, adapter="a-host", host_commit="c0ffee", settings={"iterations": 3}
     )

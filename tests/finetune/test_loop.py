@@ -90,6 +90,33 @@ def test_same_seed_same_result_and_global_streams_untouched(default, model, data
     assert not torch.equal(other.model.opacity, default.model.opacity)
 
 
+class Noting:
+    """The engine of this machine, which notes the stop of each picture and whether it was cut."""
+
+    name = "noting"
+
+    def __init__(self):
+        self.engine, self.seen = create_engine("auto"), []
+
+    def rasterize(self, inputs, thresholds):
+        self.seen.append((inputs.stop, thresholds is not None))
+        return self.engine.rasterize(inputs, thresholds)
+
+
+@pytest.mark.parametrize("truncate", [True, False], ids=["thresholds", "control"])
+def test_a_stop_is_trained_with_from_the_first_step_and_kept(model, dataset, truncate):
+    engine, settings = Noting(), Settings(iterations=3, stop=0.2, truncate=truncate)
+    result = finetune(model, dataset, settings, engine=engine)
+    before = [(None, False)]  # fragments before are those of the model as it came
+    assert engine.seen == 3 * [(0.2, truncate), *before]
+    assert result.model.stop == 0.2
+    assert result.progress.speedup > 1.05
+    engine = Noting()
+    again = finetune(result, dataset, Settings(iterations=1), engine=engine)
+    assert engine.seen[0] == (0.2, True)
+    assert again.model.stop == 0.2
+
+
 @pytest.mark.parametrize("target", [1.4, 2.0])
 def test_target_is_met_on_training_views(model, dataset, target):
     result = finetune(model, dataset, Settings(iterations=80, target_speedup=target))

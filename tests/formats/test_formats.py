@@ -152,6 +152,30 @@ def test_a_plain_ply_beside_other_formats_keeps_its_sidecar(tmp_path):
     assert torch.equal(load(tmp_path / "a.ply").thresholds.logits, store.logits)
 
 
+@pytest.mark.parametrize("truncated", [False, True], ids=["stop alone", "with thresholds"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb"])
+def test_a_stop_comes_back(suffix, truncated, tmp_path):
+    splat, path = random_splat(50, 1, 0), tmp_path / f"model{suffix}"
+    if truncated:
+        splat = replace(splat, thresholds=ThresholdStore.from_falloff(torch.full((50,), 0.3)))
+    for stop in (0.01, 1e-4, 1.0):
+        formats.write(formats.named(path), path, splat.with_stop(stop))
+        again = load(path)
+        assert again.stop == stop
+        assert (again.falloff is not None) == truncated
+    assert load(path, truncation=False).stop is None
+
+
+@pytest.mark.parametrize("stop", ["0", "2", "nan", "much"])
+def test_a_stop_that_cannot_be_is_refused(stop, tmp_path):
+    write_ply(path := tmp_path / "model.ply", random_splat(5, 1, 0).with_stop(0.25))
+    content = path.read_bytes()
+    assert content.count(b"comment fragprune stop 0.25\n") == 1
+    path.write_bytes(content.replace(b"stop 0.25", f"stop {stop}".encode()))
+    with pytest.raises(ModelFileError, match=r"stop|float"):
+        load(path)
+
+
 def test_axes_that_turn_twice_are_as_they_were():
     splat = random_splat(7, 3, 5)
     for signs in ((-1, -1, 1), (1, -1, -1)):

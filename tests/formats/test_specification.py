@@ -27,7 +27,8 @@ COUNT = 30
 @pytest.fixture
 def model():
     tau = torch.linspace(0.01, 0.95, COUNT)
-    return replace(random_splat(COUNT, 1, 0), thresholds=ThresholdStore.from_falloff(tau))
+    pruned = replace(random_splat(COUNT, 1, 0), thresholds=ThresholdStore.from_falloff(tau))
+    return pruned.with_stop(0.01)
 
 
 @pytest.fixture
@@ -42,6 +43,8 @@ def test_ply_column(model, tmp_path):
     assert names[-1] == b"trunc_threshold"
     rows = np.frombuffer(body, "<f4").reshape(COUNT, -1)
     assert rows[:, -1].tolist() == model.thresholds.values.tolist()
+    (comment,) = re.findall(r"^    (comment .*)", PAGE, re.M)
+    assert head.decode().splitlines()[3] == comment
 
 
 def test_spz_record(model, codes, tmp_path):
@@ -51,7 +54,9 @@ def test_spz_record(model, codes, tmp_path):
     assert content[14] & 0x2
     assert struct.unpack_from("<II", content, 32) == (kind, COUNT)
     assert list(content[40 : 40 + COUNT]) == codes
-    assert struct.unpack_from("<I", content, 16)[0] == 40 + COUNT
+    kind = int(re.search(r"type (0x\w+), length 4", PAGE)[1], 16)
+    assert struct.unpack_from("<IIf", content, 40 + COUNT) == (kind, 4, pytest.approx(0.01))
+    assert struct.unpack_from("<I", content, 16)[0] == 40 + COUNT + 12
 
 
 def test_sog_image(model, tmp_path):
@@ -81,7 +86,9 @@ def test_glb_attribute(model, tmp_path):
     assert name in scene["extensionsUsed"]
     assert "extensionsRequired" not in scene
     primitive = scene["meshes"][0]["primitives"][0]
-    assert primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] == {name: {}}
+    assert primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] == {
+        name: json.loads(re.search(r"object, `(.*?)`", PAGE.replace("\n", " "))[1])
+    }
     accessor = scene["accessors"][primitive["attributes"][f"{name}:THRESHOLD"]]
     assert (accessor["type"], accessor["componentType"], accessor["count"]) == ("SCALAR", 5126, 30)
     view = scene["bufferViews"][accessor["bufferView"]]

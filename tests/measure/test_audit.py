@@ -156,6 +156,20 @@ def test_cuts_are_compared_with_the_model_as_it_is(figures):
     assert HONOURING not in [each["viewers"] for each in found["viewers"]]
 
 
+def test_a_stop_is_priced_on_a_model_without_one_and_is_its_own_on_another():
+    splat, views = tiny.random_model(), [("view", tiny.cameras()[0].view())]
+    plain, _ = audit(splat, views, engine=ENGINE, repeats=1)
+    priced = plain["cuts"][-1]
+    stopped, _ = audit(splat.with_stop(0.01), views, engine=ENGINE, repeats=1)
+    assert (plain["stop"], stopped["stop"]) == (None, 0.01)
+    assert priced["name"] == "a stop at 0.01"
+    assert priced["fragments_per_pixel"] == stopped["fragments_per_pixel"]
+    assert stopped["cuts"][-1]["name"] == UNTRUNCATED
+    assert stopped["cuts"][-1]["fragments_per_pixel"] == plain["fragments_per_pixel"]
+    pays = [each["shaded_per_pixel"] for each in stopped["viewers"]]
+    assert pays == [each["shaded_per_pixel"] for each in plain["viewers"]]  # quads cannot stop
+
+
 def test_a_pruned_model_is_measured_with_its_thresholds_and_without():
     splat = tiny.random_model()
     pruned = replace(splat, thresholds=ThresholdStore.from_falloff(torch.full((len(splat),), 0.3)))

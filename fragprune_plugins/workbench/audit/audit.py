@@ -70,7 +70,10 @@ REASONS = ("behind what is opaque", "at the rim, beyond 2 sigma", "of faint Gaus
 """Where an idle fragment sits: the first that is true of it."""
 
 AS_IT_IS = "as it is"
-UNTRUNCATED = "without its thresholds"
+UNTRUNCATED = "without its thresholds and stop"
+
+STOP = 0.01
+"""The stop that is tried on a model without one."""
 
 _COUNTS = ("fragments_per_pixel", "evaluated_per_pixel")
 
@@ -217,7 +220,7 @@ def audit(
     """Measure what a splat costs from some cameras.
 
     Args:
-        model: N Gaussians, drawn with their thresholds where they have some.
+        model: N Gaussians, drawn with their thresholds and stop where they have some.
         views: the cameras with their names, on the model's device.
         engine: draws and counts.
         tiles: of all views together, whose fragments are weighed one by one.
@@ -287,6 +290,7 @@ def audit(
     figures = {
         "gaussians": len(model),
         "truncated": model.falloff is not None,
+        "stop": model.stop,
         "views": len(views),
         "fragments_per_pixel": cuts[0]["fragments_per_pixel"],
         "evaluated_per_pixel": cuts[0]["evaluated_per_pixel"],
@@ -318,7 +322,9 @@ def _candidates(model: Model, splats: Splats) -> dict[str, Candidate]:
         thresholds = cut.thresholds(splats.opacities)
         thresholds = thresholds if own is None else torch.maximum(own, thresholds)
         found[cut.name] = Candidate(model, cut=thresholds)
-    if own is not None:
+    if model.stop is None:
+        found[f"a stop at {STOP:g}"] = Candidate(model.with_stop(STOP))
+    if model.pruned:
         found[UNTRUNCATED] = Candidate(model.untruncated())
     return found
 

@@ -120,8 +120,9 @@ def command(
     for name, splats, view, store in scenes:
         cut = thresholds_for(RasterInputs(view, splats), store)
         cut = torch.full_like(splats.opacities, TRUNCATION) if cut is None else cut.detach()
+        stop = None if store is None else store.stop
         for kind in kinds:
-            cases += [Case(name, view, splats, kind, thresholds) for thresholds in (None, cut)]  # type: ignore[arg-type]
+            cases += [Case(name, view, splats, kind), Case(name, view, splats, kind, cut, stop)]  # type: ignore[arg-type]
     before = os.getloadavg()[0]
 
     def say(text: str) -> None:

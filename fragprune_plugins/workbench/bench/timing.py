@@ -29,6 +29,7 @@ class Case:
         splats: activated Gaussians; their device does the work.
         kind: forward only, or with every gradient.
         thresholds: (N,) or None.
+        stop: as in ``RasterInputs``.
     """
 
     scene: str
@@ -36,6 +37,7 @@ class Case:
     splats: Splats
     kind: Pass
     thresholds: Tensor | None = None
+    stop: float | None = None
 
     __repr__ = one_line
 
@@ -168,7 +170,7 @@ def scaling(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float] 
 
 def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     """Make a function that draws once, optionally with gradients of a fixed random loss."""
-    inputs = RasterInputs(case.view, case.splats, planes=())
+    inputs = RasterInputs(case.view, case.splats, planes=(), stop=case.stop)
     if case.kind == "forward":
 
         @torch.no_grad()
@@ -183,7 +185,8 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     thresholds = None
     if case.thresholds is not None:
         thresholds = case.thresholds.clone().requires_grad_(True)
-    inputs = RasterInputs(case.view, replace(case.splats, **leaves), hook, planes=())
+    splats = replace(case.splats, **leaves)
+    inputs = RasterInputs(case.view, splats, hook, planes=(), stop=case.stop)
     stream = torch.Generator().manual_seed(0)
     weight = torch.randn(3, case.view.height, case.view.width, generator=stream).to(case.device)
 

@@ -75,6 +75,14 @@ _OPTIONS = (
         f"{PORTABLE_ELASTICITY:g} of the loss per pixel of area.",
     ),
     click.option(
+        "--stop",
+        type=float,
+        metavar="SHARE",
+        help="Draw and train with a stop: a pixel draws the fragment that leaves less than this "
+        "share of its light, and ends there. 0.01 is usual. Without it, the model's own; else the "
+        "rule of 3DGS. Works with --control, too.",
+    ),
+    click.option(
         "--control",
         is_flag=True,
         help="Run the same iterations without truncation, to compare with.",
@@ -127,6 +135,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
         target_speedup: float | None,
         target_time: float | None,
         portable: bool,
+        stop: float | None,
         control: bool,
         nonfinite: Any,
         **kwargs: Any,
@@ -156,6 +165,7 @@ def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
             itself=itself,
             portable=portable,
             truncate=not control,
+            stop=stop,
             seed=kwargs.get("seed", 0),
             views_per_step=views,
             nonfinite=nonfinite,

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import click
 
+from fragprune_plugins.constants import TRANSMITTANCE_MIN
 from fragprune_plugins.errors import SidecarError
 from fragprune_plugins.workbench.commands.common import (
     MODEL,
     Command,
+    Number,
     OutFile,
     Report,
     describe_dropped,
@@ -36,14 +38,22 @@ from fragprune_plugins.workbench.models import model as models
     is_flag=True,
     help="Leave out Gaussians that no view can draw, with an opacity below 1/255.",
 )
+@click.option(
+    "--stop",
+    type=Number(TRANSMITTANCE_MIN, 1),
+    metavar="SHARE",
+    help="Give the model a stop, also one that was never fine-tuned: a pixel draws the fragment "
+    "that leaves less than this share of its light, and ends there. 0.01 is usual.",
+)
 @truncation_option
-def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
-    """Write MODEL with its thresholds into one file.
+def command(model: Path, out: Path, drop: bool, stop: float | None, no_truncation: bool) -> Report:
+    """Write MODEL with its thresholds and its stop into one file.
 
     A .ply gets a further column, trunc_threshold: a falloff in (0, 1). A renderer gets the same
     picture as fragprune if it draws a fragment only where exp(-q/2) >= trunc_threshold, with q the
     squared Mahalanobis distance. Tools that read columns by name ignore a column that they do not
-    know. .spz, .sog and .glb hold thresholds as extensions, which other readers skip.
+    know. A stop is a comment of the header. .spz, .sog and .glb hold both as extensions, which
+    other readers skip.
 
     .splat and .compressed.ply cannot hold thresholds: they are written with --no-truncation only.
     What a format does not keep is said when it is written.
@@ -53,6 +63,7 @@ def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
       fragprune export pruned.ply --out for_viewer.ply
       fragprune export pruned.ply --out pruned.spz
       fragprune export model.spz --out model.ply --no-truncation
+      fragprune export model.ply --out faster.ply --stop 0.01
     """
     from fragprune_plugins.files import sidecar
     from fragprune_plugins.files.atomic import put, staging
@@ -60,14 +71,16 @@ def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
     from fragprune_plugins.workbench.pruning.visibility import visible
 
     form = formats.named(out)
-    require_place(out, model, thresholds=not no_truncation)
+    require_place(out, model, thresholds=not no_truncation or stop is not None)
     splat = models.load(model, truncation=not no_truncation)
-    if not no_truncation and splat.thresholds is None:
+    splat = splat if stop is None else splat.with_stop(stop)
+    if not no_truncation and not splat.pruned:
         raise SidecarError(
             str(sidecar.path_beside(model)),
             "no thresholds for this model",
             "a sidecar beside it, written by fragprune, or a file that holds them",
-            "Run fragprune finetune first; --no-truncation writes a model without thresholds.",
+            "Run fragprune finetune first, or add --stop; --no-truncation writes a model without "
+            "thresholds.",
         )
     dropped, lines, count = None, [], len(splat)
     with staging(out) as folder:
@@ -84,9 +97,11 @@ def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
     if drop:
         dropped = dropping(out, size, count, len(splat))
         lines.append(describe_dropped(dropped, "too faint for any view"))
-    held = "no thresholds" if no_truncation else "thresholds"
-    column = THRESHOLD_COLUMN if form.paired and not no_truncation else None
-    lines.append(describe_written(out, f": {len(splat)} Gaussians with {column or held}"))
+    cut = splat.falloff is not None
+    column = THRESHOLD_COLUMN if form.paired and cut else None
+    held = column or ("thresholds" if cut else "no thresholds")
+    held += "" if splat.stop is None else f" and a stop at {splat.stop:g}"
+    lines.append(describe_written(out, f": {len(splat)} Gaussians with {held}"))
     return Report(
         {
             "model": str(model),
@@ -94,7 +109,8 @@ def command(model: Path, out: Path, drop: bool, no_truncation: bool) -> Report:
             "format": form.name,
             "keeps": form.keeps or None,
             "gaussians": len(splat),
-            "thresholds": not no_truncation,
+            "thresholds": cut,
+            "stop": splat.stop,
             "column": column,
             "dropped": dropped,
         },

@@ -63,7 +63,7 @@ def render_view(
     *,
     engine: str | Engine = "auto",
 ) -> Image:
-    """A picture of a model, truncated as its thresholds say; ``rasterize`` gives more than that.
+    """A picture of a model, as its thresholds and stop say; ``rasterize`` gives more than that.
 
     Args:
         model: what ``load`` gave, the result of a training, or a file.

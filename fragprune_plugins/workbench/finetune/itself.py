@@ -71,7 +71,8 @@ def own_pictures(
 
     @torch.no_grad()
     def draw(view: View) -> Tensor:
-        return drawer.rasterize(RasterInputs(view, splats, planes=()), thresholds).image
+        inputs = RasterInputs(view, splats, planes=(), stop=model.stop)
+        return drawer.rasterize(inputs, thresholds).image
 
     views = around(model, seed=seed) if cameras is None else cameras
     if held_out is None:

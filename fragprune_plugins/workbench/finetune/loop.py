@@ -140,10 +140,10 @@ def finetune(
         )
     engine = engine_for(engine, device) if isinstance(engine, str) else engine
     dataset = dataset.to(device)
-    if settings.portable and (rule is not None or model.falloff is not None):
+    if settings.portable and (rule is not None or model.pruned):
         raise UsageError(
             "finetune",
-            "portable, and thresholds to draw with",
+            "portable, and thresholds or a stop to draw with",
             "a model without any: it is for viewers that know none",
             "Pass --no-truncation to ignore thresholds stored with the model.",
         )
@@ -190,7 +190,8 @@ def mean_fragments(model: Model, shots: Sequence[Shot], engine: Engine) -> float
     splats = model.splats()
     total = 0.0
     for shot in shots:
-        outputs = engine.rasterize(RasterInputs(shot.view, splats, planes=()), model.falloff)
+        inputs = RasterInputs(shot.view, splats, planes=(), stop=model.stop)
+        outputs = engine.rasterize(inputs, model.falloff)
         total += float(outputs.fragments_per_pixel)
     return total / len(shots)
 
@@ -279,8 +280,8 @@ class _Run:
     def result_model(self) -> Model:
         """The model as learned, free of gradients."""
         learned: dict[str, Any] = {n: getattr(self.model, n).detach() for n in self.rates}
-        store = self.stage.store
-        return replace(self.model, **learned, thresholds=None if store.neutral else store)
+        model = replace(self.model, **learned, thresholds=self.stage.store)
+        return model if model.pruned else model.untruncated()
 
     @property
     def seconds(self) -> float:
@@ -500,7 +501,8 @@ class _Run:
 
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
         """Draw a view with its thresholds; also return the pressure."""
-        inputs = RasterInputs(shot.view, self.model.splats(), planes=())
+        stop = self.stage.store.stop
+        inputs = RasterInputs(shot.view, self.model.splats(), planes=(), stop=stop)
         thresholds = self.stage.thresholds(inputs)
 
         outputs, plain = self.engine.rasterize(inputs, thresholds), None
@@ -508,12 +510,13 @@ class _Run:
             plain = self._plain(inputs)
 
         def untruncated() -> RasterOutputs:
-            return outputs if thresholds is None else plain or self._plain(inputs)
+            whole = thresholds is None and stop is None
+            return outputs if whole else plain or self._plain(inputs)
 
         area = area_per_pixel(inputs) if self.settings.portable else None
         return outputs, self.stage.drew(shot, outputs, untruncated, area=area)
 
     @torch.no_grad()
     def _plain(self, inputs: RasterInputs) -> RasterOutputs:
-        """Draw without thresholds."""
-        return self.engine.rasterize(inputs, None)
+        """Draw without thresholds and stop."""
+        return self.engine.rasterize(replace(inputs, stop=None), None)

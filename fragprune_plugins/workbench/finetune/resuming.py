@@ -120,11 +120,13 @@ def configuration(
     """
     shots = (*dataset.train, *dataset.test)
     store = model.thresholds
-    known = {} if store is None or store.neutral else store.numbers
+    known: list[Tensor | str] = [] if store is None or store.neutral else [*store.numbers.values()]
+    if model.stop is not None:
+        known.append(f"stop {model.stop}")
     return {
         "version": VERSION,
         "model": _digest(model.tensors.values()),
-        "thresholds": _digest(known.values()),
+        "thresholds": _digest(known),
         "photographs": _digest(each for shot in shots for each in _of(shot)),
         "engine": engine,
         "plugins": deciding(),

@@ -70,7 +70,7 @@ def times_faster(
     in all rounds moves it little.
 
     Args:
-        before: drawn without thresholds.
+        before: drawn without thresholds and stop.
         now: drawn with them; free of gradients, for which an engine would keep states.
         thresholds: of ``now``, for a rasterization.
         shots: the views.
@@ -83,7 +83,8 @@ def times_faster(
         turn += 1
         for index, shot in enumerate(shots):
             for first in (True, False) if turn % 2 else (False, True):
-                inputs = RasterInputs(shot.view, old if first else new, planes=())
+                splats, stop = (old, None) if first else (new, now.stop)
+                inputs = RasterInputs(shot.view, splats, planes=(), stop=stop)
                 cut = None if first else thresholds(inputs)
                 spent = timed(partial(engine.rasterize, inputs, cut), before.xyz.device)[1]
                 least[first][index] = min(least[first][index], spent)

@@ -73,7 +73,7 @@ def load(
                 raise
         else:
             if _versions(path) == before:
-                return model if truncation and model.falloff is not None else model.untruncated()
+                return model if truncation and model.pruned else model.untruncated()
 
 
 def _expect_whole(path: Path) -> None:
@@ -138,7 +138,7 @@ def save(
             formats.write(form, new, model)
         return path
     with staging(path) as folder:
-        whole, pair = folder / path.name, model.falloff is not None
+        whole, pair = folder / path.name, model.pruned
         write_ply(whole, model.untruncated(), marked=pair)
         sidecar.replace_pair(path, whole, store if pair else None, settings=settings)
     return sidecar.path_beside(path) if pair else path

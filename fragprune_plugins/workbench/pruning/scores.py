@@ -93,7 +93,8 @@ def keep_needed(
     drawer, splats, error = _drawer(engine, model), model.splats(), 0.0
     with torch.no_grad():
         for shot in shots:
-            image = drawer.rasterize(RasterInputs(shot.view, splats, planes=()), thresholds).image
+            inputs = RasterInputs(shot.view, splats, planes=(), stop=model.stop)
+            image = drawer.rasterize(inputs, thresholds).image
             error += float((shot.looked_at(image).clamp(0, 1) - shot.image).square().sum())
     views = _bar([shot.view for shot in shots], progress)
     each, least = removal_error(model, thresholds, views, drawer).double().sort(stable=True)
@@ -225,7 +226,8 @@ def removal_error(
     stream = torch.Generator().manual_seed(0)
     scores = torch.zeros_like(opacities)
     for view in views:
-        image = engine.rasterize(RasterInputs(view, splats, planes=()), thresholds).image
+        inputs = RasterInputs(view, splats, planes=(), stop=model.stop)
+        image = engine.rasterize(inputs, thresholds).image
         for probe in range(PROBES):
             signs = torch.randint(0, 2, image.shape, generator=stream).mul(2).sub(1).to(image)
             (slope,) = torch.autograd.grad(image, opacities, signs, retain_graph=probe < PROBES - 1)
@@ -280,7 +282,7 @@ def _inputs(model: Model, views: Iterable[View]) -> Iterator[RasterInputs]:
     """The inputs of every view, with counts and weights."""
     splats = model.splats()
     for view in views:
-        yield RasterInputs(view, splats, planes=(), counts=True, scores=True)
+        yield RasterInputs(view, splats, planes=(), counts=True, scores=True, stop=model.stop)
 
 
 @torch.no_grad()

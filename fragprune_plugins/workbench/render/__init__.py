@@ -194,7 +194,8 @@ def command(
         maps: dict[int, Tensor] = {}
 
         def draw(index: int) -> RasterOutputs:
-            inputs = RasterInputs(named[index][1].to(where), splats, counts=heatmap, planes=())
+            view = named[index][1].to(where)
+            inputs = RasterInputs(view, splats, counts=heatmap, planes=(), stop=part.stop)
             with torch.no_grad():
                 outputs = rasterizer.rasterize(inputs, thresholds_for(inputs, part.thresholds))
             drawn[index] = float(outputs.fragments_per_pixel)
@@ -233,7 +234,7 @@ def command(
             "files": [str(file) for file in files],
             "fragments_per_pixel": mean,
             "gaussians": len(whole),
-            "truncated": whole.thresholds is not None,
+            "truncated": whole.falloff is not None,
             "engine": rasterizer.name,
             "device": str(where),
             "warnings": warnings,
@@ -241,7 +242,7 @@ def command(
         "\n".join(
             [
                 f"Wrote {wrote} ({mean:.1f} fragments per pixel, "
-                f"{'not ' * (whole.thresholds is None)}truncated).",
+                f"{'not ' * (whole.falloff is None)}truncated).",
                 *(f"Warning: {each}" for each in warnings),
             ]
         ),

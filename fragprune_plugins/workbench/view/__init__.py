@@ -76,7 +76,7 @@ def command(
         _spare_other_pages(out)
         writable_folder(out)
     loaded = [models.load(each) for each in (model, compare) if each is not None]
-    truncated = [each.thresholds is not None for each in loaded]
+    truncated = [each.falloff is not None for each in loaded]
     if compare is not None:
         names = [model.stem, compare.stem]
         if names[0] == names[1]:

@@ -158,7 +158,7 @@ def write(form: Format, new: Path, model: Model) -> None:
     """
     from fragprune_plugins.files.ply import write_ply
 
-    if model.falloff is not None:
+    if model.pruned:
         expect_carrier(form, new)
     if form.paired:
         write_ply(new, model)
@@ -181,7 +181,7 @@ def write(form: Format, new: Path, model: Model) -> None:
 
 
 def expect_carrier(form: Format, path: Path) -> None:
-    """Raise OutputError if files of a format cannot hold thresholds."""
+    """Raise OutputError if files of a format cannot hold thresholds and a stop."""
     if not form.carries:
         raise OutputError(
             str(path),

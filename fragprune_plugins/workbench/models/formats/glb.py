@@ -29,6 +29,7 @@ from fragprune_plugins.workbench.models.formats.values import (
 
 BASE = "KHR_gaussian_splatting"
 CUTOFF = "FRAGPRUNE_gaussian_splatting_cutoff"
+_THRESHOLD = f"{CUTOFF}:THRESHOLD"
 
 _AXES = (-1, -1, 1)  # the PLY's to glTF's, and back
 _JSON, _BIN, _MAGIC = 0x4E4F534A, 0x004E4942, 0x46546C67
@@ -67,7 +68,9 @@ def read(reading: Reading) -> Model:
     xyz = column("POSITION", 3)
     names = [(f"{BASE}:ROTATION", 4), (f"{BASE}:SCALE", 3), (f"{BASE}:OPACITY", 1)]
     parts = [column(*each) for each in names] + [column(name, 3) for name in sh]
-    cutoff = column(f"{CUTOFF}:THRESHOLD", 1)[:, 0] if _cut(primitive) else None
+    extension = _extension(primitive)
+    cut = extension is not None and ("stop" not in extension or _THRESHOLD in attributes)
+    cutoff = column(_THRESHOLD, 1)[:, 0] if cut else None
     reading.place = ""
     if any(len(part) != len(xyz) for part in (*parts, *(() if cutoff is None else (cutoff,)))):
         raise ValueError("attributes of different lengths")
@@ -82,6 +85,7 @@ def read(reading: Reading) -> Model:
         log_scales=np.log(np.maximum(scale, _SCALE_MIN)),
         rotations=rotation[:, [3, 0, 1, 2]],
         thresholds=None if cutoff is None else torch.from_numpy(cutoff.copy()),
+        stop=None if extension is None else extension.get("stop"),
     )
     return turned(splat, _AXES)
 
@@ -106,8 +110,10 @@ def _primitive(scene: dict[str, Any]) -> dict[str, Any]:
     return primitive
 
 
-def _cut(primitive: dict[str, Any]) -> bool:
-    return CUTOFF in primitive["extensions"][BASE].get("extensions", {})
+def _extension(primitive: dict[str, Any]) -> dict[str, Any] | None:
+    """Ours; None if the primitive has none."""
+    found: dict[str, Any] | None = primitive["extensions"][BASE].get("extensions", {}).get(CUTOFF)
+    return found
 
 
 def _accessor(
@@ -136,7 +142,7 @@ def _accessor(
 
 
 def write(file: BinaryIO, splat: Model) -> None:
-    """Write one primitive; the extension is there only with thresholds."""
+    """Write one primitive; the extension is there only with thresholds or a stop."""
     splat = turned(splat, _AXES)
     xyz, base, rest = array(splat.xyz), array(splat.f_dc)[:, 0], array(splat.f_rest)
     opacity = opacities_of(splat)
@@ -157,8 +163,10 @@ def write(file: BinaryIO, splat: Model) -> None:
     }
     used = [BASE]
     if (falloff := splat.falloff) is not None:
-        columns[f"{CUTOFF}:THRESHOLD"] = array(falloff)[:, None]
-        extension["extensions"] = {CUTOFF: {}}
+        columns[_THRESHOLD] = array(falloff)[:, None]
+    if splat.pruned:
+        stop = {} if splat.stop is None else {"stop": splat.stop}
+        extension["extensions"] = {CUTOFF: stop}
         used.append(CUTOFF)
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []

@@ -109,7 +109,7 @@ def _read(meta: dict[str, Any], load: Load) -> Model:
     with np.errstate(over="ignore"):
         xyz = np.sign(logs) * np.expm1(np.abs(logs))
     rgba = image(base)
-    extra = meta.get("extras", {}).get(EXTRA)
+    extra = meta.get("extras", {}).get(EXTRA, {})
     return splat_of(
         xyz=xyz,
         colours=_book(base)[rgba[:, :3]],
@@ -117,7 +117,8 @@ def _read(meta: dict[str, Any], load: Load) -> Model:
         opacities=rgba[:, 3] / 255,
         log_scales=_book(scales)[image(scales)[:, :3]],
         rotations=_rotations(image(meta["quats"])),
-        thresholds=None if extra is None else of_codes(image(extra)[:, 0]),
+        thresholds=of_codes(image(extra)[:, 0]) if "files" in extra else None,
+        stop=extra.get("stop"),
     )
 
 
@@ -176,7 +177,7 @@ def _rotations(texels: Bytes) -> npt.NDArray[Any]:
 
 def write(file: BinaryIO, splat: Model) -> None:
     """Write a bundle along a Z-order curve; the extra image is there only if it cuts something."""
-    order, codes = morton_order(splat), codes_of(splat)
+    order, codes, stop = morton_order(splat), codes_of(splat), splat.stop
     splat = splat.untruncated().keep(order)
     count = len(splat)
     width = 4 * math.ceil(count**0.5 / 4)
@@ -233,9 +234,12 @@ def write(file: BinaryIO, splat: Model) -> None:
             "codebook": book.tolist(),
             "files": ["shN_centroids.webp", *plane("shN_labels.webp", two)],
         }
+    extra: dict[str, Any] = {} if stop is None else {"stop": stop}
     if codes is not None:
         grey = np.repeat(codes[order.numpy(), None], 3, axis=1)
-        meta["extras"] = {EXTRA: {"files": plane(f"{EXTRA}.webp", grey)}}
+        extra["files"] = plane(f"{EXTRA}.webp", grey)
+    if extra:
+        meta["extras"] = {EXTRA: extra}
     files[_META] = json.dumps(meta, separators=(",", ":")).encode()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():

@@ -44,6 +44,9 @@ CUTOFFS = 0x46500001
 """Type of our extension record: vendor 0x4650 (FP), extension 1. Its payload is one code for each
 Gaussian."""
 
+STOP = 0x46500002
+"""Likewise, extension 2. Its payload is the stop, float32."""
+
 _COORDINATES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 _RDF = 6  # the PLY's axes among those that it names
 _MAGIC = 0x5053474E
@@ -83,10 +86,10 @@ def read(reading: Reading) -> Model:
         parts = _streams(reading, header)
     if header.antialiased:
         log.warning("SPZ: it was trained with antialiasing, and is drawn as 3DGS draws, without")
-    if unknown := records.keys() - {CUTOFFS, _COORDINATES}:
+    if unknown := records.keys() - {CUTOFFS, STOP, _COORDINATES}:
         named = ", ".join(f"{each:#010x}" for each in sorted(unknown)[:_NAMED])
         log.warning("SPZ: skipped %d extension(s): %s", len(unknown), named)
-    splat = _splat(header, parts, records.get(CUTOFFS))
+    splat = _splat(header, parts, records.get(CUTOFFS), records.get(STOP))
     return turned(splat, _axes(records.get(_COORDINATES)))
 
 
@@ -156,7 +159,7 @@ def _axes(payload: bytes | None) -> tuple[int, int, int]:
     return x, y, z
 
 
-def _splat(header: _Header, parts: list[bytes], codes: bytes | None) -> Model:
+def _splat(header: _Header, parts: list[bytes], codes: bytes | None, stop: bytes | None) -> Model:
     count = header.count
     if codes is not None and len(codes) != count:
         raise ValueError(f"{len(codes)} thresholds for {count} Gaussians")
@@ -172,6 +175,7 @@ def _splat(header: _Header, parts: list[bytes], codes: bytes | None) -> Model:
         log_scales=scales / 16 - 10,
         rotations=_first_three(rotations) if header.version == 2 else _smallest_three(rotations),
         thresholds=None if codes is None else of_codes(np.frombuffer(codes, np.uint8)),
+        stop=None if stop is None else float(f"{struct.unpack('<f', stop)[0]:.6g}"),  # as written
     )
 
 
@@ -195,7 +199,7 @@ def _smallest_three(data: Bytes) -> npt.NDArray[Any]:
 
 
 def write(file: BinaryIO, splat: Model) -> None:
-    """Write version 4; the extension record is there only if a threshold cuts something."""
+    """Write version 4; extension records are there only for thresholds that cut, and for a stop."""
     xyz, sh, bits = array(splat.xyz), array(splat.f_rest), _FRACTION_BITS
     while bits and np.abs(xyz).max() * (1 << bits) >= (1 << 23) - 1:
         bits -= 1  # a scene wider than 2048 units
@@ -216,6 +220,8 @@ def write(file: BinaryIO, splat: Model) -> None:
     streams = [np.ascontiguousarray(part).tobytes() for part in parts if part.size]
     codes = codes_of(splat)
     zone = b"" if codes is None else _RECORD.pack(CUTOFFS, len(codes)) + codes.tobytes()
+    if splat.stop is not None:
+        zone += _RECORD.pack(STOP, 4) + struct.pack("<f", splat.stop)
     flags = _EXTENDED if zone else 0
     header = _HEADER.pack(_MAGIC, 4, len(splat), splat.sh_degree, bits, flags, len(streams))
     file.write(header + struct.pack("<I", 32 + len(zone)) + bytes(12) + zone)

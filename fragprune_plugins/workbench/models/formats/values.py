@@ -14,6 +14,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.types import is_stop
 from fragprune_plugins.workbench.models import cutoffs
 
 Floats = npt.NDArray[np.float32]
@@ -39,6 +40,7 @@ def splat_of(
     log_scales: npt.NDArray[Any],
     rotations: npt.NDArray[Any],
     thresholds: Tensor | None = None,
+    stop: float | None = None,
 ) -> Model:
     """A splat of arrays.
 
@@ -50,14 +52,17 @@ def splat_of(
         log_scales: (N, 3) logarithms of standard deviations.
         rotations: (N, 4) quaternions w, x, y, z; one of length 0 becomes no rotation.
         thresholds: (N,) in (0, 1), or None.
+        stop: as in ``RasterInputs``.
 
     Raises:
-        ValueError: there are no Gaussians, or thresholds are outside (0, 1).
+        ValueError: there are no Gaussians, or thresholds or the stop are out of range.
     """
     if not len(xyz):
         raise ValueError("0 Gaussians")
     if thresholds is not None and not ((thresholds > 0) & (thresholds < 1)).all():
         raise ValueError("thresholds outside (0, 1)")
+    if not is_stop(stop):
+        raise ValueError(f"a stop of {stop}, which is 1e-4 to 1")
     inside = np.clip(np.asarray(opacities, np.float64), _ALPHA_EDGE, 1 - _ALPHA_EDGE)
     rotations = np.array(rotations, np.float32)
     rotations[(rotations == 0).all(axis=1), 0] = 1
@@ -66,7 +71,7 @@ def splat_of(
         with np.errstate(over="ignore"):
             return torch.from_numpy(np.array(values, np.float32))
 
-    return Model(
+    model = Model(
         xyz=tensor(xyz),
         f_dc=tensor(colours)[:, None],
         f_rest=tensor(rest),
@@ -75,6 +80,7 @@ def splat_of(
         rotation=torch.from_numpy(rotations),
         thresholds=None if thresholds is None else ThresholdStore.from_falloff(thresholds),
     )
+    return model if stop is None else model.with_stop(stop)
 
 
 def of_codes(codes: Bytes) -> Tensor | None:
