@@ -54,7 +54,7 @@ class ModelState:
         hooked: the optimizers that carry our hooks.
         hooks: handles that remove these hooks.
         stepped: value of ``steps`` at the last step of the store.
-        lent: per running optimizer step, (param group, the host's rate) to restore.
+        lent: per running optimizer step, (param group, the host's options) to restore.
     """
 
     store: ThresholdStore
@@ -69,7 +69,7 @@ class ModelState:
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
-    lent: list[list[tuple[dict[str, Any], float]]] = field(default_factory=list)
+    lent: list[list[tuple[dict[str, Any], dict[str, Any]]]] = field(default_factory=list)
 
     __repr__ = one_line
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from fragprune_plugins.constants import ALPHA_MIN, LOGIT_MAX, LOGIT_MIN, NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError, InputError, SidecarError
+from fragprune_plugins.learning.adam import make_adam
 from fragprune_plugins.reprs import short
 from fragprune_plugins.types import is_stop
 
@@ -44,8 +45,7 @@ class ThresholdStore:
 
     def _bind(self, logits: Tensor, lr: float) -> None:
         self.logits = logits.detach().clone().requires_grad_(True)
-        # eps as the hosts have it: a larger one freezes thresholds whose gradients are tiny.
-        self.optimizer = torch.optim.Adam([self.logits], lr=lr, eps=1e-15)
+        self.optimizer = make_adam([{"params": [self.logits], "lr": lr}])
         self._seen: tuple[Tensor, int] | None = None  # the logits last looked at, and their version
         # the logits that given thresholds became, their version, and the thresholds
         self._given: tuple[Tensor, int, Tensor] | None = None
@@ -334,7 +334,7 @@ class ThresholdStore:
             self._set_moments(
                 rows["exp_avg"].to(device).clone(),
                 rows["exp_avg_sq"].to(device).clone(),
-                torch.tensor(float(state["adam_step"])),
+                torch.tensor(float(state["adam_step"]), dtype=torch.float32),
             )
 
     def _set_moments(self, exp_avg: Tensor, exp_avg_sq: Tensor, step: Tensor) -> None:

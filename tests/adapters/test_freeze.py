@@ -73,6 +73,19 @@ def test_the_rates_of_stage_two_are_the_schedules():
     assert [r["f_dc"] for r in rates] == pytest.approx([0.0025 * 0.1 ** (i / 4) for i in range(5)])
 
 
+def test_on_a_cpu_adam_is_fused_in_stage_two_and_the_host_pickles_its_own():
+    with running(Settings(iterations=5, train="appearance"), from_step=2) as host:
+        model, camera = host.model(20), host.camera()
+        groups, fused = model.optimizer.param_groups, []
+        model.optimizer.register_step_pre_hook(
+            lambda *_: fused.append({g["name"] for g in groups if g["fused"]})
+        )
+        for iteration in (1, 2, 3, 4):
+            host.step(model, camera, iteration)
+            assert not any(group["fused"] for group in groups)
+    assert fused == [set(), set(), MOVES["appearance"], MOVES["appearance"]]
+
+
 def rates_of(model):
     return {group["name"]: group["lr"] for group in model.optimizer.param_groups}
 

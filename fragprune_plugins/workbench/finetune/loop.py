@@ -19,6 +19,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.losses import code_for, photometric_loss
 from fragprune_plugins.errors import CheckpointError, UsageError
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.adam import make_adam
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, Waiting, between_steps
@@ -268,13 +269,16 @@ class _Run:
         if settings.train == "all":
             rates |= _GEOMETRY | {"xyz": _GEOMETRY["xyz"] * dataset.extent}
         parameters = {
-            name: getattr(model, name).detach().clone().requires_grad_(True) for name in rates
+            name: getattr(model, name)
+            .detach()
+            .clone(memory_format=torch.contiguous_format)
+            .requires_grad_(True)
+            for name in rates
         }
         self.model = replace(model, **parameters, thresholds=None)
         self.rates = {name: rate * settings.rate for name, rate in rates.items()}
-        self.optimizer = torch.optim.Adam(
-            [{"params": [each], "lr": self.rates[name]} for name, each in parameters.items()],
-            eps=1e-15,
+        self.optimizer = make_adam(
+            [{"params": [each], "lr": self.rates[name]} for name, each in parameters.items()]
         )
 
     def result_model(self) -> Model:
@@ -370,7 +374,8 @@ class _Run:
         for name in self.rates:
             parameter = getattr(self.model, name)
             parameter.data.copy_(tensors[f"model.{name}"])
-            state: dict[str, Tensor] = {"step": torch.tensor(float(adam_step))}
+            step = torch.tensor(float(adam_step), dtype=torch.float32)
+            state: dict[str, Tensor] = {"step": step}
             for moment in _MOMENTS:
                 state[moment] = torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
             self.optimizer.state[parameter] = state

@@ -1,0 +1,48 @@
+"""On a CPU, stage 2 steps Adam in torch's fused kernel, whoever owns the optimizer.
+
+It reads and writes each number once, where the plain loop makes a copy for each operation: several
+times faster. Its last bits differ from the loop's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+EPSILON = 1e-15
+"""As the hosts have it: a larger one freezes thresholds whose gradients are tiny."""
+
+
+def make_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
+    """An Adam of parameters on one device; they are contiguous, as the kernel wants them."""
+    devices = {each.device.type for group in groups for each in group["params"]}
+    return torch.optim.Adam(groups, eps=EPSILON, fused=True if devices == {"cpu"} else None)
+
+
+def can_be_fused(optimizer: Any, group: dict[str, Any]) -> bool:
+    """Whether a host's optimizer may step a param group in the fused kernel.
+
+    It may if it is torch's own plain Adam, and all that the kernel reads lies in memory as float32
+    on the CPU, in one order.
+    """
+    if type(optimizer) is not torch.optim.Adam:
+        return False
+    if group["fused"] or group["capturable"] or group["differentiable"]:
+        return False
+    tensors = []
+    for parameter in group["params"]:
+        state = optimizer.state.get(parameter, {})
+        tensors += [parameter, parameter.grad, *(state[name] for name in state)]
+    return all(_is_plain(each) for each in tensors if each is not None)
+
+
+def _is_plain(value: Any) -> bool:
+    return (
+        isinstance(value, Tensor)
+        and value.layout is torch.strided
+        and value.device.type == "cpu"
+        and value.dtype == torch.float32
+        and value.is_contiguous()
+    )

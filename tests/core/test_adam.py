@@ -1,0 +1,68 @@
+"""Which optimizers step in the fused kernel; it takes memory as it lies."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from fragprune_plugins.learning.adam import can_be_fused, make_adam
+
+
+def group_of(kind=torch.optim.Adam, grad=None, **options):
+    parameter = torch.ones(4, 3, requires_grad=True)
+    optimizer = kind([parameter])
+    parameter.grad = torch.ones(4, 3)
+    optimizer.step()
+    parameter.grad = torch.ones(4, 3) if grad is None else grad
+    group = optimizer.param_groups[0]
+    group.update(options)
+    return optimizer, group
+
+
+class Sparing(torch.optim.Adam):
+    """Steps in a way of its own."""
+
+
+def test_a_plain_adam_is_fused_and_steps_to_nearly_the_same():
+    optimizer, group = group_of()
+    assert can_be_fused(optimizer, group)
+    other, _ = group_of()
+    group["fused"] = True
+    optimizer.step()
+    other.step()
+    torch.testing.assert_close(group["params"][0], other.param_groups[0]["params"][0])
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"kind": Sparing},
+        {"kind": torch.optim.AdamW},
+        {"kind": torch.optim.SGD},
+        {"fused": True},
+        {"differentiable": True},
+        {"grad": torch.ones(4, 3).to_sparse()},
+        {"grad": torch.ones(3, 4).T},
+    ],
+    ids=str,
+)
+def test_others_step_as_their_owner_has_it(case):
+    assert not can_be_fused(*group_of(**case))
+
+
+@pytest.mark.parametrize("name", ["exp_avg", "exp_avg_sq"])
+@pytest.mark.parametrize("change", [torch.Tensor.double, lambda t: t.T.contiguous().T])
+def test_moments_that_lie_otherwise_are_left_to_the_loop(name, change):
+    optimizer, group = group_of()
+    state = optimizer.state[group["params"][0]]
+    state[name] = change(state[name])
+    assert not can_be_fused(optimizer, group)
+
+
+def test_ours_is_fused_on_a_cpu_and_steps_without_gradients_too():
+    adam = make_adam([{"params": [torch.ones(3, requires_grad=True)], "lr": 0.1}])
+    adam.step()
+    assert adam.param_groups[0]["fused"]
+    assert adam.param_groups[0]["eps"] == 1e-15
+    elsewhere = torch.ones(3, device="meta", requires_grad=True)
+    assert not make_adam([{"params": [elsewhere], "lr": 0.1}]).param_groups[0]["fused"]
