@@ -1,12 +1,14 @@
 """Where the time of a `finetune` step goes, by stage; and what the loss alone takes.
 
 python iteration.py [--size 640x480 ...] [--gaussians N] [--steps 30] [--threads 2] [--processor]
+                    [--plain]
 python iteration.py --loss [--size 640x480 ...]
 
 Trains the bench scene of SH degree 3, whole and with every Gaussian cut at a falloff, on pictures
 of itself in other colours, and prints a table: medians over steps in milliseconds of the wall's
 clock, or of the processor's, which other programs disturb less; then, for each step, processor
-time of the user and of the system, and page faults.
+time of the user and of the system, and page faults. With --plain: torch's loss and loop of Adam,
+and memory that goes back to the kernel.
 
 With --loss: value and gradient by torch and by each build, processor time of one thread, the least
 of 9.
@@ -37,8 +39,10 @@ import torch
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu import engine as cpu
+from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.engines.losses import compiled_loss
 from fragprune_plugins.learning import losses
+from fragprune_plugins.learning.adam import EPSILON
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
@@ -152,9 +156,10 @@ def profile(
             cut = kind == "cut"
             settings = Settings(iterations=steps + SKIPPED, truncate=cut, pressure=1e-4)
             store = ThresholdStore.from_falloff(torch.full((gaussians,), FALLOFF)) if cut else None
-            plan, scene = Schedule(settings, warmup=0), make_scene(gaussians)
+            scene = replace(make_scene(gaussians), thresholds=store)
+            plan = Schedule(settings, warmup=0)
             with watched(now) as clock:
-                loop.finetune(scene, data, settings, store=store, schedule=plan, engine="cpu")
+                loop.finetune(scene, data, settings, schedule=plan, engine="cpu")
             kept = clock.steps[SKIPPED:]
             names = (*STAGES, "user", "system", "faults")
             row = {n: 1e3 * statistics.median(step.get(n, 0.0) for step in kept) for n in names}
@@ -183,6 +188,11 @@ def time_losses(size: str) -> dict[str, float]:
     return found
 
 
+def plain_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
+    """As the hosts make it."""
+    return torch.optim.Adam(groups, eps=EPSILON)
+
+
 def sides(size: str) -> tuple[int, int]:
     """Width and height."""
     width, height = map(int, size.split("x"))
@@ -207,10 +217,15 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--processor", action="store_true")
+    parser.add_argument("--plain", action="store_true")
     parser.add_argument("--loss", action="store_true")
     args = parser.parse_args()
     sizes = args.size or ["320x240", "640x480", "1280x960"]
     torch.set_num_threads(1 if args.loss else args.threads)
+    if args.plain:
+        loop.photometric_loss, loop.make_adam = losses.photometric_loss, plain_adam
+    else:
+        keep_freed_memory()
     columns: dict[str, dict[str, float]] = {}
     for size in sizes:
         if args.loss:

@@ -192,6 +192,7 @@ def command(
         require_place(out, model, thresholds=settings.truncate and not settings.portable)
         click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
+    from fragprune_plugins.engines.cpu.memory import keep_freed_memory
     from fragprune_plugins.workbench.figures.evaluate import Candidate
     from fragprune_plugins.workbench.finetune import finished as finetuned
     from fragprune_plugins.workbench.finetune import resuming
@@ -208,6 +209,7 @@ def command(
             model, data, images, resolution, white_background, remedy=remedy
         )
     rasterizer, where = open_engine(engine, device, threads)
+    keep_freed_memory()
     truncation = settings.truncate and not no_truncation
     whole = models.load(model, truncation=truncation, device="cpu" if shard else where)
     if itself:
