@@ -37,6 +37,9 @@ class Role(Enum):
     VIEW = "remember which model is being rendered"
     RASTERIZE = "draw with thresholds"
     LOSS = "note the host's loss when it goes backward"
+    SIMILARITY = (
+        "answer structural similarity on a CPU in compiled code, once a call made both ways agreed"
+    )
     METRIC = "evaluate a picture; NaN if the weights cannot be loaded"
     ANSWER = (
         "answer a call that the host's own function cannot answer on this machine",

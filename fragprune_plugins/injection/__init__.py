@@ -9,6 +9,7 @@ stepping     steps and optimizers         rasterizing  views, rasterizations, th
 aligning     rows added and removed       saving       sidecars and checkpoints
 state        the run and its models, shared by all handlers
 patching     wraps functions and restores them
+similarity   answers the hosts' SSIM on a CPU
 stand_ins    replace the host's compiled packages
 ranks        refuses several processes that train one model together
 workers      prepares worker processes that the host spawns

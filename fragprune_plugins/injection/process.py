@@ -80,6 +80,7 @@ def host_process(
 @contextlib.contextmanager
 def surroundings(device: str) -> Iterator[None]:
     """Inside, torch and Pillow do what hosts expect of them on this device."""
+    from fragprune_plugins.engines.cpu.memory import keep_freed_memory
     from fragprune_plugins.injection.cpu_only import cpu_only
 
     with contextlib.ExitStack() as stack:
@@ -87,6 +88,8 @@ def surroundings(device: str) -> Iterator[None]:
         stack.enter_context(_host_pictures())
         stack.enter_context(mock.patch.object(os, "execv", _refuse_to_start_again))
         stack.enter_context(cpu_only() if device == "cpu" else current_gpu(device))
+        if device == "cpu":
+            keep_freed_memory()
         yield
 
 

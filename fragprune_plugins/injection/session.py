@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Iterator
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,8 +14,8 @@ import torch
 from fragprune_plugins.errors import SessionError
 from fragprune_plugins.hosts.adapter import ScriptAdapter
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.seams import Seam, SeamCall
-from fragprune_plugins.injection import aligning, ranks, rasterizing, saving, stepping
+from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
+from fragprune_plugins.injection import aligning, ranks, rasterizing, saving, similarity, stepping
 from fragprune_plugins.injection.patching import PatchLedger
 from fragprune_plugins.injection.stand_ins import StandIns
 from fragprune_plugins.injection.state import SessionState
@@ -23,6 +24,7 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 
 _OF_CALLS = stepping.OF_CALLS | rasterizing.OF_CALLS | saving.OF_CALLS
+_OF_CALLS |= {Role.SIMILARITY: similarity.on_similarity}
 _OF_MODELS = stepping.OF_MODELS | aligning.OF_MODELS | saving.OF_MODELS
 
 _active: Session | None = None
@@ -70,6 +72,9 @@ class Session(SessionState):
             self.install_stand_ins()
             for seam in self.adapter.seams_for(self.repo):
                 self._ledger.wrap(seam, partial(enter, seam))
+            extra = similarity.seam_of(self.repo)
+            if extra is not None and extra.module not in sys.modules:  # late, it is the host's
+                self._ledger.wrap(extra, partial(enter, extra))
             self._stand_ins.refuse_leftovers(self.repo.root)
         except BaseException:
             self._take_back()

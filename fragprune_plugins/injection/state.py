@@ -124,6 +124,7 @@ class SessionState:
         self.drop_in = drop_in
         self.dialect = adapter.dialect(repo)
         self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # waits for its model
+        self.similar: bool | None = None  # compiled similarity agrees with the host's own
         self.absent: set[Seam] = set()  # metrics whose weights cannot be loaded
         self.models: weakref.WeakKeyDictionary[Any, ModelState] = weakref.WeakKeyDictionary()
         self.optimizers: weakref.WeakKeyDictionary[Any, list[weakref.ReferenceType[Any]]] = (
