@@ -1,6 +1,7 @@
 """Everything that an adapter imports: ``from fragprune_plugins.adapting import ...``.
 
-a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo, Finding
+a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo,
+            ParamGroup, Finding
 its seams   Seam, Role, SeamCall, RowTrace, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs, slice_at
 its script  CommandLine, ConfigFile, Photographs
@@ -40,6 +41,7 @@ from fragprune_plugins.hosts.adapter import (
     HostAdapter,
     HostCall,
     HostInfo,
+    ParamGroup,
     ScriptAdapter,
 )
 from fragprune_plugins.hosts.findings import Finding
@@ -95,6 +97,7 @@ __all__ = [
     "ModelFileError",
     "Moment",
     "NotComparedError",
+    "ParamGroup",
     "Photographs",
     "RasterInputs",
     "RasterOutputs",

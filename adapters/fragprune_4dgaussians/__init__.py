@@ -31,6 +31,7 @@ from fragprune_plugins.adapting import (
     HostRepo,
     ModelFileError,
     NotComparedError,
+    ParamGroup,
     RasterInputs,
     RasterizerCall,
     RasterOutputs,
@@ -102,6 +103,11 @@ def completed(call: SeamCall) -> Any:
     return tuple(capture)
 
 
+def is_fine(call: SeamCall) -> bool:
+    """Whether a view is of the phase "fine", whose iterations are steps."""
+    return "fine" in call.arguments["stage"]
+
+
 class MovingGaussians(GraphdecoAdapter):
     """The adapter of 4DGaussians."""
 
@@ -119,8 +125,12 @@ class MovingGaussians(GraphdecoAdapter):
         ),
     )
     calls = (RasterizerCall(outputs=OUTPUTS),)
-    groups = ("xyz", "deformation", "grid", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-    scheduled = frozenset({"xyz", "deformation", "grid"})
+    groups = (
+        GraphdecoAdapter.groups[0],
+        ParamGroup("deformation", scheduled=True),
+        ParamGroup("grid", scheduled=True),
+        *GraphdecoAdapter.groups[1:],
+    )
     own_names = (f"{graphdeco.MODEL}:save_deformation", f"{graphdeco.MODEL}:_deformation_table")
     dialect_type = MovingDialect
     steps_by_rendering = True
@@ -132,7 +142,7 @@ class MovingGaussians(GraphdecoAdapter):
                 "GaussianModel.update_learning_rate": None,  # it does not know the phase
                 "GaussianModel.densify_and_prune": {"attribute": "GaussianModel.densify"},
                 "GaussianModel.restore": {"how": completed},
-                "render": {"needs": ("viewpoint_camera", "pc", "stage")},
+                "render": {"needs": ("viewpoint_camera", "pc", "stage"), "how": is_fine},
             },
         ),
         Seam(Role.STILL, graphdeco.MODEL, "GaussianModel.prune"),
@@ -181,10 +191,6 @@ class MovingGaussians(GraphdecoAdapter):
             if of_coarse
             else "Rename the file or its folder, or name it by a shorter path.",
         )
-
-    def begins_step(self, call: SeamCall) -> bool:
-        """Whether the view is of the phase "fine"."""
-        return "fine" in call.arguments["stage"]
 
     def view(self, camera: Any) -> int:
         """The camera's number, because the host copies cameras and loads them again.

@@ -19,6 +19,7 @@ from fragprune_plugins.adapting import (
     HostInfo,
     HostRepo,
     NotComparedError,
+    ParamGroup,
     Role,
     RowTrace,
     Seam,
@@ -90,10 +91,15 @@ class Compact3DGS(GraphdecoAdapter):
             "and no colours.",
         ),
     )
-    groups = ("xyz", "opacity", "scaling", "rotation", "mask")
-    appearance = frozenset({NETWORK})
+    groups = (
+        GraphdecoAdapter.groups[0],
+        ParamGroup("opacity", copied=True),
+        ParamGroup("scaling"),
+        ParamGroup("rotation", copied=True),
+        ParamGroup("mask"),
+        ParamGroup(NETWORK, colour=True, named=False),
+    )
     densifies_until = ()  # it prunes by its mask to the end
-    inherited = ("rotation", "opacity")
     own_names = tuple(f"{MODEL}:{name}" for name in ("vq_scale", "recolor", "mlp_head"))
     seams = (
         *revised(

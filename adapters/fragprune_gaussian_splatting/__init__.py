@@ -60,6 +60,8 @@ SETTINGS = (
 class PackageDialect(GraphdecoDialect):
     """Vanilla's call of August 2024, under dotted names."""
 
+    own_kernels = "compiler"
+
     def names(self) -> frozenset[str]:
         """The import names in ``modules``."""
         knn = (f"{PACKAGE}.simple_knn", f"{PACKAGE}.simple_knn._C")

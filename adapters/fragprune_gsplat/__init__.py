@@ -18,6 +18,7 @@ from fragprune_plugins.adapting import (
     HostAdapter,
     HostInfo,
     HostRepo,
+    ParamGroup,
     Role,
     RowTrace,
     ScriptAdapter,
@@ -137,7 +138,7 @@ class Gsplat(HostAdapter):
     )
     installed = (PACKAGE,)
     steps_by_rendering = True
-    appearance = HostAdapter.appearance | {"colors"}
+    groups = (*HostAdapter.groups, ParamGroup("colors", colour=True))
     seams: tuple[Seam, ...] = (
         Seam(
             Role.RASTERIZE,

@@ -74,6 +74,7 @@ class GsplatDialect(Dialect):
     """
 
     means = "means"
+    own_kernels = "gpu"
     alpha_max: float
     floor: float
     tight: bool
@@ -249,14 +250,6 @@ class GsplatDialect(Dialect):
             "n_batches": 1,
             "n_cameras": len(inputs.projections),
         }
-
-    def stands_in(self, call: HostCall) -> bool:
-        """True for tensors on the CPU: gsplat has kernels only for CUDA."""
-        return not call.arguments["means"].is_cuda
-
-    def present(self, package: str) -> bool:
-        """Whether its kernels can run: they are compiled at first use, which needs a GPU."""
-        return torch.cuda.is_available()
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """A stand-in that keeps gsplat from compiling its kernels; ``answers`` has what we need."""

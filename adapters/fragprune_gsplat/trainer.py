@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
@@ -81,10 +80,6 @@ def given(arguments: list[str]) -> dict[str, list[str]]:
 
 class TrainerDialect(GsplatDialect):
     """The dialect with a stand-in for the loss's kernel."""
-
-    def present(self, package: str) -> bool:
-        """Whether a compiled package can be imported here, and run."""
-        return super().present(package) and find_spec(package) is not None
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """The stand-ins, by import name."""

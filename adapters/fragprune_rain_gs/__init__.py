@@ -55,6 +55,8 @@ where it holds several, that of the last."""
 class RainDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with a dilation of its own, and depth as third output."""
 
+    own_kernels = "compiler"
+
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call; depth is one more channel, without gradient."""
         inputs = super().unpack(call)

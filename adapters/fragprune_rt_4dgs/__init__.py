@@ -22,6 +22,7 @@ from fragprune_plugins.adapting import (
     HostRepo,
     ModelFileError,
     NotComparedError,
+    ParamGroup,
     RasterizerCall,
     SeamCall,
     UsageError,
@@ -59,10 +60,14 @@ class RT4DGS(GraphdecoAdapter):
     )
     package = RASTERIZER
     calls = (RasterizerCall(SETTINGS, OUTPUTS, arguments=ARGUMENTS),)
-    groups = (*GraphdecoAdapter.groups, "t", "scaling_t", "rotation_r")
+    groups = (
+        *GraphdecoAdapter.groups,
+        ParamGroup("t", gradient_read=True),
+        ParamGroup("scaling_t"),
+        ParamGroup("rotation_r"),
+    )
     own_names = (f"{MODEL}:get_marginal_t", f"{RASTERIZER}:GaussianRasterizer")
     dialect_type = RT4DGSDialect
-    gradients_read = frozenset({"t"})
     seams = revised(
         GraphdecoAdapter.seams,
         {
@@ -121,7 +126,7 @@ class RT4DGS(GraphdecoAdapter):
 
     # -- its models ------------------------------------------------------------------------------
 
-    def elsewhere(self, model: Any) -> list[Tensor]:
+    def extra_parameters(self, model: Any) -> list[Tensor]:
         """The environment map, whose optimizer is a local of the training loop."""
         return [model.env_map] if getattr(model.env_map, "requires_grad", False) else []
 

@@ -42,6 +42,8 @@ OUTPUTS = 6
 class RT4DGSDialect(GraphdecoDialect):
     """Cuts the 4D Gaussians at the call's moment; an engine draws the 3D Gaussians."""
 
+    own_kernels = "compiler"
+
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call. Depth and flow become features; absent rows are at the camera.
 

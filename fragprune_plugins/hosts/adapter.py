@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from fragprune_plugins.errors import NotComparedError, UsageError
+from fragprune_plugins.errors import ModelFileError, NotComparedError, UsageError
 from fragprune_plugins.files.reading import MEBIBYTE, Door, parse_json
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.flags import Flags
@@ -27,7 +26,75 @@ if TYPE_CHECKING:
     from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 CHECKPOINT_KEY = "fragprune"
-"""Under which a host's checkpoint carries thresholds."""
+"""Under which a host's checkpoint carries thresholds, in the state of the optimizer."""
+
+
+def optimizer_state(capture: Any, where: str) -> dict[str, Any]:
+    """The first optimizer's state dict in a host's checkpoint.
+
+    It can hold a key of ours, because ``load_state_dict`` ignores keys that it does not know.
+
+    Args:
+        capture: what the host's ``capture`` returned.
+        where: for the message.
+
+    Raises:
+        ModelFileError: there is none.
+    """
+    parts: list[dict[str, Any]] = [
+        part for part in capture if isinstance(part, dict) and "param_groups" in part
+    ]
+    if parts:
+        return parts[0]
+    raise ModelFileError(
+        where,
+        "no optimizer's state in it",
+        "one, as the host captures it",
+        "Name another, or a PLY.",
+    )
+
+
+@dataclass(frozen=True)
+class ParamGroup:
+    """A param group of the host's optimizer.
+
+    Attributes:
+        name: the host's name for it.
+        colour: holds the colour, which ``--train appearance`` trains beside the opacity.
+        copied: children copy it from their parents bit for bit; this is checked.
+        scheduled: the host sets its learning rate in every iteration, also in stage 2.
+        gradient_read: the host reads its gradient in every iteration. While frozen, it gets zeros.
+        named: the host's source spells the name out; otherwise the adapter's ``group_name`` does.
+    """
+
+    name: str
+    colour: bool = False
+    copied: bool = False
+    scheduled: bool = False
+    gradient_read: bool = False
+    named: bool = True
+
+
+XYZ = ParamGroup("xyz", scheduled=True)
+GROUPS = (
+    XYZ,
+    ParamGroup("f_dc", colour=True, copied=True),
+    ParamGroup("f_rest", colour=True),
+    ParamGroup("opacity"),
+    ParamGroup("scaling"),
+    ParamGroup("rotation", copied=True),
+)
+"""The groups of 3DGS, in order: ``load_state_dict`` matches them by position."""
+
+
+def trained_groups(groups: Iterable[ParamGroup], train: str) -> frozenset[str] | None:
+    """Names of the param groups that stage 2 trains for a value of ``--train``; None for all."""
+    colours = {group.name for group in groups if group.colour}
+    return {
+        "opacity": frozenset({"opacity"}),
+        "appearance": frozenset({"opacity", *colours}),
+        "all": None,
+    }[train]
 
 
 @dataclass(frozen=True)
@@ -90,6 +157,10 @@ class Dialect(ABC):
     means: ClassVar[str] = "means3D"
     """What the call names the (N, 3) means."""
 
+    own_kernels: ClassVar[Literal["", "gpu", "compiler"]] = ""
+    """What compiled modules inside the host's own package need: a "gpu"; or also CUDA's "compiler",
+    because they are compiled when they are imported. "" if there are none."""
+
     @abstractmethod
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the host's call into ``RasterInputs``."""
@@ -130,17 +201,6 @@ class Dialect(ABC):
     def names(self) -> frozenset[str]:
         """The import names in ``modules``; these packages need not be installed."""
         return frozenset(self.modules(lambda call: None))
-
-    def stands_in(self, call: HostCall) -> bool:
-        """Whether our engine must answer a call that the host's own function cannot."""
-        return False
-
-    def present(self, package: str) -> bool:
-        """Whether the host can import its own compiled package here."""
-        try:
-            return find_spec(package) is not None
-        except ValueError:  # a module without a spec is another tool's stand-in
-            return True
 
     def spares(self) -> dict[str, ModuleType]:
         """Stand-ins for packages that the host imports but does not need, for a CPU."""
@@ -316,12 +376,7 @@ class HostAdapter(ABC):
         installed: import names of the host's packages, if it is installed instead of checked out.
         steps_by_rendering: the host does not call the STEP seam in every iteration. In an iteration
             without that call, the first view drawn with gradients begins the step.
-        scheduled: param groups whose learning rate the host sets in every iteration, also in stage
-            2.
-        appearance: param groups of the colour, which ``--train appearance`` also trains.
-        inherited: param groups that children copy from their parents bit for bit; this is checked.
-        gradients_read: param groups whose gradient the host reads in every iteration. While frozen,
-            they get zeros.
+        groups: param groups of the host's main optimizer, in order.
         on_gpu: our cuda engine can draw its Gaussians. If not, ``fragprune run`` refuses a GPU for
             what draws with thresholds.
     """
@@ -332,10 +387,7 @@ class HostAdapter(ABC):
     descends_from: tuple[str, ...] = ()
     installed: tuple[str, ...] = ()
     steps_by_rendering = False
-    scheduled: frozenset[str] = frozenset({"xyz"})
-    appearance: frozenset[str] = frozenset({"f_dc", "f_rest"})
-    inherited: tuple[str, ...] = ()
-    gradients_read: frozenset[str] = frozenset()
+    groups: tuple[ParamGroup, ...] = GROUPS
     on_gpu: bool = True
 
     # -- the source ------------------------------------------------------------------------------
@@ -392,20 +444,9 @@ class HostAdapter(ABC):
     def opacities(self, model: Any) -> Tensor:
         """(N,) activated opacities."""
 
-    def rows(self, model: Any) -> int:
-        """How many Gaussians the model holds."""
-        return len(self.means(model))
-
     def view(self, camera: Any) -> int:
         """A key that identifies a training view; by default the object's id."""
         return id(camera)
-
-    def begins_step(self, call: SeamCall) -> bool:
-        """Whether a view drawn with gradients may begin a step; see ``steps_by_rendering``.
-
-        A host may train in several phases, of which not all count.
-        """
-        return True
 
     def model_of(self, call: SeamCall) -> Any:
         """The model of a seam's call: by default the object of the method.
@@ -418,16 +459,11 @@ class HostAdapter(ABC):
         return call.instance
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
-        """The name of a param group for ``trained_groups``; None if it has none."""
+        """The name of a param group, as in ``groups``; None if it has none."""
         return group.get("name")
 
-    def trained_groups(self, train: str) -> frozenset[str] | None:
-        """The param groups that stage 2 trains for a value of ``--train``; None for all."""
-        opacity = frozenset({"opacity"})
-        return {"opacity": opacity, "appearance": opacity | self.appearance, "all": None}[train]
-
-    def elsewhere(self, model: Any) -> list[Tensor]:
-        """Parameters of an optimizer that we cannot reach, which drawing alone moves."""
+    def extra_parameters(self, model: Any) -> list[Tensor]:
+        """Trained parameters outside the known optimizers, which drawing alone moves."""
         return []
 
     def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
@@ -437,10 +473,6 @@ class HostAdapter(ABC):
             model: the host's model.
             output: the folder of the run that was resumed; None if stage 2 resumes none.
         """
-
-    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
-        """The dict inside the host's checkpoint tuple that can hold a key of ours."""
-        raise NotImplementedError(f"{self.name}: CAPTURE and RESTORE seams need checkpoint_state")
 
 
 class ScriptAdapter(HostAdapter):

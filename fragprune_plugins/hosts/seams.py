@@ -34,7 +34,10 @@ class Role(Enum):
         "count one training step",
         "in stage 2, after: the value to return to the host (the call's result)",
     )
-    VIEW = "remember which model is being rendered"
+    VIEW = (
+        "remember which model is being rendered",
+        "before: whether the view may begin a step, where views do (True)",
+    )
     RASTERIZE = "draw with thresholds"
     LOSS = "note the host's loss when it goes backward"
     SIMILARITY = (

@@ -70,7 +70,7 @@ def expect_children(call: SeamCall, found: str, right: bool) -> None:
 def are_copies(
     session: SessionState, model: Any, tensors: Mapping[str, Tensor], parents: Tensor
 ) -> bool:
-    """Whether new rows equal their parents to the bit in the adapter's ``inherited`` groups.
+    """Whether new rows equal their parents to the bit in every group that children copy.
 
     Args:
         session: the state of the session.
@@ -79,7 +79,8 @@ def are_copies(
         parents: (P,) rows of the parents.
     """
     known = {name: group["params"][0] for name, group in session.groups(model)}
-    return all(torch.equal(tensors[n], known[n][parents]) for n in session.adapter.inherited)
+    copied = [group.name for group in session.adapter.groups if group.copied]
+    return all(torch.equal(tensors[name], known[name][parents]) for name in copied)
 
 
 def on_choice(session: SessionState, call: SeamCall) -> Any:

@@ -58,7 +58,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     state, view = session.models.get(model), session.adapter.view(call.first)
     begins = session.adapter.steps_by_rendering and session.learn and torch.is_grad_enabled()
     if begins and state is not None and not state.begun:
-        if session.adapter.begins_step(call):
+        if call.how(True):
             begin_step(session, model, state)
         else:
             expect_to_train(session, call, model)
@@ -141,13 +141,14 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     rendering = session.rendering.get()
     state = session.models.get(rendering[0]) if rendering else None
     drawn = HostCall.of(call)
-    by_host = partial(draw, session, drawn) if session.dialect.stands_in(drawn) else call.run
+    means, gpu = drawn[session.dialect.means], session.dialect.own_kernels == "gpu"
+    by_host = partial(draw, session, drawn) if gpu and not means.is_cuda else call.run
     if rendering is None or state is None or session.pausing.get():
         return by_host()
     rows = session.dialect.rows_drawn(rendering[0], drawn)
     if rows is not None:
         session.expect_rows(rendering[0], state, f"{session.adapter.name}: rasterizer call")
-    means, expected = drawn[session.dialect.means], len(state.store if rows is None else rows)
+    expected = len(state.store if rows is None else rows)
     if len(means) != expected:
         raise AlignmentError(
             f"{session.adapter.name}: rasterizer call",

@@ -14,7 +14,7 @@ from torch import Tensor
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import staging
-from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
+from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, optimizer_state
 from fragprune_plugins.hosts.seams import Role, SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -137,14 +137,16 @@ def on_capture(session: SessionState, call: SeamCall) -> Any:
     state = session.models.get(model)
     if state is not None and (session.standing_still(model) or state.store.cuts):
         session.expect_rows(model, state, str(call.seam))
-        session.adapter.checkpoint_state(result)[CHECKPOINT_KEY] = state.store.state_dict()
+        held = optimizer_state(result, f"{session.adapter.name}: checkpoint")
+        held[CHECKPOINT_KEY] = state.store.state_dict()
     return result
 
 
 def on_restore(session: SessionState, call: SeamCall) -> Any:
     """Take thresholds out of the host's checkpoint, and let the host restore the rest."""
     model, capture = call.model, call.how(call.first)
-    saved = session.adapter.checkpoint_state(capture).pop(CHECKPOINT_KEY, None)
+    held = optimizer_state(capture, f"{session.adapter.name}: checkpoint")
+    saved = held.pop(CHECKPOINT_KEY, None)
     result = call.run(**{call.seam.needs[0]: capture})
     restore_rates(session, model)
     state = session.models.get(model)

@@ -17,6 +17,20 @@ from fragprune_plugins.hosts.adapter import Dialect, HostCall
 log = logging.getLogger("fragprune")
 
 
+def runs_here(dialect: Dialect, package: str) -> bool:
+    """Whether the host can import and run its own compiled modules of a package here."""
+    from torch.cuda import is_available
+    from torch.utils import cpp_extension
+
+    try:
+        found = find_spec(package) is not None
+    except ValueError:  # a module without a spec is another tool's stand-in
+        found = True
+    needs = "" if package in dialect.names() else dialect.own_kernels
+    compiler = needs != "compiler" or cpp_extension.CUDA_HOME is not None
+    return found and compiler and (not needs or is_available())
+
+
 class StandIns:
     """The stand-ins that a dialect makes for its host's compiled packages.
 
@@ -44,7 +58,7 @@ class StandIns:
             package = name.split(".")[0]
             wanted = self._drop_in
             if wanted is None:
-                wanted = package in self._placed or not self._dialect.present(package)
+                wanted = package in self._placed or not runs_here(self._dialect, package)
             if not wanted:
                 continue
             if name in sys.modules:

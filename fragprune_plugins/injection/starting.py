@@ -12,7 +12,12 @@ from typing import Any, NamedTuple
 from fragprune_plugins.errors import ModelFileError, UsageError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import Door
-from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, CommandLine, ScriptAdapter
+from fragprune_plugins.hosts.adapter import (
+    CHECKPOINT_KEY,
+    CommandLine,
+    ScriptAdapter,
+    optimizer_state,
+)
 from fragprune_plugins.injection.command import HostCommand
 from fragprune_plugins.injection.process import host_checkpoints
 
@@ -58,7 +63,7 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
         return Start(at, path, "the command names it")
     where, flag = output or "no output folder", host.line.spellings("resume")[-1]
     saved, newer = files(adapter, output), 0
-    while saved and _learned(adapter, saved[-1][1]):
+    while saved and _learned(saved[-1][1]):
         saved.pop()
         newer += 1
     if not saved and newer:
@@ -76,7 +81,7 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
             "Add one of these flags to the host's command.",
         )
     iteration, path = saved[-1]
-    later = [(at, file) for at, file in saved if at > iteration and not _learned(adapter, file)]
+    later = [(at, file) for at, file in saved if at > iteration and not _learned(file)]
     if later:
         log.warning(
             "%s is of a later iteration, but it is older than the file from which stage 2 starts; "
@@ -164,13 +169,13 @@ def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterat
         made.unlink(missing_ok=True)
 
 
-def _learned(adapter: ScriptAdapter, path: Path) -> bool:
+def _learned(path: Path) -> bool:
     """Whether stage 2 or a control wrote the file, and not stage 1."""
     from fragprune_plugins.files import sidecar
 
     if path.suffix == ".ply":
         return sidecar.belongs(path)
-    return CHECKPOINT_KEY in adapter.checkpoint_state(_read_checkpoint(path)[0])
+    return CHECKPOINT_KEY in optimizer_state(_read_checkpoint(path)[0], str(path))
 
 
 def _iteration_of_ply(ply: Path) -> int:

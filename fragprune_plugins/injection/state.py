@@ -21,7 +21,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.hosts.adapter import HostAdapter
+from fragprune_plugins.hosts.adapter import HostAdapter, trained_groups
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.events import PopulationChange
@@ -123,6 +123,7 @@ class SessionState:
         self.engines: dict[torch.device, Engine] = {}
         self.drop_in = drop_in
         self.dialect = adapter.dialect(repo)
+        self.trained = trained_groups(adapter.groups, self.settings.train)  # names; None for all
         self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # waits for its model
         self.similar: bool | None = None  # compiled similarity agrees with the host's own
         self.absent: set[Seam] = set()  # metrics whose weights cannot be loaded
@@ -259,7 +260,7 @@ class SessionState:
             SidecarError: the sidecar is missing or belongs to another file.
         """
         means = self.adapter.means(model)
-        store, _ = sidecar.load(path, self.adapter.rows(model), means.device)
+        store, _ = sidecar.load(path, len(means), means.device)
         state = self.models[model] = ModelState(store, loaded=weakref.ref(means))
         self.follow(model, state)
         self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)
@@ -282,7 +283,7 @@ class SessionState:
 
     def expect_rows(self, model: Any, state: ModelState, where: str) -> None:
         """Raise AlignmentError unless a model has one threshold per Gaussian."""
-        rows = self.adapter.rows(model)
+        rows = len(self.adapter.means(model))
         if rows != len(state.store):
             raise AlignmentError(
                 where,

@@ -45,7 +45,7 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
     session.optimizers[model] = [weakref.ref(optimizer) for optimizer in call.how()]
     groups = session.groups(model)
     session.rates[model] = {name: group["lr"] for name, group in groups if name}
-    rows = session.adapter.rows(model)
+    rows = len(session.adapter.means(model))
     if state is not None and not kept:
         before = len(state.store)
         state.store.replace(rows)
@@ -129,8 +129,9 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
     if not session.standing_still(model):
         expect_sound(session, model, state)
         return
-    trained = session.adapter.trained_groups(session.settings.train)
+    trained = session.trained
     stage, rates = state.stage, session.rates[model]
+    scheduled = {group.name for group in session.adapter.groups if group.scheduled}
     for group in optimizer.param_groups:
         name = session.adapter.group_name(model, group)
         if trained is not None and name not in trained:
@@ -138,7 +139,7 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
                 parameter.grad = None
             continue
         ours: dict[str, Any] = {}
-        if stage is not None and name in rates and name not in session.adapter.scheduled:
+        if stage is not None and name in rates and name not in scheduled:
             ours["lr"] = stage.rate(name, rates[name])
         if can_be_fused(optimizer, group):
             ours["fused"] = True
@@ -214,12 +215,12 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
 
 def frozen_parameters(session: SessionState, model: Any) -> list[Tensor]:
     """Parameters of a model that are frozen in this step; none outside stage 2."""
-    trained = session.adapter.trained_groups(session.settings.train)
+    trained = session.trained
     if trained is None or not session.standing_still(model):
         return []
     groups = [group for name, group in session.groups(model) if name not in trained]
     own = [parameter for group in groups for parameter in group["params"]]
-    return own + session.adapter.elsewhere(model)
+    return own + session.adapter.extra_parameters(model)
 
 
 @contextlib.contextmanager
@@ -266,9 +267,10 @@ def depends_only_on(known: set[int], value: Any) -> bool:
 
 def fill_gradients_read(session: SessionState, model: Any) -> None:
     """Set zero gradients on frozen parameters whose gradient the host reads."""
-    trained = session.adapter.trained_groups(session.settings.train)
+    trained = session.trained
+    read = {group.name for group in session.adapter.groups if group.gradient_read}
     for name, group in session.groups(model):
-        if trained is not None and name not in trained and name in session.adapter.gradients_read:
+        if trained is not None and name not in trained and name in read:
             for parameter in group["params"]:
                 parameter.grad = torch.zeros_like(parameter)
 

@@ -446,7 +446,7 @@ def logits_of(marks: Tensor) -> Tensor:
 
 def label(host: Running, model: Any) -> None:
     """Mark row i with i, and give it a unique threshold and unique moments."""
-    numbers = torch.arange(host.adapter.rows(model))
+    numbers = torch.arange(len(host.adapter.means(model)))
     host.driver.mark(model, numbers)
     host.store(model).load_state_dict(
         {
@@ -469,7 +469,7 @@ def expect_ancestors(host: Running, model: Any) -> None:
         AssertionError: names the first row with a wrong threshold.
     """
     store, marks = host.store(model), host.driver.marks(model)
-    rows, state = host.adapter.rows(model), store.state_dict()
+    rows, state = len(host.adapter.means(model)), store.state_dict()
     if not len(store) == rows == len(marks):
         raise AssertionError(f"{len(store)} thresholds for {rows} Gaussians")
     neutral = torch.full((rows,), NEUTRAL_LOGIT)

@@ -22,6 +22,7 @@ from fragprune_light_gaussian import LightGaussian
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.hosts.adapter import optimizer_state
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -248,7 +249,7 @@ def test_a_point_cloud_alone_is_resumed_with_the_hosts_weight_decay(
     made = tmp_path / "made.pth"
     LightGaussian().checkpoint_from_ply(summary.model_after, 29, made)
     (capture, _) = torch.load(made, weights_only=False)
-    state = LightGaussian().checkpoint_state(capture)
+    state = optimizer_state(capture, "checkpoint")
     assert {group["weight_decay"] for group in state["param_groups"]} == {0.01}
     words = command(mini, "train_densify_prune.py", photographs, tmp_path, 20, "--sh_degree", 2)
     words += ["--start_checkpoint", str(summary.model_after)]

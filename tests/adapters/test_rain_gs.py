@@ -20,6 +20,7 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.stand_ins import runs_here
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.workbench.run import _measure, _photographs
 from fragprune_rain_gs import PACKAGE, RainGS
@@ -58,9 +59,9 @@ def test_the_hosts_own_rasterizer_is_used_where_it_can_be_compiled(mini, monkeyp
     for compiler, gpu in ((None, True), ("/usr/local/cuda", False), ("/usr/local/cuda", True)):
         monkeypatch.setattr(extension, "CUDA_HOME", compiler)
         monkeypatch.setattr(torch.cuda, "is_available", lambda gpu=gpu: gpu)
-        assert dialect.present("submodules") == bool(compiler and gpu)
-        assert dialect.present("torch")
-        assert not dialect.present("simple_knn")
+        assert runs_here(dialect, "submodules") == bool(compiler and gpu)
+        assert runs_here(dialect, "torch")
+        assert not runs_here(dialect, "simple_knn")
 
 
 class Notes:

@@ -13,6 +13,7 @@ from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.stand_ins import runs_here
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing.host import joint, running
@@ -377,9 +378,9 @@ def test_the_hosts_own_rasterizer_stays_where_it_can_be_compiled(mini, monkeypat
     monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", compiler)
     monkeypatch.setattr("torch.cuda.is_available", lambda: gpu)
     dialect = RT4DGS().dialect(HostRepo(mini))
-    assert dialect.present("gaussian_renderer") == bool(compiler and gpu)
-    assert dialect.present("torch")
-    assert not dialect.present("pointops2_cuda")
+    assert runs_here(dialect, "gaussian_renderer") == bool(compiler and gpu)
+    assert runs_here(dialect, "torch")
+    assert not runs_here(dialect, "pointops2_cuda")
 
 
 def test_a_ply_is_no_model_of_this_host(tmp_path):

@@ -9,14 +9,14 @@ import torch
 
 from fragprune_plugins.hosts.findings import Match
 from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
-from fragprune_plugins.hosts.seams import Role
+from fragprune_plugins.hosts.seams import Role, revised
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
 class PatchesByHand(Vanilla3DGS):
     """Wraps a function of the host by itself, and never takes it back."""
 
-    def rows(self, model: Any) -> int:
+    def means(self, model: Any) -> torch.Tensor:
         kind = type(model)
         if not hasattr(kind.oneupSHdegree, "by_hand"):
 
@@ -25,15 +25,15 @@ class PatchesByHand(Vanilla3DGS):
 
             wrapper.by_hand = True
             kind.oneupSHdegree = wrapper
-        return super().rows(model)
+        return super().means(model)
 
 
 class TakesRandomNumbers(Vanilla3DGS):
     """Moves the host's random stream."""
 
-    def rows(self, model: Any) -> int:
+    def means(self, model: Any) -> torch.Tensor:
         torch.rand(1)
-        return super().rows(model)
+        return super().means(model)
 
 
 class MixesUpParents(Vanilla3DGS):
@@ -45,22 +45,21 @@ class MixesUpParents(Vanilla3DGS):
         else seam
         for seam in Vanilla3DGS.seams
     )
-    inherited = ()
+    groups = tuple(replace(group, copied=False) for group in Vanilla3DGS.groups)
 
 
 class LosesTheCheckpoint(Vanilla3DGS):
-    """Puts thresholds into a copy of the host's checkpoint."""
+    """Puts no thresholds into the host's checkpoint."""
 
-    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
-        return dict(super().checkpoint_state(capture))
+    seams = revised(Vanilla3DGS.seams, {"GaussianModel.capture": None})
 
 
 class TrainsTooMuch(Vanilla3DGS):
     """Lets scales move with the opacities."""
 
-    def trained_groups(self, train: str) -> frozenset[str] | None:
-        groups = super().trained_groups(train)
-        return groups | {"scaling"} if groups else None
+    def group_name(self, model: Any, group: Any) -> str | None:
+        name = super().group_name(model, group)
+        return "opacity" if name == "scaling" else name
 
 
 class LeavesParametersAsleep(Vanilla3DGS):

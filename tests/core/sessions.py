@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import torch
 
+from fragprune_plugins.hosts.adapter import ParamGroup
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.schedule import Settings
@@ -29,13 +30,10 @@ class Model:
 class Adapter:
     """Describes it."""
 
-    name, inherited = "three-lines", ("xyz", "o")
+    name, groups = "three-lines", (ParamGroup("xyz", copied=True), ParamGroup("o", copied=True))
 
     def dialect(self, repo):
         return f"dialect of {repo.root}"
-
-    def rows(self, model):
-        return len(model.xyz)
 
     def means(self, model):
         return model.xyz

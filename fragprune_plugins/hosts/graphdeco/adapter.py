@@ -10,9 +10,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from fragprune_plugins.errors import ModelFileError, NotComparedError
+from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.adapter import (
     CHECKPOINT_KEY,
+    GROUPS,
     CommandLine,
     Dialect,
     HostCall,
@@ -37,9 +38,6 @@ if TYPE_CHECKING:
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 CAMERAS = "utils.camera_utils"
 OTHER = "Use the adapter of that host."
-
-GROUPS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-"""Names and order of the host optimizer's param groups; load_state_dict matches by position."""
 
 
 def optimizers(call: SeamCall) -> list[Any]:
@@ -140,15 +138,6 @@ class GraphdecoDialect(Dialect):
         """(colour (3, H, W), radii (P,) int32), and inverse depth (1, H, W) if ``outputs`` is 3."""
         return (outputs.image, outputs.radii, outputs.invdepth)[: self.outputs]
 
-    def present(self, package: str) -> bool:
-        """Whether the package can be imported, or compiled if it is a module of the host."""
-        if not self.package.startswith(f"{package}."):
-            return super().present(package)
-        from torch.cuda import is_available
-        from torch.utils.cpp_extension import CUDA_HOME
-
-        return CUDA_HOME is not None and is_available()
-
     def names(self) -> frozenset[str]:
         """The import names of the rasterizer and simple_knn, without an import of torch."""
         return frozenset((self.package, "simple_knn", "simple_knn._C"))
@@ -168,7 +157,6 @@ class GraphdecoAdapter(ScriptAdapter):
         package: import name of the rasterizer.
         calls: calls of the rasterizer that the dialect answers; each function makes one of them.
         dialect_type: the dialect that answers them.
-        groups: names of the optimizer's param groups, in order, as ``training_setup`` spells them.
         own_names: "module:name" of names that only this host's source mentions, not its ancestors'.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
@@ -184,13 +172,11 @@ class GraphdecoAdapter(ScriptAdapter):
     """The module of the functions that call the rasterizer."""
     calls: tuple[RasterizerCall, ...] = (RasterizerCall(),)
     dialect_type: type[GraphdecoDialect] = GraphdecoDialect
-    groups: tuple[str, ...] = GROUPS
     own_names: tuple[str, ...] = ()
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
     densifies_until: tuple[str, ...] = ("densify_until_iter",)
     checkpoints = "chkpnt"
-    inherited = ("f_dc", "rotation")
     seams = (
         *MODEL_SEAMS,
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
@@ -228,9 +214,10 @@ class GraphdecoAdapter(ScriptAdapter):
         """An error if the source spells out other param groups."""
         setup = "GaussianModel.training_setup"
         found = group_names(repo.function(MODEL, setup))
-        if found in ((), self.groups):
+        known = tuple(group.name for group in self.groups if group.named)
+        if found in ((), known):
             return []
-        at, expected = f"{MODEL}:{setup} ({repo.place(MODEL, setup)})", ", ".join(self.groups)
+        at, expected = f"{MODEL}:{setup} ({repo.place(MODEL, setup)})", ", ".join(known)
         return [Finding("error", "param-groups", at, ", ".join(found), expected, OTHER)]
 
     def _calls(self, repo: HostRepo) -> list[Finding]:
@@ -333,19 +320,6 @@ class GraphdecoAdapter(ScriptAdapter):
         opacities: Tensor = model.get_opacity
         return opacities.detach().reshape(-1)
 
-    def checkpoint_state(self, capture: Any) -> dict[str, Any]:
-        """The optimizer's state dict: load_state_dict ignores keys it does not know."""
-        parts = [p for p in capture if isinstance(p, dict) and "param_groups" in p]
-        if parts:
-            state: dict[str, Any] = parts[0]
-            return state
-        raise ModelFileError(
-            f"{self.name}: checkpoint",
-            "no optimizer's state in it",
-            "one, as the host captures it",
-            "Name another, or a PLY.",
-        )
-
     def read_model(self, ply: Path) -> Model:
         """The host's own PLY."""
         from fragprune_plugins.files.ply import read_ply
@@ -372,7 +346,7 @@ class GraphdecoAdapter(ScriptAdapter):
         rows = len(m.xyz)
         tensors = dict(
             zip(
-                GROUPS,
+                [group.name for group in GROUPS],
                 (m.xyz, m.f_dc, m.f_rest, m.opacity, m.scaling, m.rotation),
                 strict=True,
             )

@@ -58,7 +58,7 @@ def alignment(case: Case) -> str:
                 actions[name](model, host.arguments, chance)
                 expect_ancestors(host, model)
                 done["actions"] += 1
-                if not 0 < host.adapter.rows(model) < MOST:
+                if not 0 < len(host.adapter.means(model)) < MOST:
                     return
             require(host.render(camera, model)["render"].isfinite().all(), "pixels not finite")
 
