@@ -26,7 +26,9 @@ def runs_here(dialect: Dialect, package: str) -> bool:
         found = find_spec(package) is not None
     except ValueError:  # a module without a spec is another tool's stand-in
         found = True
-    needs = "" if package in dialect.names() else dialect.own_kernels
+    names = dialect.names()
+    own = package not in names and any(name.startswith(f"{package}.") for name in names)
+    needs = dialect.own_kernels if own else ""
     compiler = needs != "compiler" or cpp_extension.CUDA_HOME is not None
     return found and compiler and (not needs or is_available())
 
