@@ -157,8 +157,7 @@ class GaussianSplatting(GraphdecoAdapter):
     )
     installed = (PACKAGE, MCMC, REDUCED)
     package = RASTERIZER
-    renderer = MODEL
-    calls = (RasterizerCall(frozenset({"antialiasing"}), 3, "GaussianModel.render"),)
+    calls = (RasterizerCall(frozenset({"antialiasing"}), 3),)
     scripts = (f"{PACKAGE}/train.py",)
     dialect_type = PackageDialect
     seams = (

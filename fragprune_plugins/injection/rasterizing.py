@@ -25,6 +25,7 @@ from fragprune_plugins.injection.stepping import (
     frozen_parameters,
 )
 from fragprune_plugins.learning.area import area_per_pixel
+from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")
@@ -163,10 +164,10 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     with directly():
         inputs, engine = unpack(session, drawn)
         inputs = replace(inputs, stop=state.store.stop)
-        thresholds = (
-            session.truncate(inputs, state.store) if stage is None else stage.thresholds(inputs)
-        )
-        if thresholds is not None or inputs.stop is not None or presses:
+        if stage is None:
+            thresholds = thresholds_for(inputs, state.store, session.plugins)
+        else:
+            thresholds = stage.thresholds(inputs)
             if thresholds is not None and rows is not None:
                 thresholds = thresholds[rows]
             truncated = partial(rasterize, engine, state, rendering[1], thresholds)

@@ -29,10 +29,9 @@ from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
-from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds_for
+from fragprune_plugins.plugins.hooks import engine_for, schedule_for
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import RasterInputs
 
 log = logging.getLogger("fragprune")
 
@@ -180,10 +179,6 @@ class SessionState:
     def follow(self, model: Any, state: ModelState) -> None:
         """Make this the model of reports and summaries."""
         self.last, self.last_state = weakref.ref(model), state
-
-    def truncate(self, inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
-        """(N,) thresholds for one rasterization, as plugins answer; None for no truncation."""
-        return thresholds_for(inputs, store, self.plugins)
 
     def changed(self, store: ThresholdStore, operation: str, before: int) -> None:
         """Tell observers that rows changed.

@@ -21,6 +21,7 @@ from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.hooks import thresholds_for
 
 
 def on_scene(session: SessionState, call: SeamCall) -> Any:
@@ -80,7 +81,7 @@ def stage2(session: SessionState, model: Any, state: ModelState) -> Stage2:
         state.store,
         session.settings,
         session.schedule,
-        truncate=session.truncate,
+        truncate=partial(thresholds_for, plugins=session.plugins),
         views=state.views,
         watch=partial(report, session),
         parameters=parameters,

@@ -90,6 +90,8 @@ class Host:
     """What tells this way of driving a host from others, in the report."""
     lacks: Mapping[str, str] = MappingProxyType({})
     """Promises that cannot be asked of the host, by name ("checkpoint"), and why not."""
+    renderer: str = "gaussian_renderer:render"
+    """The host's function that draws a view, "module:function"."""
     draws_alone: bool = True
     """Without a session the host can draw here, through our stand-ins for compiled packages."""
     opacity: frozenset[str] = frozenset({"opacity"})
@@ -179,7 +181,8 @@ class Host:
 
     def render(self, camera: Any, model: Any, background: Tensor) -> dict[str, Any]:
         """Call the host's render function; returns a dict with "render" (3, H, W)."""
-        draw = import_module("gaussian_renderer").render
+        module, function = self.renderer.split(":")
+        draw = getattr(import_module(module), function)
         package: dict[str, Any] = draw(camera, model, self.pipe(), background)
         return package
 

@@ -8,7 +8,7 @@ from miniatures.skeletons import GROUPS, SETTINGS, STATES, skeleton
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.findings import Match
-from fragprune_plugins.hosts.seams import Role, Seam
+from fragprune_plugins.hosts.seams import Role, Seam, revised
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
@@ -89,6 +89,25 @@ def test_a_host_without_its_training_script_is_not_vanilla(tmp_path):
     (tmp_path / "train.py").rename(tmp_path / "train_densify.py")
     (error,) = errors(repo)
     assert (error.code, error.found) == ("other-host", "no train.py")
+
+
+class Renamed(Vanilla3DGS):
+    """A fork that says ``splat.draw`` for ``gaussian_renderer.render``."""
+
+    seams = revised(Vanilla3DGS.seams, {"render": {"module": "splat", "attribute": "draw"}})
+
+
+def test_a_renamed_renderer_is_read_where_its_seam_says(tmp_path):
+    repo = skeleton(tmp_path, functions=["draw"])
+    (tmp_path / "gaussian_renderer").rename(tmp_path / "splat")
+    adapter = Renamed()
+    assert adapter.match(repo).fits
+    assert adapter.dialect(repo).settings == tuple(SETTINGS)
+    (tmp_path / "splat/__init__.py").write_text(
+        "def draw(viewpoint_camera, pc):\n    return blobs(pc)\n"
+    )
+    (error,) = [f for f in adapter.match(HostRepo(tmp_path)).findings if f.level == "error"]
+    assert (error.code, error.where.split()[0]) == ("rasterizer-call", "splat:draw")
 
 
 def test_both_calls_of_a_late_state_are_vanillas_own(tmp_path):

@@ -131,14 +131,6 @@ def test_the_model_of_reports_is_the_one_that_was_followed_last():
     assert session.last_state is known
 
 
-def test_thresholds_are_those_that_the_plugins_answer(monkeypatch):
-    session = state()
-    asked = []
-    monkeypatch.setattr(module, "thresholds_for", lambda *words: asked.append(words) or "theirs")
-    assert session.truncate("inputs", "store") == "theirs"
-    assert asked == [("inputs", "store", session.plugins)]
-
-
 def saved(session):
     return [about["path"] for name, about in session.plugins.told if name == "fragprune_saved"]
 

@@ -156,6 +156,7 @@ class GraphdecoAdapter(ScriptAdapter):
     Attributes:
         package: import name of the rasterizer.
         calls: calls of the rasterizer that the dialect answers; each function makes one of them.
+            The functions are those of the module that the first VIEW seam names.
         dialect_type: the dialect that answers them.
         own_names: "module:name" of names that only this host's source mentions, not its ancestors'.
         scripts: paths of training scripts in the checkout, the usual one first.
@@ -168,8 +169,6 @@ class GraphdecoAdapter(ScriptAdapter):
     package = "diff_gaussian_rasterization"
     kernel: ClassVar[Kernel] = SPLAT
     """How the host's rasterizer draws; the sources of a vendored one are compared with it."""
-    renderer = RENDERER
-    """The module of the functions that call the rasterizer."""
     calls: tuple[RasterizerCall, ...] = (RasterizerCall(),)
     dialect_type: type[GraphdecoDialect] = GraphdecoDialect
     own_names: tuple[str, ...] = ()
@@ -222,34 +221,42 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def _calls(self, repo: HostRepo) -> list[Finding]:
         """An error for each call of the rasterizer that is not in ``calls``."""
-        functions = dict.fromkeys(each.function for each in self.calls)
-        there = [each for each in functions if repo.function(self.renderer, each)]  # or no seam
+        renderer, accepted = self._accepted()
+        functions = dict.fromkeys(each.function for each in accepted)
+        there = [each for each in functions if repo.function(renderer, each)]  # or no seam
         found = []
-        for name in dict.fromkeys([*there, *drawing_functions(repo, self.renderer)]):
-            expected = [str(each) for each in self.calls if each.function == name]
-            calls = read_calls(repo, self.renderer, name)
+        for name in dict.fromkeys([*there, *drawing_functions(repo, renderer)]):
+            expected = [str(each) for each in accepted if each.function == name]
+            calls = read_calls(repo, renderer, name)
             for each in calls:
                 own = each.call.package == self.package
                 call = replace(each.call, package="") if own else each.call
-                if not any(known.answers(call) for known in self.calls):
-                    found.append(
-                        (name, repo.at(self.renderer, each.line), str(call), expected, OTHER)
-                    )
+                if not any(known.answers(call) for known in accepted):
+                    found.append((name, repo.at(renderer, each.line), str(call), expected, OTHER))
             if not calls:
                 nothing = "no call of GaussianRasterizationSettings with keywords"
                 remedy = "Check that this is the folder of the training script."
-                found.append((name, repo.place(self.renderer, name), nothing, expected, remedy))
+                found.append((name, repo.place(renderer, name), nothing, expected, remedy))
         return [
             Finding(
                 "error",
                 "rasterizer-call",
-                f"{self.renderer}:{name} ({at})",
+                f"{renderer}:{name} ({at})",
                 what,
                 " or ".join(expected) or f"a rasterizer in {', '.join(functions)} alone",
                 remedy,
             )
             for name, at, what, expected, remedy in found
         ]
+
+    def _accepted(self) -> tuple[str, list[RasterizerCall]]:
+        """The module whose functions draw, and ``calls`` with the function that makes each.
+
+        The first VIEW seam names the module, and the function of calls that name none.
+        """
+        view = next(seam for seam in self.seams if seam.role is Role.VIEW)
+        calls = [replace(each, function=each.function or view.attribute) for each in self.calls]
+        return view.module, calls
 
     def other_host(self, repo: HostRepo, found: list[str]) -> list[Finding]:
         """One error with all differences from this host, if there are any."""
@@ -267,8 +274,9 @@ class GraphdecoAdapter(ScriptAdapter):
         ]
 
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
-        """The dialect for the arguments and outputs in the source of ``render``."""
-        call = next(iter(read_calls(repo, RENDERER, "render")), None)
+        """The dialect for the arguments and outputs of the first of ``calls`` in the source."""
+        renderer, accepted = self._accepted()
+        call = next(iter(read_calls(repo, renderer, accepted[0].function)), None)
         return self.dialect_type(
             package=self.package,
             settings=call.settings if call else (),

@@ -30,14 +30,14 @@ class RasterizerCall:
     Attributes:
         besides: settings in addition to the shared ones.
         outputs: number of returned values; None if the host does not unpack the tuple.
-        function: the function of ``gaussian_renderer`` that makes the call.
+        function: the function that makes the call; "" for that of the first VIEW seam.
         arguments: allowed arguments in addition to the shared ones.
         package: import name of the rasterizer; "" for the adapter's.
     """
 
     besides: frozenset[str] = frozenset()
     outputs: int | None = 2
-    function: str = "render"
+    function: str = ""
     arguments: frozenset[str] = frozenset()
     package: str = ""
 
