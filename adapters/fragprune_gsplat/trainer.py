@@ -10,7 +10,7 @@ import ast
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 
@@ -218,13 +218,3 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         path.parent.mkdir(parents=True, exist_ok=True)
         torch.save({"step": iteration - 1, "splats": model.state_dict()}, str(path))
         return path
-
-    def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """None: the script cannot resume."""
-        return []
-
-    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> NoReturn:
-        """Refuse: the script cannot resume."""
-        raise UsageError(
-            "simple_trainer", "a PLY to resume from", "a training from its start", "See --help."
-        )

@@ -153,7 +153,7 @@ class RT4DGS(GraphdecoAdapter):
         torch.save((model.capture(), iteration), path)
         return path
 
-    def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> NoReturn:
+    def captured(self, ply: Path) -> NoReturn:
         """Refuse: a PLY holds no time."""
         raise ModelFileError(
             str(ply),

@@ -559,10 +559,22 @@ class ScriptAdapter(HostAdapter):
     def model_file(self, output: Path, iteration: int) -> Path:
         """The file to which the host saves its model at an iteration."""
 
-    @abstractmethod
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """Files of an output folder to resume from: (iteration, checkpoint or PLY), newest last."""
+        """Files of an output folder to resume from: (iteration, checkpoint or PLY), newest last.
 
-    @abstractmethod
+        By default none, because the host cannot resume.
+        """
+        return []
+
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
-        """Make a checkpoint from a PLY of the host, from which the host can resume."""
+        """Make a checkpoint from a PLY of the host, from which the host can resume.
+
+        Raises:
+            UsageError: the host cannot resume from one.
+        """
+        raise UsageError(
+            str(ply),
+            f"a PLY, from which {self.info.title} cannot resume",
+            "what its script resumes from",
+            "See its --help.",
+        )

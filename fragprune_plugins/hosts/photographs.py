@@ -9,6 +9,9 @@ from typing import Any
 from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import InputError
 
+WIDEST = 1600
+"""Pixels: hosts shrink wider images to this width where no size is asked for (-r -1)."""
+
 
 @dataclass(frozen=True)
 class Resolution:

@@ -144,9 +144,14 @@ KNOWN = {
         "fragprune_gsplat.dialect",
         "fragprune_plugins",
         "fragprune_plugins.adapting",
+        "fragprune_plugins.errors",
+        "fragprune_plugins.injection",
+        "fragprune_plugins.injection.options",
         "fragprune_plugins.injection.process",
         "fragprune_plugins.injection.session",
+        "fragprune_plugins.learning.events",
         "fragprune_plugins.learning.interruption",
+        "fragprune_plugins.plugins.loading",
     },
 }
 

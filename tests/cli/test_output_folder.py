@@ -13,8 +13,8 @@ from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.ply import write_ply
-from fragprune_plugins.hosts.graphdeco.output import trained_on
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.workbench.scenes.output import trained_on
 
 
 def write_output(folder, data, model, **arguments):

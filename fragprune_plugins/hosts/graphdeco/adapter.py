@@ -22,10 +22,9 @@ from fragprune_plugins.hosts.adapter import (
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_plugins.hosts.graphdeco.densifying import clones, splits
-from fragprune_plugins.hosts.graphdeco.output import WIDEST
 from fragprune_plugins.hosts.graphdeco.reading import read_flags, read_getters
 from fragprune_plugins.hosts.kernels import SPLAT, Kernel, read_kernels
-from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import Function, HostRepo
 

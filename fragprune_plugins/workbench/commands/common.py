@@ -87,7 +87,7 @@ class ModelFile(click.Path):
         path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
         if not os.path.isdir(path):  # also of too long a name
             return path
-        from fragprune_plugins.hosts.graphdeco.output import newest_model
+        from fragprune_plugins.workbench.scenes.output import newest_model
 
         try:
             found = newest_model(path)
@@ -492,7 +492,7 @@ views_option = click.option(
 
 def cameras_of(model: Path) -> Path | None:
     """The cameras that a host wrote beside a model, if its output folder has them."""
-    from fragprune_plugins.hosts.graphdeco.output import CAMERAS, output_folder
+    from fragprune_plugins.workbench.scenes.output import CAMERAS, output_folder
 
     folder = output_folder(model)
     found = None if folder is None else folder / CAMERAS
@@ -516,8 +516,8 @@ def photographs_for(
         UsageError: there is no folder, and the model lies in no output folder with arguments.
         DatasetError: the training's arguments cannot be read.
     """
-    from fragprune_plugins.hosts.graphdeco.output import ARGUMENTS, trained_on
     from fragprune_plugins.hosts.photographs import Photographs, Resolution
+    from fragprune_plugins.workbench.scenes.output import ARGUMENTS, trained_on
 
     if data is not None:
         return Photographs(data, Resolution(resolution), white_background, images)

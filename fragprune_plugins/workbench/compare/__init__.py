@@ -158,8 +158,8 @@ def _scene(data: Path | None, known: dict[Path, Recorded], *models: Path) -> Pho
         UsageError: there is no folder, and nothing says which, or the models differ in it.
         DatasetError: a training's arguments cannot be read.
     """
-    from fragprune_plugins.hosts.graphdeco.output import trained_on
     from fragprune_plugins.hosts.photographs import Photographs
+    from fragprune_plugins.workbench.scenes.output import trained_on
 
     read = {each.photographs for each in known.values()}
     if not read and data is None:

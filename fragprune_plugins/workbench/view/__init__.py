@@ -139,7 +139,7 @@ def _cameras(data: Path | None, cameras: Path | None, white_background: bool) ->
 
 def _of_training(model: Path) -> Path | None:
     """The cameras that a host wrote beside a model; None if there are none."""
-    from fragprune_plugins.hosts.graphdeco.output import CAMERAS, output_folder
+    from fragprune_plugins.workbench.scenes.output import CAMERAS, output_folder
 
     folder = output_folder(model)
     return folder / CAMERAS if folder is not None and (folder / CAMERAS).is_file() else None

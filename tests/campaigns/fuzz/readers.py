@@ -19,7 +19,6 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
-from fragprune_plugins.hosts.graphdeco.output import trained_on
 from fragprune_plugins.hosts.preflight import missing_imports
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import resumed_at
@@ -32,6 +31,7 @@ from fragprune_plugins.workbench.prices.cost import UNITS, Cost
 from fragprune_plugins.workbench.scenes import colmap
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Photograph
+from fragprune_plugins.workbench.scenes.output import trained_on
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 

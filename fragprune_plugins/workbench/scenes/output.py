@@ -14,11 +14,8 @@ from typing import Any
 
 from fragprune_plugins.errors import DatasetError, ModelFileError, printable
 from fragprune_plugins.files.reading import MEBIBYTE, Door
-from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
 from fragprune_plugins.hosts.source import parsed
-
-WIDEST = 1600
-"""Pixels: hosts shrink wider images to this width where no size is asked for (-r -1)."""
 
 ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
 

@@ -1,0 +1,151 @@
+"""The size of the house, counted from its source. A bound is lowered whenever the figure falls."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from fragprune_plugins.hosts.adapter import Dialect, HostAdapter, ScriptAdapter
+
+ROOT = Path(__file__).parents[2]
+PRODUCT = ROOT / "fragprune_plugins"
+HOST = PRODUCT / "workbench" / "demo" / "host"  # a program of its own
+ENTRIES = ("injection.launch", "injection.api", "injection.workers", "adapting")
+LAZY = ("files.ply", "engines", "hosts.graphdeco.stand_ins")  # by name, in adapting.__getattr__
+
+# figure: (bound, goal)
+BOUNDS = {
+    "core lines": (14_460, 12_000),
+    "core imports of the workbench": (0, 0),
+    "imports inside functions": (302, 60),
+    "functions over 60 lines": (25, 10),
+    "longest function": (152, 80),
+    "members of an adapter": (24, 24),
+    "members of a dialect": (7, 7),
+    "members with one user": (5, 5),
+}
+
+
+@cache
+def sources() -> dict[str, Path]:
+    """The product's modules by name, and their files."""
+    files = (path for path in PRODUCT.rglob("*.py") if not path.is_relative_to(HOST))
+    names = {path.relative_to(ROOT).with_suffix("").parts: path for path in files}
+    return {".".join(parts).removesuffix(".__init__"): path for parts, path in names.items()}
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+def imported(module: str) -> set[str]:
+    """Modules of the product that a module imports, at its top or inside functions."""
+    nodes = list(ast.walk(tree(sources()[module])))
+    typing = {
+        inner
+        for node in nodes
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    found = set()
+    for node in nodes:
+        if node in typing:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found & sources().keys()
+
+
+def core() -> set[str]:
+    """Everything that a host run can load, adapters apart."""
+    known: set[str] = set()
+    waiting = [f"fragprune_plugins.{name}" for name in (*ENTRIES, *LAZY)]
+    while waiting:
+        module = waiting.pop()
+        if module not in known:
+            known.add(module)
+            package = module.rpartition(".")[0]  # runs before its modules
+            waiting += [*imported(module), *([package] if "." in package else [])]
+    return known
+
+
+def functions() -> list[ast.AST]:
+    nodes = (node for path in sources().values() for node in ast.walk(tree(path)))
+    return [node for node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def lengths() -> list[int]:
+    return [node.end_lineno - node.lineno + 1 for node in functions()]
+
+
+def lines_of_imports() -> int:
+    inside = {
+        node
+        for function in functions()
+        for node in ast.walk(function)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    }
+    return len(inside)
+
+
+def members(*kinds: type) -> set[str]:
+    """Methods that a subclass may define."""
+    known = (item for kind in kinds for item in vars(kind).items())
+    return {name for name, value in known if inspect.isfunction(value) and name[0] != "_"}
+
+
+def single_users() -> list[str]:
+    """Methods and attributes of adapters and dialects that the adapters of one folder define."""
+    attributes = {
+        name
+        for kind in (HostAdapter, ScriptAdapter, Dialect)
+        for name in kind.__annotations__.keys() | vars(kind).keys()
+        if not name.startswith("_")
+    }
+    users: Counter[str] = Counter()
+    for folder in sorted((ROOT / "adapters").iterdir()):
+        nodes = [node for path in folder.rglob("*.py") for node in ast.walk(tree(path))]
+        classes = [node for node in nodes if isinstance(node, ast.ClassDef) and node.bases]
+        defined: set[str] = set()
+        for statement in (each for node in classes for each in node.body):
+            if isinstance(statement, ast.FunctionDef):
+                defined.add(statement.name)
+            elif isinstance(statement, ast.Assign):
+                defined |= {name.id for name in statement.targets if isinstance(name, ast.Name)}
+        users.update(defined & attributes)
+    return sorted(name for name, count in users.items() if count == 1)
+
+
+@cache
+def figures() -> dict[str, int]:
+    loaded = core()
+    return {
+        "core lines": sum(len(sources()[m].read_text().splitlines()) for m in loaded),
+        "core imports of the workbench": len([m for m in loaded if ".workbench" in m]),
+        "imports inside functions": lines_of_imports(),
+        "functions over 60 lines": len([n for n in lengths() if n > 60]),
+        "longest function": max(lengths()),
+        "members of an adapter": len(members(HostAdapter, ScriptAdapter)),
+        "members of a dialect": len(members(Dialect)),
+        "members with one user": len(single_users()),
+    }
+
+
+@pytest.mark.parametrize("figure", BOUNDS)
+def test_the_house_grows_no_further(figure):
+    bound, _ = BOUNDS[figure]
+    assert figures()[figure] <= bound
+
+
+if __name__ == "__main__":
+    for name, (bound, goal) in BOUNDS.items():
+        print(f"{name}: {figures()[name]} (bound {bound}, goal {goal})")
+    print(f"with one user: {', '.join(single_users())}")
