@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from fragprune_plugins.engines import slice_at
     from fragprune_plugins.files.model import Model
     from fragprune_plugins.injection.api import activate, deactivate, paused
-    from fragprune_plugins.learning.ranks import joined
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.plugins.hooks import engine_for, rasterize
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.prices.calibration import prices_of
     from fragprune_plugins.workbench.prices.cost import Cost
     from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
+    from fragprune_plugins.workbench.ranks import joined
     from fragprune_plugins.workbench.scenes.cameras import load_cameras
     from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
@@ -70,7 +70,7 @@ _HOME = {
     "deactivate": "injection.api",
     "engine_for": "plugins.hooks",
     "finetune": "workbench.finetune.loop",
-    "joined": "learning.ranks",
+    "joined": "workbench.ranks",
     "keep_best": "workbench.pruning.scores",
     "keep_needed": "workbench.pruning.scores",
     "load": "workbench.models.model",

@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 
 from fragprune_plugins.errors import RanksError
-from fragprune_plugins.learning.ranks import launched
 
 _LAUNCHERS = {"torchrun", "torch.distributed.run", "torch.distributed.launch", "accelerate"}
 
@@ -23,7 +22,8 @@ def expect_one() -> None:
     """
     import torch
 
-    ranks, found = launched().size, f"WORLD_SIZE={os.environ.get('WORLD_SIZE')} in the environment"
+    said = os.environ.get("WORLD_SIZE", "")
+    ranks, found = int(said) if said.isdigit() else 1, f"WORLD_SIZE={said} in the environment"
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         ranks = torch.distributed.get_world_size()
         found = f"torch.distributed with {ranks} processes"

@@ -19,8 +19,8 @@ import torch
 from cli.commands import run as run_command
 
 from fragprune_plugins.errors import FragpruneError
-from fragprune_plugins.learning.ranks import joined
 from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.ranks import joined
 
 LONGEST = 60  # seconds that a child may live
 

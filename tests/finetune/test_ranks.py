@@ -16,12 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning import ranks as module
-from fragprune_plugins.learning.ranks import Ranks, fingerprint, launched, speaks
 from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.workbench import ranks as module
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.loop import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+from fragprune_plugins.workbench.ranks import Ranks, fingerprint, launched, speaks
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 STEPS = 12
@@ -225,7 +225,7 @@ def test_a_launcher_is_known_by_the_environment(monkeypatch, size, rank, expecte
 
 LAST_THREADS = """
 import os, sys, torch
-from fragprune_plugins.learning.ranks import joined
+from fragprune_plugins.workbench.ranks import joined
 with joined(torch.device("cpu")) as ranks:
     tensor = torch.ones(3, requires_grad=True)
     tensor.sum().backward()

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import DivergedError, InputError, UsageError
-from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, Splats
@@ -23,6 +22,7 @@ from fragprune_plugins.workbench.finetune.loop import finetune
 from fragprune_plugins.workbench.finetune.processes import Shards, part_of, whole_of
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.sharded import ShardedEngine, reaching
+from fragprune_plugins.workbench.ranks import Ranks
 
 STEPS = 12
 ATTRIBUTES = ("means", "opacities", "scales", "rotations", "sh")

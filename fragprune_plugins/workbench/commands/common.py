@@ -30,7 +30,7 @@ from fragprune_plugins.errors import (
 )
 from fragprune_plugins.files.records import strict
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
-from fragprune_plugins.learning.ranks import launched, local_rank, speaks
+from fragprune_plugins.workbench.ranks import launched, local_rank, speaks
 
 if TYPE_CHECKING:
     import torch

@@ -11,7 +11,6 @@ import click
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.learning.interruption import sigterm_interrupts
-from fragprune_plugins.learning.ranks import Ranks, joined, launched
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.common import (
     DATA_HELP,
@@ -36,6 +35,7 @@ from fragprune_plugins.workbench.commands.common import (
 from fragprune_plugins.workbench.commands.learning import learning_options, resuming_options
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 
 if TYPE_CHECKING:
     from fragprune_plugins.engines import Engine

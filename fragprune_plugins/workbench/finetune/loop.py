@@ -23,7 +23,6 @@ from fragprune_plugins.learning.adam import make_adam
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.interruption import Terminate, Waiting, between_steps
-from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import FrameClock, Progress, Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -38,6 +37,7 @@ from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configura
 from fragprune_plugins.workbench.finetune.timing import require_reach, times_faster
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.prices.cost import Cost, work_of
+from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions

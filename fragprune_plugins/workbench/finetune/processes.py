@@ -17,10 +17,10 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.ranks import Ranks, fingerprint
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
+from fragprune_plugins.workbench.ranks import Ranks, fingerprint
 
 
 class Replicas:

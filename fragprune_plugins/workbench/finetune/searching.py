@@ -19,12 +19,12 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.pressure import FEWEST
-from fragprune_plugins.learning.ranks import Ranks
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
+from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 TOLERANCE = 0.02

@@ -29,8 +29,8 @@ from fragprune_plugins.errors import InputError, RanksError
 from fragprune_plugins.types import Moment, RasterInputs, SpacetimeSplats, Splats, View
 
 if TYPE_CHECKING:
-    from fragprune_plugins.learning.ranks import Ranks
     from fragprune_plugins.types import RasterOutputs
+    from fragprune_plugins.workbench.ranks import Ranks
 
 _SENT = ("means", "opacities", "scales", "rotations", "cov3d")
 """Attributes that are sent as they are; colours and thresholds go with them."""

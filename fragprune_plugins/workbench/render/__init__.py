@@ -8,7 +8,6 @@ from pathlib import Path
 import click
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.ranks import Ranks, joined
 from fragprune_plugins.workbench.commands.common import (
     CAMERAS_HELP,
     FILE,
@@ -29,6 +28,7 @@ from fragprune_plugins.workbench.commands.common import (
     views_option,
 )
 from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.ranks import Ranks, joined
 
 
 def _direction(
