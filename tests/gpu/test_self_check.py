@@ -12,7 +12,7 @@ import torch
 
 from fragprune_plugins import engines
 from fragprune_plugins.engines import reference
-from fragprune_plugins.engines.cuda import driver, kernels, self_check
+from fragprune_plugins.engines.cuda import comparison, driver, kernels, self_check
 from fragprune_plugins.engines.cuda.self_check import Verdict, check_in_subprocess, why_not
 from fragprune_plugins.errors import EngineError, KernelError
 from fragprune_plugins.testing import scenes
@@ -157,9 +157,9 @@ def test_what_went_wrong_is_told_from_what_could_not_be_tried(
             raise found
         return found
 
-    monkeypatch.setattr(self_check, "compare", compare)
+    monkeypatch.setattr(comparison, "compare", compare)
     monkeypatch.setattr(driver, "Driver", object)
-    assert self_check.main("cpu") == status
+    assert comparison.main("cpu") == status
     printed = capsys.readouterr()
     assert printed.out == "begun\n"
     assert said in printed.err
@@ -171,7 +171,7 @@ def test_a_gpu_that_is_another_process_s_could_not_be_tried(monkeypatch, capsys)
         raise RuntimeError("CUDA error: CUDA-capable device(s) is/are busy or unavailable\nMore")
 
     monkeypatch.setattr(torch, "zeros", busy)
-    assert self_check.main("cpu") == 4
+    assert comparison.main("cpu") == 4
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.strip().endswith("busy or unavailable")

@@ -2,10 +2,13 @@
 
 Large frames are compared with the cpu engine's, small frames and slices with the oracle's, and
 sorted keys with torch's. Repeated frames must be the same and must not accumulate memory.
+
+As a program it is the process that ``self_check`` starts.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -15,6 +18,7 @@ import torch
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.arrays import address
 from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cuda import driver
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.cuda.frame import (
     DIGITS,
@@ -25,7 +29,9 @@ from fragprune_plugins.engines.cuda.frame import (
     Sort,
     launch_sort,
 )
+from fragprune_plugins.engines.cuda.self_check import BEGUN, COULD_NOT_RUN, FAILS
 from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.errors import KernelError
 from fragprune_plugins.types import Moment, RasterInputs, SpacetimeSplats, Splats, View
 
 if TYPE_CHECKING:
@@ -298,3 +304,24 @@ def _sliced(engine: Any, where: torch.device, dtype: torch.dtype) -> dict[str, T
     torch.autograd.backward([each.sum() for each in named.values()])
     named |= {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
     return {name: each.detach().cpu().double() for name, each in named.items()}
+
+
+def main(device: str) -> int:
+    """The check's own process."""
+    where, begun = torch.device(device), False
+    try:
+        torch.zeros(1, device=where)
+        gpu = driver.Driver()
+        begun = True
+        print(BEGUN, flush=True)
+        found = compare(gpu, where)
+    except Exception as why:
+        short = isinstance(why, (KernelError, MemoryError, torch.cuda.OutOfMemoryError))
+        print(f"{type(why).__name__}: {why}".splitlines()[0], file=sys.stderr)
+        return FAILS if begun and not short else COULD_NOT_RUN
+    print("; ".join(found), file=sys.stderr)
+    return FAILS if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

@@ -21,18 +21,17 @@ from typing import Final, Literal
 import torch
 
 from fragprune_plugins.engines.cuda import driver, kernels
-from fragprune_plugins.engines.cuda.comparison import compare
-from fragprune_plugins.errors import KernelError
 
 log = logging.getLogger("fragprune")
 
 PATIENCE: Final = 300
 """Seconds that a check may take; mostly for compiling, once."""
 
-_BEGUN: Final = "begun"
+BEGUN: Final = "begun"
 """Said once there is a context and memory: what goes wrong later is the kernels' doing."""
 
-_FAILS, _COULD_NOT_RUN = 3, 4  # exit codes
+FAILS, COULD_NOT_RUN = 3, 4
+"""Exit codes of the check's process, ``engines.cuda.comparison``."""
 
 
 @dataclass(frozen=True)
@@ -91,18 +90,18 @@ def check_in_subprocess(device: torch.device | str) -> Verdict:
 
 
 def _run(device: torch.device | str) -> Verdict:
-    command = [sys.executable, "-m", "fragprune_plugins.engines.cuda.self_check", str(device)]
+    command = [sys.executable, "-m", "fragprune_plugins.engines.cuda.comparison", str(device)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     except subprocess.TimeoutExpired as late:
-        begun = _BEGUN in str(late.stdout)
+        begun = BEGUN in str(late.stdout)
         return Verdict("fails" if begun else "could not run", f"no end within {PATIENCE} s")
     if done.returncode == 0:
         return Verdict("agrees")
-    if done.returncode in (_FAILS, _COULD_NOT_RUN):
-        begun, reason = done.returncode == _FAILS, done.stderr.strip().splitlines()[-1]
+    if done.returncode in (FAILS, COULD_NOT_RUN):
+        begun, reason = done.returncode == FAILS, done.stderr.strip().splitlines()[-1]
     else:
-        begun, reason = _BEGUN in done.stdout, f"it ended with exit code {done.returncode}"
+        begun, reason = BEGUN in done.stdout, f"it ended with exit code {done.returncode}"
     return Verdict("fails" if begun else "could not run", reason)
 
 
@@ -128,24 +127,3 @@ def _circumstances(device: str) -> str:
     )
     digest = hashlib.sha256(kernels.digest_of_sources() + repr(what).encode())
     return digest.hexdigest()[:24]
-
-
-def main(device: str) -> int:
-    """The check's own process."""
-    where, begun = torch.device(device), False
-    try:
-        torch.zeros(1, device=where)
-        gpu = driver.Driver()
-        begun = True
-        print(_BEGUN, flush=True)
-        found = compare(gpu, where)
-    except Exception as why:
-        short = isinstance(why, (KernelError, MemoryError, torch.cuda.OutOfMemoryError))
-        print(f"{type(why).__name__}: {why}".splitlines()[0], file=sys.stderr)
-        return _FAILS if begun and not short else _COULD_NOT_RUN
-    print("; ".join(found), file=sys.stderr)
-    return _FAILS if found else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
