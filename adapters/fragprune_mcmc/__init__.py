@@ -7,12 +7,14 @@ adds noise to the positions, scaled by the rate that ``update_learning_rate`` re
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapting import (
+    AlignmentError,
     CommandLine,
     ConfigFile,
     GraphdecoAdapter,
@@ -24,6 +26,7 @@ from fragprune_plugins.adapting import (
     RasterizerCall,
     RasterOutputs,
     Role,
+    RowTrace,
     Seam,
     SeamCall,
     hookimpl,
@@ -63,6 +66,49 @@ def no_noise(call: SeamCall) -> float:
     return 0.0
 
 
+@contextmanager
+def following_copies(call: SeamCall) -> Iterator[RowTrace]:
+    """Note the parents that the host draws, whose copies overwrite dead rows or are appended.
+
+    The host hands them to ``_update_params``, which makes the copies. It drops the moments of both.
+
+    Raises:
+        AlignmentError: the new rows are not copies of the parents.
+    """
+    import torch
+
+    model, trace, drawn = call.model, RowTrace(), []
+    before, update = len(model.get_xyz), model._update_params
+
+    def noting(idxs: Tensor, *args: Any, **kwargs: Any) -> Any:
+        drawn.append(idxs.detach().clone())
+        return update(idxs, *args, **kwargs)
+
+    model._update_params = noting
+    try:
+        yield trace
+    finally:
+        del model._update_params
+    if not drawn:  # nothing to overwrite or to append
+        return
+    parents, dead = drawn[-1], call.arguments.get("dead_mask")
+    origins = torch.arange(len(model.get_xyz), device=parents.device)
+    rows = origins[before:] if dead is None else dead.nonzero()[:, 0]
+    colours, turns = model._features_dc.detach(), model._rotation.detach()
+    if len(rows) != len(parents) or not all(
+        torch.equal(each[rows], each[parents]) for each in (colours, turns)
+    ):
+        raise AlignmentError(
+            str(call.seam),
+            f"{len(rows)} new rows that are not copies of the {len(parents)} sampled",
+            "one copy per sampled row, in the host's order",
+            "Report this with the host's commit: its relocation differs.",
+        )
+    origins[rows] = parents
+    trace.origins, trace.fresh = origins, torch.zeros_like(origins, dtype=torch.bool)
+    trace.fresh[rows] = trace.fresh[parents] = True
+
+
 class MCMC(GraphdecoAdapter):
     """The adapter of 3DGS-MCMC."""
 
@@ -81,10 +127,10 @@ class MCMC(GraphdecoAdapter):
     dialect_type = MCMCDialect
     seams = (
         *revised(GraphdecoAdapter.seams, {"GaussianModel.update_learning_rate": {"how": no_noise}}),
-        Seam(Role.CHOICE, MODEL, "GaussianModel._update_params", ("idxs", "ratio")),
-        Seam(Role.COPY, MODEL, "GaussianModel.relocate_gs", ("dead_mask",)),
-        Seam(Role.FORGET, MODEL, "GaussianModel.replace_tensors_to_optimizer", ("inds",)),
-        Seam(Role.STILL, MODEL, "GaussianModel.add_new_gs", ("cap_max",)),
+        Seam(
+            Role.REARRANGE, MODEL, "GaussianModel.relocate_gs", ("dead_mask",), how=following_copies
+        ),
+        Seam(Role.REARRANGE, MODEL, "GaussianModel.add_new_gs", ("cap_max",), how=following_copies),
     )
 
     def command_line(self, repo: HostRepo) -> CommandLine:

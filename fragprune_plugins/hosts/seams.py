@@ -54,14 +54,11 @@ class Role(Enum):
     )
     KEEP = "keep the surviving rows"
     APPEND = "append rows"
-    CHOICE = "note the rows that the host drew as parents of the rows it appends or overwrites next"
-    COPY = "overwrite rows with copies of others; does nothing in stage 2"
     REARRANGE = (
         "keep, copy and append rows in one call; does nothing in stage 2",
         "around: a context manager that makes the host's own code carry row numbers; it "
         "yields a ``RowTrace``, which is complete at exit",
     )
-    FORGET = "drop the moments of rows"
     STILL = (
         "do nothing in stage 2: for functions that would change frozen parameters or rows",
         "instead: the return value of the skipped call (None)",

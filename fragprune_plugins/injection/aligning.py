@@ -83,59 +83,6 @@ def are_copies(
     return all(torch.equal(tensors[name], known[name][parents]) for name in copied)
 
 
-def on_choice(session: SessionState, call: SeamCall) -> Any:
-    """Keep the rows that the host sampled as parents."""
-    result = call.run()
-    state = session.models.get(call.model)
-    if state is not None:
-        chosen = call.first
-        state.pending_parents = chosen.detach().clone()
-    return result
-
-
-def on_copy(session: SessionState, call: SeamCall) -> Any:
-    """Copy thresholds to rows that the host overwrites with others. In stage 2 nothing runs.
-
-    Raises:
-        AlignmentError: the overwritten rows are not copies of the sampled rows.
-    """
-    if session.standing_still(call.model):
-        return None
-    state = session.models.get(call.model)
-    if state is None:
-        return call.run()
-    mask = call.first
-    target = mask.nonzero()[:, 0]
-    state.pending_parents = None
-    try:
-        result = call.run()
-    finally:
-        source, state.pending_parents = state.pending_parents, None
-    if source is None:  # nothing to overwrite, or nothing to copy
-        return result
-    groups = [(name, group) for name, group in session.groups(call.model) if name]
-    rows = {name: group["params"][0].detach()[target] for name, group in groups}
-    if len(source) != len(target) or not are_copies(session, call.model, rows, source):
-        raise AlignmentError(
-            str(call.seam),
-            f"{len(target)} overwritten rows that are not copies of the {len(source)} sampled",
-            "one copy per overwritten row, in the host's order",
-            "Report this with the host's commit: its relocation differs.",
-        )
-    state.store.copy(source, target)
-    session.changed(state.store, "copy", len(state.store))
-    return result
-
-
-def on_forget(session: SessionState, call: SeamCall) -> Any:
-    """Zero the store's moments of rows whose moments the host zeroed."""
-    result = call.run()
-    state = session.models.get(call.model)
-    if state is not None:
-        state.store.forget(call.first)
-    return result
-
-
 def on_keep(session: SessionState, call: SeamCall) -> Any:
     """Remove the thresholds of rows that the host removed."""
     result = call.run()
@@ -181,9 +128,6 @@ OF_MODELS: dict[Role, Callable[..., Any]] = {
     Role.PARENTS: on_parents,
     Role.KEEP: on_keep,
     Role.APPEND: on_append,
-    Role.CHOICE: on_choice,
-    Role.COPY: on_copy,
     Role.REARRANGE: on_rearrange,
-    Role.FORGET: on_forget,
     Role.STILL: on_still,
 }

@@ -117,85 +117,6 @@ def test_a_model_that_is_not_followed_is_the_hosts_own_business(session, role):
     assert session.plugins.told == []
 
 
-def test_chosen_rows_are_kept_as_they_were(session):
-    model, known = follow(session)
-    rows = torch.tensor([3, 3])
-    result = OF_MODELS[Role.CHOICE](session, call(model, Role.CHOICE, lambda rows: "drawn", rows))
-    assert result == "drawn"
-    rows += 1
-    assert known.pending_parents.tolist() == [3, 3]
-
-
-def relocate(session, model, mask, chosen, becomes=None):
-    """The host draws rows and overwrites those of a mask with what ``becomes`` says."""
-
-    def host(mask):
-        if chosen is not None:
-            OF_MODELS[Role.CHOICE](session, call(model, Role.CHOICE, lambda rows: None, chosen))
-            with torch.no_grad():
-                for parameter in (model.xyz, model.opacity):
-                    parameter[mask] = parameter[chosen if becomes is None else becomes]
-        return "moved"
-
-    return OF_MODELS[Role.COPY](session, call(model, Role.COPY, host, mask))
-
-
-def test_overwritten_rows_take_the_thresholds_of_what_they_became(session):
-    model, known = follow(session)
-    mask = torch.tensor([False, True, False, False, True, False])
-    assert relocate(session, model, mask, torch.tensor([5, 0])) == "moved"
-    assert torch.equal(known.store.logits, LOGITS[torch.tensor([0, 5, 2, 3, 0, 5])])
-    assert told(session) == [("copy", 6, 6)]
-    assert known.pending_parents is None
-
-
-def test_where_nothing_was_drawn_nothing_is_copied(session):
-    model, known = follow(session)
-    known.pending_parents = torch.tensor([1])  # of an earlier choice, which is not this call's
-    assert relocate(session, model, torch.ones(6, dtype=torch.bool), None) == "moved"
-    assert torch.equal(known.store.logits, LOGITS)
-    assert (known.pending_parents, told(session)) == (None, [])
-
-
-def test_a_group_without_a_name_takes_no_part_in_a_copy(session):
-    model, known = follow(session)
-    model.optimizer.add_param_group({"params": [torch.zeros(1)], "name": ""})
-    mask = torch.tensor([False, True, False, False, False, False])
-    relocate(session, model, mask, torch.tensor([5]))
-    assert float(known.store.logits[1].detach()) == LOGITS[5]
-
-
-@pytest.mark.parametrize(("chosen", "becomes"), [([5, 0], [4, 0]), ([5], [5])])
-def test_a_relocation_that_copied_other_rows_is_refused(session, chosen, becomes):
-    model, known = follow(session)
-    mask = torch.tensor([False, True, False, False, True, False])
-    said = f"2 overwritten rows that are not copies of the {len(chosen)} sampled"
-    with pytest.raises(AlignmentError, match=said) as caught:
-        relocate(session, model, mask, torch.tensor(chosen), torch.tensor(becomes))
-    assert caught.value.where == "host:f"
-    assert torch.equal(known.store.logits, LOGITS)
-
-
-def test_a_host_that_fails_while_it_relocates_leaves_no_parents_behind(session):
-    model, known = follow(session)
-
-    def host(mask):
-        OF_MODELS[Role.CHOICE](session, call(model, Role.CHOICE, lambda rows: None, mask))
-        raise KeyError("in the host")
-
-    with pytest.raises(KeyError, match="in the host"):
-        OF_MODELS[Role.COPY](session, call(model, Role.COPY, host, torch.tensor([1])))
-    assert known.pending_parents is None
-
-
-def test_moments_are_forgotten_where_the_host_forgets_its_own(session):
-    model, known = follow(session)
-    seam = call(model, Role.FORGET, lambda inds: "forgot", torch.tensor([0, 3]))
-    assert OF_MODELS[Role.FORGET](session, seam) == "forgot"
-    assert known.store.numbers["their moments"].tolist() == [0, 2, 3, 0, 5, 6]
-    assert torch.equal(known.store.logits, LOGITS)
-
-
 def test_thresholds_of_removed_rows_go_with_them(session):
     model, known = follow(session)
     mask = torch.tensor([True, False, True, True, False, False])
@@ -255,7 +176,7 @@ def test_an_operation_whose_rows_nobody_traced_is_refused(session):
     assert caught.value.where == "host:f"
 
 
-@pytest.mark.parametrize("role", [Role.COPY, Role.REARRANGE, Role.STILL])
+@pytest.mark.parametrize("role", [Role.REARRANGE, Role.STILL])
 def test_a_frozen_model_stands_still(frozen, role):
     model, known = follow(frozen)
     ran = []
