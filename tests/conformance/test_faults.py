@@ -50,7 +50,7 @@ class Growing(MCMC):
 class Unchosen(MCMC):
     """Does not know which rows a relocation copies."""
 
-    seams = but(MCMC, "GaussianModel._update_params")
+    seams = but(MCMC, "GaussianModel.relocate_gs")
 
 
 class Pruning(LightGaussian):
