@@ -93,7 +93,7 @@ def following_copies(call: SeamCall) -> Iterator[RowTrace]:
         return
     parents, dead = drawn[-1], call.arguments.get("dead_mask")
     origins = torch.arange(len(model.get_xyz), device=parents.device)
-    rows = origins[before:] if dead is None else dead.nonzero()[:, 0]
+    rows = origins[before:].clone() if dead is None else dead.nonzero()[:, 0]
     colours, turns = model._features_dc.detach(), model._rotation.detach()
     if len(rows) != len(parents) or not all(
         torch.equal(each[rows], each[parents]) for each in (colours, turns)
