@@ -22,15 +22,15 @@ def runs_here(dialect: Dialect, package: str) -> bool:
     from torch.cuda import is_available
     from torch.utils import cpp_extension
 
-    try:
-        found = find_spec(package) is not None
-    except ValueError:  # a module without a spec is another tool's stand-in
-        found = True
     names = dialect.names()
     own = package not in names and any(name.startswith(f"{package}.") for name in names)
-    needs = dialect.own_kernels if own else ""
-    compiler = needs != "compiler" or cpp_extension.CUDA_HOME is not None
-    return found and compiler and (not needs or is_available())
+    if own and dialect.own_kernels:  # the host's folder need not be on the path yet
+        compiler = dialect.own_kernels != "compiler" or cpp_extension.CUDA_HOME is not None
+        return compiler and is_available()
+    try:
+        return find_spec(package) is not None
+    except ValueError:  # a module without a spec is another tool's stand-in
+        return True
 
 
 class StandIns:

@@ -7,8 +7,10 @@ from typing import Any
 
 import torch
 
+from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
 from fragprune_plugins.hosts.findings import Match
 from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
+from fragprune_plugins.hosts.graphdeco.adapter import completed
 from fragprune_plugins.hosts.seams import Role, revised
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -48,10 +50,19 @@ class MixesUpParents(Vanilla3DGS):
     groups = tuple(replace(group, copied=False) for group in Vanilla3DGS.groups)
 
 
-class LosesTheCheckpoint(Vanilla3DGS):
-    """Puts no thresholds into the host's checkpoint."""
+def without_thresholds(call: Any) -> Any:
+    def rest(part: Any) -> Any:
+        if not isinstance(part, dict):
+            return part
+        return {key: value for key, value in part.items() if key != CHECKPOINT_KEY}
 
-    seams = revised(Vanilla3DGS.seams, {"GaussianModel.capture": None})
+    return tuple(map(rest, completed(call)))
+
+
+class LosesTheCheckpoint(Vanilla3DGS):
+    """Takes thresholds out of the host's checkpoint, and drops them."""
+
+    seams = revised(Vanilla3DGS.seams, {"GaussianModel.restore": {"how": without_thresholds}})
 
 
 class TrainsTooMuch(Vanilla3DGS):
