@@ -168,6 +168,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
             thresholds = thresholds_for(inputs, state.store, session.plugins)
         else:
             thresholds = stage.thresholds(inputs)
+        if thresholds is not None or inputs.stop is not None or presses:
             if thresholds is not None and rows is not None:
                 thresholds = thresholds[rows]
             truncated = partial(rasterize, engine, state, rendering[1], thresholds)
