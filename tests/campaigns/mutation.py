@@ -48,7 +48,7 @@ def main() -> int:
         known = {} if words.again else _outcomes(words.modules)
         if todo := [name for name in wanted if known.get(name) in (None, "survived")]:
             _mutmut(words.processes, todo)
-    return _table(_outcomes(words.modules), words.wanted)
+    return table(_outcomes(words.modules), words.wanted)
 
 
 def _mutmut(processes: int, names: list[str]) -> None:
@@ -92,7 +92,7 @@ def _outcomes(modules: list[str]) -> dict[str, str | None]:
     }
 
 
-def _table(outcomes: dict[str, str | None], wanted: float) -> int:
+def table(outcomes: dict[str, str | None], wanted: float) -> int:
     """Print outcomes by module, with a 95 % interval of the share; returns the exit code."""
     kinds = ("killed", "out of time", "survived", "not reached", "odd")
     print("| module | mutants | run | " + " | ".join(kinds) + " | share, 95 % |")
@@ -109,18 +109,18 @@ def _table(outcomes: dict[str, str | None], wanted: float) -> int:
         killed = sum(counts[kind] for kind in ENDED)
         low |= killed < wanted * ran
         figures = " | ".join(str(counts[kind]) for kind in kinds)
-        print(f"| {module} | {counts.total()} | {ran} | {figures} | {_share(killed, ran)} |")
+        print(f"| {module} | {counts.total()} | {ran} | {figures} | {share(killed, ran)} |")
     return int(low)
 
 
-def _share(killed: int, ran: int) -> str:
+def share(killed: int, ran: int) -> str:
     """A share with Wilson's interval."""
     if not ran:
         return ""
-    share, z = killed / ran, 1.96
-    middle = (share + z * z / (2 * ran)) / (1 + z * z / ran)
-    half = z * math.sqrt(share * (1 - share) / ran + (z / (2 * ran)) ** 2) / (1 + z * z / ran)
-    return f"{share:.0%} ({middle - half:.0%} to {min(1, middle + half):.0%})"
+    part, z = killed / ran, 1.96
+    middle = (part + z * z / (2 * ran)) / (1 + z * z / ran)
+    half = z * math.sqrt(part * (1 - part) / ran + (z / (2 * ran)) ** 2) / (1 + z * z / ran)
+    return f"{part:.0%} ({middle - half:.0%} to {min(1, middle + half):.0%})"
 
 
 if __name__ == "__main__":
