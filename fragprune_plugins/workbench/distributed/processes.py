@@ -20,7 +20,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.ranks import Ranks, fingerprint
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
+from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
 
 
 class Replicas:
