@@ -110,6 +110,36 @@ prints one object on stdout, and progress on stderr. [Errors](errors.md) lists t
     return _page("Command line", intro, *_commands(cli, context))
 
 
+def support() -> str:
+    """What the installed adapters serve."""
+    from fragprune_plugins.engines import ENGINES
+    from fragprune_plugins.plugins.loading import load_plugins
+    from fragprune_plugins.workbench.adapters.work import scripts as training_scripts
+
+    adapters = load_plugins().adapters
+    head = ["host", "adapter", "states", "scripts that train"]
+    rows = [head, ["---"] * len(head)]
+    limits = []
+    for adapter in adapters:
+        info = adapter.info
+        host = f"[{info.title}](https://github.com/{info.repo})"
+        scripts = ", ".join(f"`{script}`" for script in training_scripts(adapter)) or "your own"
+        rows.append([host, f"`{adapter.name}`", info.states, scripts])
+        limits += [f"* `{adapter.name}`: {limit}" for limit in info.limits]
+    table = "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
+    installed = " and ".join(f"`{a.name}`" for a in adapters if a.installed and not a.info.usage)
+    methods = " and ".join(f"`{a.name}`" for a in adapters if a.info.usage)
+    intro = f"""Scripts that do not train (render, evaluate) also run under `fragprune run`, with
+the thresholds beside their models. Every adapter draws with every engine: {
+        ", ".join(f"`{name}`" for name in ENGINES)
+    }. `fragprune check DIR` says which adapter fits a checkout, and why others do not. Our adapters
+pass the [conformance kit](conformance.md): {installed} on the installed packages, the others on
+miniatures of their hosts. {methods} is a method of its host, with
+[tests of its own](../how-to/nerfstudio.md#test-it)."""
+    refused = "\n".join(["## What does not work or is refused", "", *limits])
+    return _page("What is supported", intro, table, refused)
+
+
 def errors() -> str:
     """Every stated failure."""
     from fragprune_plugins import errors
@@ -132,6 +162,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "python.md": python,
     "command-line.md": command_line,
     "errors.md": errors,
+    "support.md": support,
 }
 
 

@@ -33,12 +33,11 @@ if TYPE_CHECKING:
         Splats,
         View,
     )
+    from fragprune_plugins.workbench.distributed.processes import part_of, whole_of
+    from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
     from fragprune_plugins.workbench.figures.evaluate import measure
     from fragprune_plugins.workbench.figures.viewing import overview, render_view
-    from fragprune_plugins.workbench.finetune.itself import own_pictures
     from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
-    from fragprune_plugins.workbench.finetune.processes import part_of, whole_of
-    from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
     from fragprune_plugins.workbench.models.model import load, save
     from fragprune_plugins.workbench.prices.calibration import prices_of
     from fragprune_plugins.workbench.prices.cost import Cost
@@ -46,6 +45,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.ranks import joined
     from fragprune_plugins.workbench.scenes.cameras import load_cameras
     from fragprune_plugins.workbench.scenes.dataset import load_dataset
+    from fragprune_plugins.workbench.scenes.itself import own_pictures
 
 __version__ = VERSION
 
@@ -59,7 +59,7 @@ _HOME = {
     "RasterOutputs": "types",
     "Schedule": "learning.schedule",
     "Settings": "learning.schedule",
-    "ShardedEngine": "workbench.finetune.sharded",
+    "ShardedEngine": "workbench.distributed.sharded",
     "Sliced": "types",
     "SpacetimeSplats": "types",
     "Splats": "types",
@@ -78,15 +78,15 @@ _HOME = {
     "load_dataset": "workbench.scenes.dataset",
     "measure": "workbench.figures.evaluate",
     "overview": "workbench.figures.viewing",
-    "own_pictures": "workbench.finetune.itself",
-    "part_of": "workbench.finetune.processes",
+    "own_pictures": "workbench.scenes.itself",
+    "part_of": "workbench.distributed.processes",
     "prices_of": "workbench.prices.calibration",
     "paused": "injection.api",
     "rasterize": "plugins.hooks",
     "render_view": "workbench.figures.viewing",
     "save": "workbench.models.model",
     "slice_at": "engines",
-    "whole_of": "workbench.finetune.processes",
+    "whole_of": "workbench.distributed.processes",
 }
 
 __all__ = [

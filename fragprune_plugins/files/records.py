@@ -82,7 +82,7 @@ def find(folder: Path) -> list[Record]:
     if not found:
         raise RecordError(
             str(folder),
-            f"no file *{SUFFIX} in it or below",
+            f"no file *{SUFFIX} in it or below" if folder.is_dir() else "no such folder",
             "an output folder of fragprune run, finetune, or of compare and profile with --out",
             "Run one of these first.",
         )

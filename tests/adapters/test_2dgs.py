@@ -22,8 +22,9 @@ from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.run import _measure, _photographs
+from fragprune_plugins.workbench.run.work import measure_models, photographs_of
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 COUNT = 16
@@ -163,13 +164,13 @@ def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained,
     pixels = (image.clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
     away = np.abs(pixels.astype(int) - np.asarray(Image.open(theirs)))
     assert away.max() <= 1  # a camera's float32, rounded
-    before, after = _measure(_photographs(summary))
+    before, after = measure_models(photographs_of(summary), EngineOptions())
     assert after["fragments_per_pixel"] < before["fragments_per_pixel"]
 
 
 def test_compare_draws_its_models_by_their_record(trained):
     summary, _, _ = trained
-    records.leave(summary.model_after, "run", {"photographs": _photographs(summary)})
+    records.leave(summary.model_after, "run", {"photographs": photographs_of(summary)})
     found = run_json("compare", summary.model_before, summary.model_after)
     assert found["b"]["fragments_per_pixel"] < found["a"]["fragments_per_pixel"]
 

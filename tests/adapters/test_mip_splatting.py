@@ -21,8 +21,9 @@ from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.run import _measure, _photographs
+from fragprune_plugins.workbench.run.work import measure_models, photographs_of
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 COUNT = 16
@@ -193,7 +194,7 @@ def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained,
     theirs = np.asarray(Image.open(folder / "00000.png"))
     assert np.abs(pixels.astype(int) - theirs).max() <= 1  # a camera's float32, rounded
     assert (pixels != theirs).mean() < 0.05
-    before, after = _measure(_photographs(summary))
+    before, after = measure_models(photographs_of(summary), EngineOptions())
     assert after["fragments_per_pixel"] < before["fragments_per_pixel"]
 
 

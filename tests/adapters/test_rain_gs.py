@@ -22,7 +22,8 @@ from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.injection.stand_ins import runs_here
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.workbench.run import _measure, _photographs
+from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.run.work import measure_models, photographs_of
 from fragprune_rain_gs import PACKAGE, RainGS
 
 COUNT = 16
@@ -151,7 +152,9 @@ def test_every_mode_is_fine_tuned_and_moves_opacities_and_thresholds_alone(
     assert len(store) == info.rows == summary.gaussians
     assert summary.fragments_after < summary.fragments_before
     assert summary.drawing == {}
-    assert _measure(_photographs(summary))  # though no --eval is in the command
+    assert measure_models(
+        photographs_of(summary), EngineOptions()
+    )  # though no --eval is in the command
     assert {PACKAGE, "wandb"} & set(sys.modules) == set()
 
 

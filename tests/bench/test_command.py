@@ -10,9 +10,14 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 from fragprune_plugins.files.ply import write_ply
-from fragprune_plugins.workbench.bench import TRUNCATION
+from fragprune_plugins.workbench.bench import work
 
-SMALL = ("--size", "40x30", "--gaussians", 200, "--repeats", 2)
+SMALL = ("--size", "40x30", "--gaussians", 200)
+
+
+@pytest.fixture(autouse=True)
+def two_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "REPEATS", 2)
 
 
 def test_json_shape() -> None:
@@ -38,14 +43,14 @@ def test_json_shape() -> None:
     }
 
 
-def test_every_size_and_count_forward_only() -> None:
+def test_every_size_and_count() -> None:
     sizes = ("--size", "24x16", "--size", "33x17")
     counts = ("--gaussians", 50, "--gaussians", 120)
-    found = run_json("bench", *sizes, *counts, "--repeats", 2, "--forward-only")
-    assert len(found["results"]) == 2 * 2 * 2
-    assert {row["pass"] for row in found["results"]} == {"forward"}
+    found = run_json("bench", *sizes, *counts)
+    assert len(found["results"]) == 2 * 2 * 2 * 2
     assert len(found["translation"]) == 4
-    plain = [row for row in found["results"] if not row["truncated"]]
+    forward = [row for row in found["results"] if row["pass"] == "forward"]
+    plain = [row for row in forward if not row["truncated"]]
     prices = [
         1e6 * row["ms_median"] / (row["fragments_per_pixel"] * row["width"] * row["height"])
         for row in plain
@@ -55,7 +60,7 @@ def test_every_size_and_count_forward_only() -> None:
 
 
 def test_the_text_says_what_was_saved_and_how_busy_the_machine_was() -> None:
-    said = run("bench", *SMALL, "--forward-only")
+    said = run("bench", *SMALL)
     assert said.exit_code == 0
     assert "x fewer fragments" in said.stdout
     assert "load" in said.stdout.splitlines()[-1]
@@ -84,17 +89,41 @@ def test_a_model_of_ones_own_with_its_thresholds(tmp_path: Path, learned: bool) 
     model = tmp_path / "mine.ply"
     splat = tiny.random_model()
     write_ply(model, tiny.cut(splat, 0.5) if learned else splat)
-    arguments = ("--model", model, "--cameras", cameras_file(tmp_path), "--size", "32x32")
-    rows = run_json("bench", *arguments, "--repeats", 2, "--forward-only")["results"]
-    assert [(row["scene"], row["gaussians"]) for row in rows] == [("mine", 60)] * 2
-    plain, cut = (row["fragments_per_pixel"] for row in rows)
+    arguments = (model, "--cameras", cameras_file(tmp_path), "--size", "32x32")
+    rows = run_json("bench", *arguments)["results"]
+    assert [(row["scene"], row["gaussians"]) for row in rows] == [("mine", 60)] * 4
+    plain, cut = (row["fragments_per_pixel"] for row in rows if row["pass"] == "forward")
     assert plain > cut > 0
     assert (cut < 0.5 * plain) == learned
-    assert TRUNCATION < 0.1
+    assert work.TRUNCATION < 0.1
+
+
+@pytest.mark.parametrize("arguments", [("--size", "40"), ("--size", "0x9")])
+def test_usage(arguments: tuple[object, ...]) -> None:
+    assert run("bench", *arguments).exit_code == 2
 
 
 @pytest.mark.parametrize(
-    "arguments", [("--size", "40"), ("--size", "0x9"), ("--model", "m.ply"), ("--repeats", 1)]
+    ("arguments", "refused"),
+    [
+        (("--gaussians", 5), "--gaussians"),
+        (("--calibrate",), "MODEL"),
+        (("--out", "prices.json"), "--out"),
+    ],
 )
-def test_usage(arguments: tuple[object, ...]) -> None:
-    assert run("bench", *arguments).exit_code == 2
+def test_an_option_without_effect_on_a_model_is_refused(
+    tmp_path: Path, arguments: tuple[object, ...], refused: str
+) -> None:
+    model = tmp_path / "mine.ply"
+    write_ply(model, tiny.random_model())
+    cameras = cameras_file(tmp_path)
+    result = run(
+        "bench", model, *arguments, *([] if refused == "MODEL" else ["--cameras", cameras])
+    )
+    assert result.exit_code == 2
+    assert f"{refused} with" in result.stderr
+
+
+def test_a_system_without_a_load_average(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("os.getloadavg")
+    assert "load unknown" in run("bench", *SMALL).stdout

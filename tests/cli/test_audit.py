@@ -81,6 +81,17 @@ def test_as_text_the_result_comes_first(model, audited, tmp_path):
     assert "audit" in result.stderr  # the bar
 
 
+def test_without_a_folder_there_is_the_table_alone(model, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ("--views", 1, "--resolution", 16, "--orbit")
+    result = run("audit", model, *words)
+    assert result.exit_code == 0
+    assert "PlayCanvas " in result.stdout
+    report = run_json("audit", model, *words)
+    assert (report["page"], report["maps"]) == (None, None)
+    assert not list(tmp_path.iterdir())
+
+
 def test_given_cameras_need_no_photographs(model, tmp_path):
     images = tiny.photographs(tiny.random_model())
     data = tiny.write_blender(tmp_path / "data", images)
@@ -129,7 +140,7 @@ def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
 def test_two_sources_of_cameras_are_refused(model, tmp_path):
     result = run("audit", model, "--data", tmp_path, "--orbit", "--out", tmp_path / "out")
     assert result.exit_code == 2
-    assert "one of them at most" in result.stderr
+    assert "--data with --orbit" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

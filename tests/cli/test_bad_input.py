@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import product
 
 import pytest
 import torch
@@ -54,22 +53,21 @@ def untouched(out):
     )
 
 
-BAD = {
-    "model missing": ("model-file", "no such file"),
-    "model cut off": ("model-file", "not readable as PLY"),
-    "a checkpoint": ("model-file", "(4D models)"),
-    "data missing": ("dataset", "no such folder"),
-    "image missing": ("dataset", "no such image"),
-    "stale sidecar": ("sidecar", "thresholds of another model"),
-    "broken sidecar": ("sidecar", "unreadable"),
-    "sidecar of one row": ("sidecar", "thresholds of 1 Gaussian"),
-}
-EACH = ("model missing", "image missing", "stale sidecar")  # refused by every command
-CASES = [*((how, "finetune") for how in BAD), *product(EACH, ("profile", "render", "compare"))]
-
-
-@pytest.mark.parametrize(("how", "command"), CASES)
-def test_refused(scene, tmp_path, how, command):
+@pytest.mark.parametrize(
+    ("how", "code", "words"),
+    [
+        ("model missing", "model-file", "no such file"),
+        ("model cut off", "model-file", "not readable as PLY"),
+        ("a checkpoint", "model-file", "(4D models)"),
+        ("data missing", "dataset", "no such folder"),
+        ("image missing", "dataset", "no such image"),
+        ("stale sidecar", "sidecar", "thresholds of another model"),
+        ("broken sidecar", "sidecar", "unreadable"),
+        ("sidecar of one row", "sidecar", "thresholds of 1 Gaussian"),
+    ],
+)
+@pytest.mark.parametrize("command", ["finetune", "profile", "render", "compare"])
+def test_refused(scene, tmp_path, how, code, words, command):
     data, path, out = scene
     if how == "model missing":
         path.unlink()
@@ -94,7 +92,7 @@ def test_refused(scene, tmp_path, how, command):
         "render": ("render", path, "--data", data, "--out", tmp_path / "pictures"),
         "compare": ("compare", path, path, "--data", data),
     }[command]
-    refused(arguments, *BAD[how])
+    refused(arguments, code, words)
     assert untouched(out)
 
 
@@ -136,7 +134,7 @@ def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypat
 @pytest.mark.parametrize("command", ["finetune", "export"])
 def test_the_model_itself_is_no_output(scene, command):
     data, path, _ = scene
-    write_ply(path, tiny.cut(tiny.random_model(8), 0.3))
+    write_ply(path, tiny.random_model(8), torch.full((8,), 0.3))
     before = path.read_bytes()
     more = ("--data", data) if command == "finetune" else ()
     for out in (path, path.with_suffix(".PLY")):  # one sidecar for both
@@ -164,7 +162,7 @@ def test_a_file_is_not_written_under_the_name_of_another_kind(words, wrong, kind
 
 def test_upper_case_is_the_same_kind(scene, tmp_path):
     _, path, _ = scene
-    write_ply(path, tiny.cut(tiny.random_model(8), 0.3))
+    write_ply(path, tiny.random_model(8), torch.full((8,), 0.3))
     assert run("export", path, "--out", tmp_path / "OUT.PLY").exit_code == 0
     assert read_ply(tmp_path / "OUT.PLY").thresholds is not None
 
@@ -217,7 +215,7 @@ def test_bugs_keep_their_traceback(scene, monkeypatch):
     def bug(*args, **kwargs):
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("fragprune_plugins.workbench.figures.evaluate.measure_all", bug)
+    monkeypatch.setattr("fragprune_plugins.workbench.profile.work.measure_all", bug)
     with pytest.raises(ZeroDivisionError):
         run("profile", path, "--data", data)
 
@@ -236,7 +234,7 @@ def test_what_the_machine_refuses_is_stated(scene, monkeypatch, error, code):
     def refuse(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr("fragprune_plugins.workbench.figures.evaluate.measure_all", refuse)
+    monkeypatch.setattr("fragprune_plugins.workbench.profile.work.measure_all", refuse)
     refused(("profile", path, "--data", data), code, "")
 
 

@@ -54,8 +54,8 @@ def test_a_folder_that_cannot_be_made_is_a_stated_error(tmp_path):
 @pytest.mark.parametrize("module", ["no.such.package", "json", "sys:exit"])
 def test_a_broken_bridge_is_named(monkeypatch, module):
     broken = EntryPoint("mine", module, bridge.GROUP)
-    monkeypatch.setattr(bridge, "entry_points", lambda group: [broken])
+    monkeypatch.setattr(bridge, "offered", lambda group: {"mine": broken})
     for words in ((), ("mine",)):
         failed = run("bridge", *words)
         assert failed.exit_code == 1
-        assert "[plugin] bridge mine" in failed.stderr
+        assert "[plugin] fragprune.bridges mine" in failed.stderr

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import importlib
+import json
 
+import pytest
+import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
 from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.plugins.hooks import rasterize
+from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.figures.metrics import psnr
+from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
 FIGURES = ("psnr", "ssim", "fragments_per_pixel", "gaussians")
 
@@ -51,3 +58,46 @@ def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):
     assert [report["a"][key] for key in FIGURES] == [plain["a"][key] for key in FIGURES]
     text = run("compare", path, path, "--data", data, "--enlarge", 3).stdout
     assert "Frames of 96x96 pixels." in text
+
+
+def test_without_photographs_b_is_compared_with_what_a_shows(tmp_path):
+    """Drawn here by hand: PSNR of B's pictures against A's, from the held-out cameras."""
+    _, path, model = tiny.scene(tmp_path)
+    other = tmp_path / "other.ply"
+    write_ply(other, tiny.cut(model, 0.3))
+    cameras = tmp_path / "cameras.json"
+    content = tiny.transforms([f"v{i}" for i in range(9)], tiny.cameras()) | {"w": 24, "h": 16}
+    cameras.write_text(json.dumps(content))
+    report = run_json("compare", path, other, "--cameras", cameras)
+    views = [view for name, view in load_cameras(cameras) if name in ("v0", "v8")]
+    thresholds = torch.full((len(model),), 0.3)
+    pictures = [
+        [rasterize(RasterInputs(view, model.splats()), cut).image for cut in (None, thresholds)]
+        for view in views
+    ]
+    expected = [psnr(after, before) for before, after in pictures]
+    assert report["target"] == "itself"
+    assert report["a"]["psnr"] is None  # infinite
+    assert report["b"]["psnr"] == pytest.approx(sum(expected) / 2, abs=0.01)
+    assert "PSNR against itself" in run("compare", path, other, "--cameras", cameras).stdout
+
+
+def test_what_finetune_self_wrote_is_compared_with_what_came_in(tmp_path):
+    """The figures are those that finetune gave."""
+    _, path, _ = tiny.scene(tmp_path)
+    other = tmp_path / "other.ply"
+    words = ("--self", "--resolution", 16, "--iters", 5)
+    learned = run_json("finetune", path, *words, "--out", other)
+    report = run_json("compare", path, other)
+    assert report["target"] == "itself"
+    for key in FIGURES:
+        assert report["b"][key] == pytest.approx(learned["after"][key], rel=1e-5), key
+
+
+def test_profile_measures_against_the_models_own_pictures(tmp_path):
+    _, path, model = tiny.scene(tmp_path)
+    write_ply(path, tiny.cut(model, 0.3))
+    report = run_json("profile", path, "--orbit", "--resolution", 16)
+    assert report["target"] == "itself"
+    assert report["columns"]["untruncated"]["psnr"] is None
+    assert 10 < report["psnr"] < 80

@@ -17,7 +17,8 @@ from fragprune_plugins import engines
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.workbench.run import _measure
+from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.run.work import measure_models
 
 
 @pytest.fixture
@@ -92,7 +93,7 @@ def test_a_run_is_measured_there(scene, engine):
         "models": [str(path)] * 2,
         "drawing": {},
     }
-    before, after = _measure(photographs, "auto", "cuda")
+    before, after = measure_models(photographs, EngineOptions(device="cuda"))
     assert (before["device"], after["engine"]) == ("meta", "elsewhere")
 
 

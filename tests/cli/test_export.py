@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from cli.commands import run, run_json
 from finetune import tiny
@@ -77,9 +78,10 @@ def test_any_model_may_get_a_stop(tmp_path):
     assert run("export", out, "--out", tmp_path / "model.splat").exit_code != 0
 
 
-def test_nothing_to_export(tmp_path):
+@pytest.mark.parametrize("name", ["out.ply", "out.spz", "out.splat"])
+def test_a_model_without_thresholds_is_written_as_it_is(tmp_path, name):
     _, path, _ = tiny.scene(tmp_path)
-    result = run("export", path, "--out", tmp_path / "out.ply")
-    assert result.exit_code == 1
-    assert "no thresholds" in result.stderr
-    assert not (tmp_path / "out.ply").exists()
+    result = run("export", path, "--out", tmp_path / name)
+    assert result.exit_code == 0
+    assert "no thresholds" in result.stdout
+    assert not models.load(tmp_path / name).pruned

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from fragprune_plugins.workbench.commands.learning import learning_options
 
 HOST = ("--", "train.py")
-COMMANDS = {"run": HOST, "finetune": ("model.ply", "--data", "scene", "--out", "out.ply")}
+COMMANDS = {"run": HOST, "finetune": (__file__, "--data", "scene", "--out", "out.ply")}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -70,7 +70,7 @@ def test_a_bound_of_loss_that_is_none_is_usage(bound):
 
 
 def test_a_bound_of_loss_needs_photographs():
-    result = run("finetune", "model.ply", "--self", "--out", "out.ply", "--max-drop", 0.1)
+    result = run("finetune", __file__, "--self", "--out", "out.ply", "--max-drop", 0.1)
     assert result.exit_code == 2
     assert "--self with --max-drop" in result.stderr
 

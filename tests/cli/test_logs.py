@@ -17,7 +17,13 @@ from fragprune_plugins.errors import OutputError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import fragprune_step
 from fragprune_plugins.plugins.loading import Plugins, installed
-from fragprune_plugins.workbench.commands.logs import COLUMNS, logging_steps
+from fragprune_plugins.workbench.commands.logs import (
+    COLUMNS,
+    CsvLog,
+    TensorBoardLog,
+    WandbLog,
+    logging_steps,
+)
 
 WORDS = ("--iters", 6, "--train", "opacity")
 
@@ -62,14 +68,14 @@ def test_a_new_run_begins_the_file_anew_and_a_resumed_one_appends(tmp_path):
     log = tmp_path / "steps.csv"
     for steps in ((1, 2, 3), (1, 2), (3, 4)):
         plugins = Plugins()
-        with logging_steps([("csv", str(log))], plugins):
+        with logging_steps([CsvLog(str(log))], plugins):
             tell(plugins, steps)
     assert [int(row["step"]) for row in rows(log)] == [1, 2, 3, 4]
 
 
 def test_a_file_can_be_followed_while_it_grows(tmp_path):
     plugins, log = Plugins(), tmp_path / "steps.csv"
-    with logging_steps([("csv", str(log))], plugins):
+    with logging_steps([CsvLog(str(log))], plugins):
         tell(plugins, [1])
         assert len(rows(log)) == 1
 
@@ -79,7 +85,7 @@ def test_tensorboard_has_every_curve(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     plugins = Plugins()
-    with logging_steps([("tensorboard", str(tmp_path / "runs"))], plugins):
+    with logging_steps([TensorBoardLog(str(tmp_path / "runs"))], plugins):
         tell(plugins, [1, 2, 4])
     events = EventAccumulator(str(tmp_path / "runs"))
     events.Reload()
@@ -97,7 +103,7 @@ def test_wandb_gets_every_step(monkeypatch):
     stand_in = SimpleNamespace(init=lambda project: seen.append(project) or begun)
     monkeypatch.setitem(sys.modules, "wandb", stand_in)
     plugins = Plugins()
-    with logging_steps([("wandb", "pruning")], plugins):
+    with logging_steps([WandbLog("pruning")], plugins):
         tell(plugins, [1, 2])
     assert seen[0] == "pruning"
     assert [step for step, _ in seen[1:3]] == [1, 2]
@@ -117,7 +123,7 @@ def test_a_missing_library_is_a_usage_error_that_says_what_to_install(tmp_path, 
 
 @pytest.mark.parametrize("word", ["csv", "csv:", "paper:x", ":x", "bar:3"])
 def test_a_log_of_no_kind_is_a_usage_error(tmp_path, word):
-    assert run("finetune", "a.ply", "--out", tmp_path / "b.ply", "--log", word).exit_code == 2
+    assert run("finetune", __file__, "--out", tmp_path / "b.ply", "--log", word).exit_code == 2
 
 
 def test_a_log_that_fails_later_does_not_stop_learning(tmp_path, caplog):
@@ -128,7 +134,7 @@ def test_a_log_that_fails_later_does_not_stop_learning(tmp_path, caplog):
             *("--log", "csv:/dev/full"),
         )
     assert result.exit_code == 0
-    assert "log-0-csv, fragprune_step: OSError" in caplog.text
+    assert "log-0-CsvLog, fragprune_step: OSError" in caplog.text
 
 
 def test_a_config_file_gives_the_options(tmp_path):
@@ -155,7 +161,7 @@ CONFIGS = {
 @pytest.mark.parametrize("text", CONFIGS)
 def test_a_config_file_that_is_wrong_is_a_usage_error(tmp_path, text):
     (tmp_path / "a.toml").write_text(text)
-    result = run("finetune", "a.ply", "--out", "b.ply", "--config", tmp_path / "a.toml")
+    result = run("finetune", __file__, "--out", "b.ply", "--config", tmp_path / "a.toml")
     assert result.exit_code == 2
     assert CONFIGS[text] in " ".join(result.stderr.split())
 
@@ -196,7 +202,7 @@ def test_a_file_that_is_no_log_is_not_begun_anew(tmp_path):
 
 def test_a_pipe_that_nobody_reads_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(OutputError, match="pipe"), logging_steps([("csv", str(tmp_path / "pipe"))]):
+    with pytest.raises(OutputError, match="pipe"), logging_steps([CsvLog(str(tmp_path / "pipe"))]):
         pass
 
 
@@ -222,7 +228,7 @@ VALUES = {
 def test_a_value_is_read_as_on_the_line(tmp_path, text):
     (tmp_path / "a.toml").write_text(text)
     words = [] if "out" in text else ["--out", "b.ply"]
-    result = run("finetune", "a.ply", *words, "--config", tmp_path / "a.toml")
+    result = run("finetune", __file__, *words, "--config", tmp_path / "a.toml")
     assert result.exit_code == 2
     assert VALUES[text] in " ".join(result.stderr.split())
 

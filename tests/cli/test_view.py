@@ -34,15 +34,16 @@ def test_a_folder_with_cameras_and_photographs(scene, tmp_path):
     assert report["truncated"] == [True]
 
 
-@pytest.mark.parametrize("single", [(), ("--single-file",)])
-def test_a_page_of_somebody_else_is_not_overwritten(scene, tmp_path, single):
+@pytest.mark.parametrize("name", [".", "index.html"])
+def test_a_page_of_somebody_else_is_not_overwritten(scene, tmp_path, name):
     _, path = scene
-    run_json("view", path, "--out", tmp_path / "page", *single)
-    run_json("view", path, "--out", tmp_path / "page", *single)  # our own may be
+    (tmp_path / "page").mkdir()
+    run_json("view", path, "--out", tmp_path / "page" / name)
+    run_json("view", path, "--out", tmp_path / "page" / name)  # our own may be
     own = tmp_path / "website" / "index.html"
     own.parent.mkdir()
     own.write_text("<!doctype html><title>My site</title>")
-    result = run("view", path, "--out", own.parent, *single)
+    result = run("view", path, "--out", own.parent / name)
     assert result.exit_code == 1
     assert "did not write" in result.stderr
     assert own.read_text().endswith("My site</title>")
@@ -53,7 +54,7 @@ def test_two_models_are_two_sides(scene, tmp_path):
     _, path = scene
     other = tmp_path / "other.ply"
     write_ply(other, tiny.random_model(20))
-    report = run_json("view", path, "--compare", other, "--out", tmp_path / "page")
+    report = run_json("view", path, other, "--out", tmp_path / "page")
     held = json.loads((tmp_path / "page" / "scene.json").read_text())
     assert [each["model"] for each in held["layers"]] == [0, 1]
     assert [each["truncated"] for each in held["layers"]] == [True, False]
@@ -77,8 +78,9 @@ def test_the_cameras_of_a_training_are_found(scene, tmp_path):
 
 
 def test_one_page(scene, tmp_path):
-    run_json("view", scene[1], "--out", tmp_path / "page", "--single-file")
-    assert [each.name for each in (tmp_path / "page").iterdir()] == ["index.html"]
+    report = run_json("view", scene[1], "--out", tmp_path / "pages" / "mine.html")
+    assert report["files"] == [str(tmp_path / "pages" / "mine.html")]
+    assert [each.name for each in (tmp_path / "pages").iterdir()] == ["mine.html"]
 
 
 def test_serves_until_ctrl_c(scene, monkeypatch):
@@ -108,7 +110,6 @@ def test_serves_until_ctrl_c(scene, monkeypatch):
     ("options", "words"),
     [
         (("--data", "x", "--cameras", "y"), "--cameras"),
-        (("--single-file",), "--out"),
         (("--port", "70000"), "--port"),
     ],
 )

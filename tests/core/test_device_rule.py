@@ -74,7 +74,7 @@ def test_what_is_not_there_or_cannot_be_drawn_on_is_refused(gpus, count, wanted,
 @pytest.mark.parametrize(
     "command",
     [
-        ("render", "m.ply", "--data", "d", "--out", "o"),
+        ("render", __file__, "--data", "d", "--out", "o"),
         ("run", "--", "train.py"),
         ("bench",),
         ("demo",),
@@ -90,7 +90,7 @@ def test_other_words_are_usage(command, word):
 def test_a_device_that_is_not_there_is_usage(tmp_path):
     if torch.cuda.is_available():
         pytest.skip("there may be one")
-    result = run("render", "m.ply", "--data", "d", "--out", tmp_path / "o", "--device", "cuda:3")
+    result = run("render", __file__, "--data", "d", "--out", tmp_path / "o", "--device", "cuda:3")
     assert result.exit_code == 2
     assert "[usage] --device cuda:3: no CUDA devices" in result.stderr
     assert not (tmp_path / "o").exists()

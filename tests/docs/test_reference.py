@@ -12,6 +12,7 @@ import fragprune_plugins
 from fragprune_plugins import errors
 from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands import cli
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -27,6 +28,7 @@ MADE = run_path(str(DOCS / "generate.py"))["PAGES"]
         ("command-line.md", [f"fragprune {name}" for name in cli.list_commands(None)]),
         ("errors.md", [kind.__name__ for kind in errors.FragpruneError.__subclasses__()]),
         ("adapters.md", ["HostAdapter"]),
+        ("support.md", [adapter.name for adapter in load_plugins().adapters]),
     ],
 )
 def test_a_page_made_from_the_code_names_all_of_it(name, listed):

@@ -17,11 +17,11 @@ from fragprune_plugins.errors import DivergedError, InputError, UsageError
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, Splats
+from fragprune_plugins.workbench.distributed.processes import Shards, part_of, whole_of
+from fragprune_plugins.workbench.distributed.sharded import ShardedEngine, reaching
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.loop import finetune
-from fragprune_plugins.workbench.finetune.processes import Shards, part_of, whole_of
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-from fragprune_plugins.workbench.finetune.sharded import ShardedEngine, reaching
 from fragprune_plugins.workbench.ranks import Ranks
 
 STEPS = 12

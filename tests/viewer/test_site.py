@@ -40,7 +40,7 @@ def test_one_page_asks_for_nothing(site):
 
 def test_one_page_has_a_limit(site):
     site["model-0.splats"] = bytes(sites.SINGLE_MAX)
-    with pytest.raises(OutputError, match="--single-file"):
+    with pytest.raises(OutputError, match="in one page"):
         sites.single_page(site)
 
 

@@ -12,18 +12,17 @@ import click
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS
-from fragprune_plugins.workbench.commands.common import (
+from fragprune_plugins.workbench.commands.command import Command, Group, Report
+from fragprune_plugins.workbench.commands.opening import open_engine, photographs_for
+from fragprune_plugins.workbench.commands.options import (
     FILE,
     MODEL,
-    Command,
+    EngineOptions,
     Function,
-    Group,
     Number,
-    Report,
-    data_options,
+    SceneOptions,
     engine_options,
-    open_engine,
-    photographs_for,
+    scene_options,
     together,
 )
 from lab.catalogue import EXPERIMENTS, QUESTIONS
@@ -73,7 +72,7 @@ def _seeds_option(default: str) -> Callable[[Function], Function]:
 
 _training_options = together(
     click.argument("model", type=MODEL),
-    data_options,
+    scene_options(),
     _out_option,
     click.option(
         "--iters",
@@ -91,7 +90,7 @@ _training_options = together(
         help="Parameters that move in every arm; default all. Not for moves.",
     ),
     _seeds_option("0"),
-    engine_options,
+    engine_options(),
 )
 
 _TRAINING = """{asks}
@@ -108,18 +107,13 @@ Example:
 def _train(
     name: str,
     model: Path,
-    data: Path | None,
-    images: str,
-    resolution: int,
-    white_background: bool,
+    scene: SceneOptions,
     out: Path,
     iters: int | None,
     scale: float | None,
     train: Any,
     seeds: tuple[int, ...],
-    engine: str,
-    device: str,
-    threads: int | None,
+    engine: EngineOptions,
 ) -> Report:
     """Run an experiment that compares trainings."""
     if iters is not None and scale is not None:
@@ -129,8 +123,8 @@ def _train(
 
     from lab import results, running
 
-    rasterizer, where = open_engine(engine, device, threads)
-    photographs = photographs_for(model, data, images, resolution, white_background)
+    rasterizer, where = open_engine(engine)
+    photographs = photographs_for(model, scene)
     with sigterm_interrupts():
         folder, outcomes = running.run(
             experiment,
@@ -167,9 +161,9 @@ for _name, _make in EXPERIMENTS.items():
 
 _views_options = together(
     click.argument("models", metavar="MODEL...", type=MODEL, nargs=-1, required=True),
-    data_options,
+    scene_options(),
     _out_option,
-    engine_options,
+    engine_options(),
 )
 
 
@@ -180,14 +174,9 @@ _views_options = together(
 )
 def _time_stages(
     models: tuple[Path, ...],
-    data: Path | None,
-    images: str,
-    resolution: int,
-    white_background: bool,
+    scene: SceneOptions,
     out: Path,
-    engine: str,
-    device: str,
-    threads: int | None,
+    engine: EngineOptions,
     repeats: int,
 ) -> Report:
     """Time the stages of frames on held-out views, from 256 pixels to 4K.
@@ -201,8 +190,8 @@ def _time_stages(
     """
     from lab import stages
 
-    drawer, where = open_engine(engine, device, threads)
-    photographs = photographs_for(models[0], data, images, resolution, white_background)
+    drawer, where = open_engine(engine)
+    photographs = photographs_for(models[0], scene)
     return _report(
         stages.run(
             models, photographs, out, engine=drawer, device=where, repeats=repeats, progress=True
@@ -214,14 +203,9 @@ def _time_stages(
 @_views_options
 def _count_fragments(
     models: tuple[Path, ...],
-    data: Path | None,
-    images: str,
-    resolution: int,
-    white_background: bool,
+    scene: SceneOptions,
     out: Path,
-    engine: str,
-    device: str,
-    threads: int | None,
+    engine: EngineOptions,
 ) -> Report:
     """Count fragments by Gaussian, opacity, size and weight on held-out views.
 
@@ -234,8 +218,8 @@ def _count_fragments(
     """
     from lab import fragments
 
-    drawer, where = open_engine(engine, device, threads)
-    photographs = photographs_for(models[0], data, images, resolution, white_background)
+    drawer, where = open_engine(engine)
+    photographs = photographs_for(models[0], scene)
     return _report(
         fragments.run(models, photographs, out, engine=drawer, device=where, progress=True)
     )

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shutil
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import ModuleType
 
 import click
 
 from fragprune_plugins.errors import PluginError, UsageError
-from fragprune_plugins.files.reading import said
-from fragprune_plugins.workbench.commands.common import Command, Report
+from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.plugins.points import load, offered
+from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.options import FILE
 
 GROUP = "fragprune.bridges"
 """Entry points: a viewer's name, and the package whose ``MODULE`` is its JavaScript module."""
@@ -18,7 +21,7 @@ GROUP = "fragprune.bridges"
 
 @click.command("bridge", cls=Command)
 @click.argument("viewer", required=False)
-@click.option("--out", type=click.Path(path_type=Path), help="Folder to copy the module into.")
+@click.option("--out", type=FILE, help="Folder to copy the module into.")
 def command(viewer: str | None, out: Path | None) -> Report:
     """Give the JavaScript module with which VIEWER honours cutoffs.
 
@@ -30,7 +33,7 @@ def command(viewer: str | None, out: Path | None) -> Report:
       fragprune bridge playcanvas --out website
       npm install "$(fragprune bridge spark)"
     """
-    modules = {entry.name: entry for entry in sorted(entry_points(group=GROUP))}
+    modules = offered(GROUP)
     if viewer is None:
         found = {name: _module(entry) for name, entry in modules.items()}
         lines = [f"{name:<16} {module}" for name, module in found.items()]
@@ -41,8 +44,6 @@ def command(viewer: str | None, out: Path | None) -> Report:
     module = _module(modules[viewer])
     if out is None:
         return Report({"bridge": viewer, "module": str(module)}, str(module.parent))
-    from fragprune_plugins.files.atomic import replacing
-
     to = out / module.name
     out.mkdir(parents=True, exist_ok=True)
     with replacing(to) as temporary:
@@ -50,21 +51,18 @@ def command(viewer: str | None, out: Path | None) -> Report:
     return Report({"bridge": viewer, "module": str(to)}, f"Wrote {to}.")
 
 
-def _module(entry: EntryPoint) -> Path:
+def _module(point: EntryPoint) -> Path:
     """The module of an installed bridge.
 
     Raises:
         PluginError: its package cannot be imported, or names no file.
     """
-    try:
-        module = entry.load().MODULE
-        if not Path(module).is_file():
-            raise FileNotFoundError(f"no file {module}")
-    except (Exception, SystemExit) as error:
+    path = Path(getattr(load(point, ModuleType), "MODULE", "MODULE"))
+    if not path.is_file():
         raise PluginError(
-            f"bridge {entry.name}",
-            f"{type(error).__name__}: {said(error)}",
-            "a package with the path of its JavaScript module",
-            f"Install {entry.value} again, or remove it.",
-        ) from error
-    return Path(module)
+            f"{point.group} {point.name}",
+            f"no file {path}",
+            "a package with the path of its JavaScript module as MODULE",
+            f"Install {point.value} again, or remove it.",
+        )
+    return path

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fragprune_plugins.workbench.commands.common import FILE, Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.options import FILE
 
 if TYPE_CHECKING:
     from fragprune_plugins.hosts.adapter import HostAdapter

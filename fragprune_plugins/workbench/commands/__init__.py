@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import os
 import sys
-from importlib.metadata import EntryPoint, entry_points
+from typing import NoReturn
 
 import click
 
 from fragprune_plugins.errors import PluginError
-from fragprune_plugins.workbench.commands.common import Group
+from fragprune_plugins.plugins.points import load, offered
+from fragprune_plugins.workbench.commands.command import Command, Group
 
 GROUP = "fragprune.commands"
 """The entry-point group of commands: a click command each, ours and those of other packages."""
@@ -20,44 +21,32 @@ class _Commands(Group):
     """Commands by entry point, imported on use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted({point.name for point in entry_points(group=GROUP)})
+        return list(offered(GROUP))
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        points = entry_points(group=GROUP, name=cmd_name)
-        return self._load(next(iter(points))) if points else None
-
-    def _load(self, point: EntryPoint) -> click.Command:
-        """The command of an entry point, or one that says why it cannot be had."""
+        point = offered(GROUP).get(cmd_name)
+        if point is None:
+            return None
         try:
-            command = point.load()
-            if not isinstance(command, click.Command):
-                raise TypeError(f"{point.value} is a {type(command).__name__}, no click command")
-        except Exception as error:
-            return _Broken(point, error)
+            command: click.Command = load(point, click.Command)
+        except PluginError as error:
+            return _broken(cmd_name, error)
         return command
 
 
-class _Broken(click.Command):
+def _broken(name: str, error: PluginError) -> click.Command:
     """Stands for a command whose package fails, so that all the others go on working."""
 
-    def __init__(self, point: EntryPoint, error: Exception) -> None:
-        owner = point.dist.name if point.dist else point.value
-        self.why = f"{type(error).__name__}: {error}".splitlines()[0]
-        super().__init__(
-            point.name,
-            help=f"Cannot be loaded ({owner}: {self.why}).",
-            context_settings={"ignore_unknown_options": True},
-            params=[click.Argument(["arguments"], nargs=-1)],
-            callback=lambda arguments: self._refuse(owner),
-        )
+    def refuse(arguments: tuple[str, ...]) -> NoReturn:
+        raise error
 
-    def _refuse(self, owner: str) -> None:
-        raise PluginError(
-            f"fragprune {self.name}",
-            self.why,
-            f"a command of the package {owner}",
-            f"Update or uninstall {owner}.",
-        )
+    return Command(
+        name,
+        help=f"Cannot be loaded ({error.found}).",
+        context_settings={"ignore_unknown_options": True},
+        params=[click.Argument(["arguments"], nargs=-1)],
+        callback=refuse,
+    )
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -78,11 +67,11 @@ def cli() -> None:
     """
 
 
-def _stand() -> None:
-    """Give the process the streams that it may have been started without.
+def _open_missing_streams() -> None:
+    """Open /dev/null for each of stdin, stdout and stderr that is closed.
 
-    A file that is opened in the place of a closed stream would get what is written to that. A
-    letter that a stream cannot write becomes an escape.
+    Else a file that is opened later would get its descriptor, and with it what is printed. A letter
+    that a stream cannot encode becomes an escape.
     """
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
@@ -98,7 +87,7 @@ def _stand() -> None:
 
 def main() -> None:
     """Entry point of the ``fragprune`` script."""
-    _stand()
+    _open_missing_streams()
     # By default, OpenMP's threads spin while they wait. On a busy machine, torch on two threads was
     # fifty times slower with spinning threads than with sleeping ones.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

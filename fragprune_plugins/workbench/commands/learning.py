@@ -21,7 +21,7 @@ from fragprune_plugins.learning.schedule import (
     Settings,
     steps_of,
 )
-from fragprune_plugins.workbench.commands.common import Number, together
+from fragprune_plugins.workbench.commands.options import Number, together
 
 _OPTIONS = (
     click.option(

@@ -1,22 +1,33 @@
 """Where the steps of learning are written while they happen: CSV, TensorBoard, Weights & Biases.
 
-A log is a plugin like any other: it implements ``fragprune_step``.
+A kind of log is an entry point: a class that gets the place that ``--log KIND:PLACE`` names.
 """
 
 from __future__ import annotations
 
 import contextlib
 import csv
+import functools
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, fields
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, Protocol
+
+import click
+from tqdm import tqdm
 
 from fragprune_plugins.errors import OutputError, UsageError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins, installed
+from fragprune_plugins.plugins.points import load, offered
+from fragprune_plugins.workbench.commands.options import Function
+from fragprune_plugins.workbench.ranks import launched
+
+GROUP = "fragprune.logs"
+"""The entry-point group of kinds of logs."""
 
 
 def _open(path: str, flags: int) -> int:
@@ -144,14 +155,12 @@ class Bar:
         total: number of steps.
     """
 
-    def __init__(self, total: str) -> None:
-        self._total = int(total)
+    def __init__(self, total: int) -> None:
+        self._total = total
         self._bar: Any = None
 
     def write(self, stats: StepStats) -> None:
         """Go on by a step."""
-        from tqdm import tqdm
-
         if self._bar is None:
             self._bar = tqdm(
                 total=self._total, disable=None, desc="fragprune", unit="it", position=1
@@ -167,15 +176,6 @@ class Bar:
             self._bar.close()
 
 
-LOGS: dict[str, Callable[[str], Log]] = {
-    "csv": CsvLog,
-    "tensorboard": TensorBoardLog,
-    "wandb": WandbLog,
-    "bar": Bar,
-}
-"""By kind; ``--log`` offers all but the bar, which ``run`` shows."""
-
-
 class _Observer:
     def __init__(self, log: Log) -> None:
         self._log = log
@@ -186,23 +186,17 @@ class _Observer:
 
 
 @contextlib.contextmanager
-def logging_steps(
-    asked: Sequence[tuple[str, str]], plugins: Plugins | None = None
-) -> Iterator[None]:
-    """Write the steps that are taken in a block.
+def logging_steps(logs: Sequence[Log], plugins: Plugins | None = None) -> Iterator[None]:
+    """Write the steps that are taken in a block, and close the logs after it.
 
     Args:
-        asked: kind (a key of ``LOGS``) and place of each log.
+        logs: where to write.
         plugins: the plugins to join; None for those of the process.
-
-    Raises:
-        UsageError: a library is missing.
-        OutputError: a file cannot be written.
     """
     plugins = plugins or installed()
     with contextlib.ExitStack() as stack:
-        for number, (kind, place) in enumerate(asked):
-            log, name = LOGS[kind](place), f"log-{number}-{kind}"
+        for number, log in enumerate(logs):
+            name = f"log-{number}-{type(log).__name__}"
             stack.callback(log.close)
             plugins.register(_Observer(log), name)
             stack.callback(plugins.remove, name)
@@ -220,3 +214,39 @@ def _missing(library: str) -> UsageError:
         f"the package {library}",
         f"pip install 'fragprune-plugins[{library}]'",
     )
+
+
+def _places(
+    ctx: click.Context, param: click.Parameter, words: tuple[str, ...]
+) -> list[tuple[EntryPoint, str]]:
+    """Kind and place of each log."""
+    kinds, places = offered(GROUP), []
+    for word in words:
+        kind, _, place = word.partition(":")
+        if kind not in kinds or not place:
+            known = ", ".join(f"{kind}:PLACE" for kind in kinds)
+            raise click.BadParameter(f"'{word}' is none of {known}.", ctx, param)
+        places.append((kinds[kind], place))
+    return places
+
+
+def log_option(function: Function) -> Function:
+    """The option ``--log``: the steps that the command takes are written there."""
+
+    @click.option(
+        "--log",
+        "logs",
+        metavar="KIND:PLACE",
+        callback=_places,
+        multiple=True,
+        help="Write every step's loss, fragments, pressure and threshold to csv:FILE, "
+        "tensorboard:FOLDER or wandb:PROJECT, or as a plugin does. May be given several times.",
+    )
+    @functools.wraps(function)
+    def logged(*args: Any, logs: list[tuple[EntryPoint, str]], **kwargs: Any) -> Any:
+        if not logs or not launched().first:
+            return function(*args, **kwargs)
+        with logging_steps([load(kind, type)(place) for kind, place in logs]):
+            return function(*args, **kwargs)
+
+    return logged  # type: ignore[return-value]

@@ -7,15 +7,8 @@ from pathlib import Path
 
 import click
 
-from fragprune_plugins.workbench.commands.common import (
-    FILE,
-    Command,
-    Report,
-    device_option,
-    engine_option,
-    open_engine,
-    threads_option,
-)
+from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.options import FILE, EngineOptions, engine_options
 
 
 @click.command("demo", cls=Command)
@@ -35,12 +28,8 @@ from fragprune_plugins.workbench.commands.common import (
     help="Iterations of the training; the fine-tuning runs half as many.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the training.")
-@engine_option("Engine that rasterizes")
-@device_option("Device; the scene is small enough for any CPU.", default="cpu")
-@threads_option
-def command(
-    out: Path, iters: int, seed: int, engine: str, device: str, threads: int | None
-) -> Report:
+@engine_options(device="Device; the scene is small enough for any CPU.", default="cpu")
+def command(out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     """Train a model of a small room, prune its fragments, and show original and pruned.
 
     It takes a few minutes on a laptop and downloads nothing: 48 photographs come with fragprune.
@@ -51,12 +40,13 @@ def command(
     """
     # torch reads this when it loads. Idle threads sleep, and leave the CPU to other programs.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from fragprune_plugins.workbench.commands.opening import open_engine
     from fragprune_plugins.workbench.demo.demo import DemoSettings, run_demo
     from fragprune_plugins.workbench.figures.wording import describe, frames, outcome
 
-    _, where = open_engine(engine, device, threads)
+    _, where = open_engine(engine)
     settings = DemoSettings(
-        iterations=iters, finetune=iters // 2, seed=seed, engine=engine, device=str(where)
+        iterations=iters, finetune=iters // 2, seed=seed, engine=engine.name, device=str(where)
     )
     report = run_demo(out, settings, lambda line: click.echo(line, err=True))
     larger = report["larger"]

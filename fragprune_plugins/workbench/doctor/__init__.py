@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-import platform
-from importlib.metadata import PackageNotFoundError, version
-from typing import Any
-
 import click
 
-from fragprune_plugins.errors import EngineError, UsageError
-from fragprune_plugins.workbench.commands.common import Command, Report
-
-_PACKAGES = ("fragprune-plugins", "torch", "numpy", "pluggy", "wrapt", "plyfile", "scikit-image")
-
-_AGREES = {"agrees": True, "fails": False, "could not run": None}
+from fragprune_plugins.workbench.commands.command import Command, Report
 
 
 @click.command("doctor", cls=Command)
@@ -35,100 +26,6 @@ def command(build_cuda: str | None) -> Report:
       fragprune doctor --json
       fragprune doctor --build-cuda 80,86,90
     """
-    if build_cuda is not None:
-        return _build(build_cuda)
-    import torch
+    from fragprune_plugins.workbench.doctor.work import build, examine
 
-    from fragprune_plugins.engines.cpu import binding
-    from fragprune_plugins.engines.cuda import driver, self_check
-    from fragprune_plugins.plugins.loading import load_plugins
-
-    packages = {name: _version(name) for name in _PACKAGES}
-    native = binding.describe()
-    # This comes first, because a GPU may allow only one process.
-    verdict = self_check.check_in_subprocess("cuda") if driver.missing() is None else None
-    gpu = driver.describe()
-    gpu["agrees"] = None if verdict is None else _AGREES[verdict.outcome]
-    gpu["check"] = None if verdict is None else str(verdict)
-    plugins = load_plugins()
-    data: dict[str, Any] = {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "packages": packages,
-        "cuda": torch.cuda.is_available(),
-        "threads": torch.get_num_threads(),
-        "native": native,
-        "gpu": gpu,
-        "engines": [
-            "reference",
-            *(["cpu"] if binding.available() else []),
-            *(["cuda"] if gpu["available"] else []),
-        ],
-        "adapters": [adapter.name for adapter in plugins.adapters],
-        "findings": [finding.as_dict() for finding in plugins.findings],
-    }
-    lines = [
-        f"python {data['python']} on {data['platform']}",
-        ", ".join(f"{name} {found or 'missing'}" for name, found in packages.items()),
-        f"CUDA {'yes' if data['cuda'] else 'no'}; {data['threads']} threads",
-        "native engine: " + ", ".join(f"{key} {value}" for key, value in native.items()),
-        "cuda engine: " + ", ".join(f"{key} {value}" for key, value in gpu.items()),
-        f"engines: {', '.join(data['engines'])}",
-        f"adapters: {', '.join(data['adapters']) or 'none'}",
-        *(str(finding) for finding in plugins.findings),
-    ]
-    wrong = not binding.available() or any(f.level == "error" for f in plugins.findings)
-    if not binding.available():
-        lines.append(
-            "The cpu engine is missing, so the slow reference engine draws on the CPU. "
-            "Install a C++17 compiler and install fragprune-plugins again."
-        )
-    if verdict is not None and verdict.outcome != "agrees":
-        wrong = True
-        lines.append(f"{verdict}. Until then, --engine auto does not use it. {verdict.remedy}")
-    return Report(data, "\n".join(lines), exit_code=1 if wrong else 0)
-
-
-def _build(architectures: str) -> Report:
-    """Compile the kernels for a comma-separated list of architectures into the cache."""
-    from fragprune_plugins.engines.cuda import kernels
-    from fragprune_plugins.engines.cuda.frame import MACROS, VARIANTS
-
-    try:
-        codes = [int(code.strip().removeprefix("sm_")) for code in architectures.split(",")]
-    except ValueError:
-        raise UsageError(
-            "--build-cuda", architectures, "compute capabilities like 80,90", "List numbers."
-        ) from None
-    built: list[dict[str, Any]] = []
-    try:
-        compiler = kernels.compiler()
-        for code in codes:
-            target = kernels.target_of(code, compiler.architectures)
-            for source, macros in VARIANTS:
-                image, had = kernels.image_of(source, {**MACROS, **macros}, target, compiler)
-                for name, needs in kernels.resources(image.log).items():
-                    built.append({"target": target, "kernel": name, "kept": had, **vars(needs)})
-    except kernels.Unavailable as why:
-        raise EngineError(
-            "--build-cuda",
-            str(why),
-            "NVRTC (through cuda-bindings) or nvcc",
-            "Install fragprune-plugins[cuda12] or [cuda13], and torch or nvidia-cuda-nvrtc.",
-        ) from why
-    folder = str(kernels.cache_folder())
-    data = {"compiler": f"{compiler.name} {compiler.version}", "kept": folder, "kernels": built}
-    lines = [f"{data['compiler']}, kept in {folder}"]
-    lines += [
-        f"{k['target']} {k['kernel']}: {k['registers']} registers, {k['shared']} bytes shared, "
-        f"{k['spills']} spilled{', already there' if k['kept'] else ''}"
-        for k in built
-    ]
-    return Report(data, "\n".join(lines))
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    return examine() if build_cuda is None else build(build_cuda)

@@ -12,29 +12,24 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.workbench.commands.common import (
-    DATA_HELP,
+from fragprune_plugins.workbench.commands.command import Command, Report, first_process_prints
+from fragprune_plugins.workbench.commands.config import config_option
+from fragprune_plugins.workbench.commands.learning import learning_options, resuming_options
+from fragprune_plugins.workbench.commands.logs import log_option
+from fragprune_plugins.workbench.commands.options import (
     FILE,
     MODEL,
-    TRAINED_ON,
-    Command,
+    EngineOptions,
     OutFile,
-    Report,
-    config_option,
-    dropping,
+    SceneOptions,
     engine_options,
-    image_options,
-    log_option,
-    one_voice,
-    open_engine,
-    photographs_for,
-    require_place,
     require_several,
+    scene_options,
     shard_option,
 )
-from fragprune_plugins.workbench.commands.learning import learning_options, resuming_options
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.models.written import dropping, require_place
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 
 if TYPE_CHECKING:
@@ -73,11 +68,6 @@ def _share(
     "thresholds themselves. .splat and .compressed.ply cannot hold any.",
 )
 @click.option(
-    "--data",
-    type=FILE,
-    help=f"{DATA_HELP} {TRAINED_ON}",
-)
-@click.option(
     "--self",
     "itself",
     is_flag=True,
@@ -90,7 +80,7 @@ def _share(
     type=FILE,
     help="With --self: cameras.json of a 3DGS model, or transforms_*.json; every 8th is held out.",
 )
-@image_options
+@scene_options()
 @learning_options
 @log_option
 @config_option
@@ -128,17 +118,14 @@ def _share(
     "Keep the unfinished fine-tuning in OUT.fragprune-unfinished; 0 keeps it at Ctrl-C and "
     "SIGTERM only.",
 )
-@engine_options
-@one_voice()
+@engine_options()
+@first_process_prints()
 def command(
     model: Path,
     out: Path,
-    data: Path | None,
     itself: bool,
     cameras: Path | None,
-    images: str,
-    resolution: int,
-    white_background: bool,
+    scene: SceneOptions,
     settings: Settings,
     keep: float | Literal["auto"] | None,
     max_drop: float | None,
@@ -149,9 +136,7 @@ def command(
     drop: bool,
     every: float,
     again: bool,
-    engine: str,
-    device: str,
-    threads: int | None,
+    engine: EngineOptions,
 ) -> Report | None:
     """Learn how far each Gaussian of MODEL must reach.
 
@@ -185,7 +170,7 @@ def command(
       fragprune finetune statue.spz --self --out pruned.spz
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
-    _require_sense(data, itself, cameras, settings, max_drop, keep)
+    _require_sense(scene.data, itself, cameras, settings, max_drop, keep)
     if shard:
         _require_shards(settings, itself, max_drop, keep, drop)
     if launched().first:
@@ -193,29 +178,30 @@ def command(
         click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
     from fragprune_plugins.engines.cpu.memory import keep_freed_memory
+    from fragprune_plugins.workbench.commands.opening import (
+        open_engine,
+        photographs_for,
+        pictures_of,
+    )
+    from fragprune_plugins.workbench.distributed.processes import part_of
+    from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
     from fragprune_plugins.workbench.figures.evaluate import Candidate
     from fragprune_plugins.workbench.finetune import finished as finetuned
     from fragprune_plugins.workbench.finetune import resuming
     from fragprune_plugins.workbench.finetune.loop import save
-    from fragprune_plugins.workbench.finetune.processes import part_of
     from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-    from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
     from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
     photographs = None
-    if data is not None or not itself:
+    if scene.data is not None or not itself:
         remedy = "Pass --data FOLDER with photographs; without any, --self."
-        photographs = photographs_for(
-            model, data, images, resolution, white_background, remedy=remedy
-        )
-    rasterizer, where = open_engine(engine, device, threads)
+        photographs = photographs_for(model, scene, remedy=remedy)
+    rasterizer, where = open_engine(engine)
     keep_freed_memory()
     truncation = settings.truncate and not no_truncation
     whole = models.load(model, truncation=truncation, device="cpu" if shard else where)
     if itself:
-        dataset = _own_pictures(
-            whole, data, cameras, resolution, white_background, seed, rasterizer
-        )
+        dataset = pictures_of(whole, scene, cameras, rasterizer, seed=seed)
     else:
         assert photographs is not None
         dataset = load_photographs(photographs)
@@ -273,7 +259,8 @@ def command(
         points = [asdict(point) for point in result.curves]
         finetuned.draw_curves(curves, points, saved.model.falloff)
     figures = measured or over.measured(dataset, rasterizer)
-    report = over.report(figures, dataset, photographs, asked)
+    pictures = scene.as_record(cameras) if itself else None
+    report = over.report(figures, dataset, photographs, asked, pictures)
     if not result.interrupted:
         checkpoints.clear()  # not before: a kill while measuring goes on from it too
     return report
@@ -339,7 +326,7 @@ def _learn(
 
 def _whole(result: FinetuneResult, ranks: Ranks) -> FinetuneResult:
     """The result with all Gaussians, in the first process; as it is in others."""
-    from fragprune_plugins.workbench.finetune.processes import whole_of
+    from fragprune_plugins.workbench.distributed.processes import whole_of
 
     whole = whole_of(result.model, ranks)
     return replace(result, model=whole) if ranks.first else result
@@ -432,30 +419,3 @@ def _require_shards(
             "options that each process can follow with a part of the Gaussians",
             "Leave one of them out.",
         )
-
-
-def _own_pictures(
-    model: Model,
-    data: Path | None,
-    cameras: Path | None,
-    resolution: int,
-    white_background: bool,
-    seed: int,
-    engine: Engine,
-) -> Dataset:
-    """The pictures of a model from the cameras asked for."""
-    import torch
-
-    from fragprune_plugins.workbench.finetune.itself import own_pictures
-    from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
-    from fragprune_plugins.workbench.scenes.generated import around
-
-    held_out = None
-    if data is not None:
-        views, held_out = load_scene_cameras(data, white_background=white_background)
-        held_out = divided(held_out, resolution)
-    elif cameras is not None:
-        views = load_cameras(cameras, white_background=white_background)
-    else:
-        views = around(model, background=torch.full((3,), float(white_background)), seed=seed)
-    return own_pictures(model, divided(views, resolution), held_out, engine=engine, seed=seed)

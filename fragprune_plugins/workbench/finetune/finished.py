@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from fragprune_plugins.errors import RecordError, SidecarError
 from fragprune_plugins.files import records
 from fragprune_plugins.learning.interruption import EXIT_CODE
-from fragprune_plugins.workbench.commands.common import Report, describe_dropped, describe_written
+from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.models import formats
+from fragprune_plugins.workbench.models.written import describe_dropped, describe_written
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.finetune.searching import Bounded
     from fragprune_plugins.workbench.scenes.dataset import Dataset
 
-_OF_RECORDS = {"curves", "photographs", "configuration", "text"}
+_OF_RECORDS = {"cameras", "curves", "photographs", "configuration", "text"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +80,7 @@ class Finetuned:
         dataset: Dataset,
         photographs: Photographs | None,
         asked: dict[str, Any],
+        pictures: dict[str, Any] | None = None,
     ) -> Report:
         """Leave a record, and say what came of it.
 
@@ -87,6 +89,7 @@ class Finetuned:
             dataset: whose held-out views it was measured on.
             photographs: where they lie, for the record; None where there are none.
             asked: the configuration, by which the same command is known again.
+            pictures: the cameras of the model's own pictures, for the record.
         """
         result, settings = self.result, self.result.settings
         before, after, *without = figures
@@ -122,6 +125,7 @@ class Finetuned:
         data["control"] = control or records.control_of(data, records.files(self.out.parent))
         text = self._text(data, len(dataset.test), len(dataset.train) + len(dataset.test))
         more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
+        more |= {"cameras": pictures} if pictures else {}
         if not result.interrupted:
             more |= {"configuration": asked, "text": text}
         if photographs is not None:

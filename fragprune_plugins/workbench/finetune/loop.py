@@ -31,8 +31,8 @@ from fragprune_plugins.plugins.hooks import engine_for, schedule_for, thresholds
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.workbench.distributed.processes import expect_divisible, processes_of
 from fragprune_plugins.workbench.finetune.checkpoints import UNFIT
-from fragprune_plugins.workbench.finetune.processes import expect_divisible, processes_of
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
 from fragprune_plugins.workbench.finetune.timing import require_reach, times_faster
 from fragprune_plugins.workbench.models import model as models

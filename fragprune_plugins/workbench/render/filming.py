@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from fragprune_plugins.errors import OutputError, UsageError
@@ -40,8 +43,6 @@ def orbit(
     Raises:
         InputError: there is no such view.
     """
-    from scipy.spatial.transform import Rotation
-
     first = overview(splat, up, width=width, height=height, fov_y=fov_y)
     centre, _ = bounds(splat)
     axis = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
@@ -84,6 +85,23 @@ def _with_lens(view: View, other: View) -> View:
     )
 
 
+def require_encoder() -> ModuleType:
+    """The package that writes films.
+
+    Raises:
+        UsageError: it is not installed.
+    """
+    try:
+        return importlib.import_module("imageio_ffmpeg")
+    except ImportError as error:
+        raise UsageError(
+            "--out",
+            "a film, and imageio-ffmpeg is not installed",
+            "the package imageio-ffmpeg, which writes films",
+            "pip install 'fragprune-plugins[video]', or name a folder for pictures.",
+        ) from error
+
+
 def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> int:
     """Write pictures as an H.264 film; an existing file stays until the film is complete.
 
@@ -100,15 +118,7 @@ def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> int:
         UsageError: imageio-ffmpeg is not installed.
         OutputError: the film cannot be written.
     """
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise UsageError(
-            "--out",
-            f"{path.name}, and imageio-ffmpeg is not installed",
-            "the package imageio-ffmpeg, to write films",
-            "pip install 'fragprune-plugins[video]', or name a folder for pictures.",
-        ) from error
+    encoder = require_encoder()
     count = 0
     with replacing(path) as temporary:
         writer = None
@@ -116,7 +126,7 @@ def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> int:
             for pixels in _bytes(frames):
                 if writer is None:
                     height, width = pixels.shape[:2]
-                    writer = imageio_ffmpeg.write_frames(
+                    writer = encoder.write_frames(
                         str(temporary), (width, height), fps=fps, macro_block_size=2, quality=8
                     )
                     writer.send(None)

@@ -154,10 +154,10 @@ def single_page(site: Site) -> bytes:
     size = sum(map(len, data.values()))
     if size > SINGLE_MAX:
         raise OutputError(
-            "--single-file",
+            "--out",
             f"{size >> 20} MiB of data",
             f"at most {SINGLE_MAX >> 20} MiB in one page",
-            "Write a folder: leave out --single-file.",
+            "Name a folder.",
         )
     # Names of all modules differ, so that one after the other they are one module.
     code = "\n".join(

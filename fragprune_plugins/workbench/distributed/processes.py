@@ -19,7 +19,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.workbench.finetune.sharded import ShardedEngine
+from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint
 
 

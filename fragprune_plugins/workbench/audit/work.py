@@ -1,0 +1,100 @@
+"""Measures a model from given or generated cameras, and writes the page."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.files.records import strict
+from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.workbench.audit import page
+from fragprune_plugins.workbench.audit.audit import audit as measured
+from fragprune_plugins.workbench.audit.placing import Placed, Side, place
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
+from fragprune_plugins.workbench.commands.options import EngineOptions, expect_one
+from fragprune_plugins.workbench.figures.wording import nothing_drawn
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
+
+PAGE, FIGURES = "audit.html", "audit.json"
+
+LARGEST = 1600
+"""Pixels of a picture's longer side, as hosts have it: a frame of more takes long."""
+
+
+def audit(
+    *,
+    model: Path,
+    cameras: Path | None,
+    data: Path | None,
+    side: Side | None,
+    views: int,
+    out: Path | None,
+    resolution: int | None,
+    white_background: bool,
+    no_truncation: bool,
+    engine: EngineOptions,
+) -> Report:
+    """Do what ``fragprune audit`` promises; its options are the arguments."""
+    expect_one(("--cameras", cameras), ("--data", data), (f"--{side}", side))
+    rasterizer, device = open_engine(engine)
+    loaded = load(model, truncation=not no_truncation, device=device)
+    if out is not None:
+        writable_folder(out)
+    if cameras is None and data is None and side is None:
+        cameras = cameras_of(model)
+    if cameras is None and data is None:
+        side = side or "auto"
+        placed = place(loaded, views, rasterizer, side=side, divide=resolution or 1)
+    else:
+        placed = _given(cameras, data, views, resolution, white_background)
+    named = [(name, view.to(device)) for name, view in placed.views]
+    measurements, shown = measured(loaded, named, engine=rasterizer, progress=True)
+    figures: dict[str, Any] = {
+        "model": str(model),
+        "cameras": {
+            "kind": placed.side,
+            "why": placed.why,
+            "enclosed": None if math.isnan(placed.enclosed) else placed.enclosed,
+        },
+        **measurements,
+        "maps": None if out is None else page.draw(out, shown),
+    }
+    figures["result"] = page.sentence(figures)
+    figures["pruning"] = page.pruning(figures)
+    figures["warnings"] = nothing_drawn([figures["fragments_per_pixel"]])
+    lines = [page.text(figures), *(f"Warning: {each}" for each in figures["warnings"])]
+    if out is None:
+        return Report(figures | {"page": None}, "\n".join(lines))
+    _write(figures, out)
+    lines.append(f"Wrote {out / PAGE} and {FIGURES}.")
+    return Report(figures | {"page": str(out / PAGE)}, "\n".join(lines))
+
+
+def _write(figures: dict[str, Any], out: Path) -> None:
+    with replacing(out / FIGURES) as path:
+        path.write_text(json.dumps(strict(figures), indent=1) + "\n", encoding="utf-8")
+    with replacing(out / PAGE) as path:
+        path.write_text(page.compose(figures, out), encoding="utf-8")
+
+
+def _given(
+    cameras: Path | None, data: Path | None, count: int, divide: int | None, white_background: bool
+) -> Placed:
+    """Cameras of a file or a scene folder, ``count`` at most, evenly spread."""
+    if cameras is not None:
+        named = load_cameras(cameras, white_background=white_background)
+    else:
+        assert data is not None
+        train, test = load_scene_cameras(data, white_background=white_background)
+        named = sorted([*train, *test], key=lambda each: each[0])
+    every = len(named)
+    chosen = list(evenly(named, count))
+    longest = max(max(view.width, view.height) for _, view in chosen)
+    chosen = divided(chosen, divide or -(-longest // LARGEST))
+    why = f"{len(chosen)} of the {every} cameras of {cameras or data}, evenly spread."
+    return Placed(chosen, "given", why, math.nan)

@@ -1,0 +1,219 @@
+"""Times engines, or measures the prices of this machine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.plugins.hooks import thresholds_for
+from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.workbench.bench.timing import Case, Pass, measure, scaling, translation
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
+from fragprune_plugins.workbench.commands.options import EngineOptions, given
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.prices.calibration import calibrate as measure_prices
+from fragprune_plugins.workbench.prices.calibration import kept_at
+from fragprune_plugins.workbench.prices.machine import describe_machine, load_average
+from fragprune_plugins.workbench.prices.scene import make_scene, make_view
+from fragprune_plugins.workbench.scenes.cameras import load_cameras
+
+TRUNCATION = 16 / 255
+"""Threshold of all Gaussians in truncated rows; leaves 0.63 of the fragments, as learning does."""
+
+REPEATS = 9
+"""Timed frames of each row."""
+
+_KINDS: tuple[Pass, ...] = ("forward", "forward_backward")
+
+Size = tuple[int, int]
+
+Scene = tuple[str, Splats, View, Tensor, float | None]
+"""Name, activated Gaussians, camera, and the thresholds (N,) and the stop of truncated rows."""
+
+
+def bench(
+    *,
+    model: Path | None,
+    cameras: Path | None,
+    sizes: list[Size],
+    gaussians: tuple[int, ...],
+    calibrate: bool,
+    out: Path | None,
+    engine: EngineOptions,
+) -> Report:
+    """Do what ``fragprune bench`` promises; its options are the arguments."""
+    _expect_used(model, calibrate=calibrate)
+    if calibrate:
+        return _calibrate(out, engine)
+    rasterizer, device = open_engine(engine)
+    before = load_average()
+    scenes = (
+        _generated(gaussians, sizes, device)
+        if model is None
+        else _of_model(model, cameras, sizes, device)
+    )
+    cases = [
+        case
+        for name, splats, view, cut, stop in scenes
+        for kind in _KINDS
+        for case in (
+            Case(name, view, splats, kind),
+            Case(name, view, splats, kind, cut, stop),
+        )
+    ]
+    results = measure(cases, [rasterizer], repeats=REPEATS, say=_say)
+    machine = describe_machine(device) | {"load_before": before, "load_after": load_average()}
+    saved = translation(results, rasterizer.name)
+    one_scene = len({row["scene"] for row in results}) == 1
+    data = {
+        "results": results,
+        "translation": {
+            key.split()[-1] if one_scene else key: each["share"] for key, each in saved.items()
+        },
+        "saved": saved,
+        "scaling": scaling(results, rasterizer.name),
+        "machine": machine,
+    }
+    return Report(data, _table(data))
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _expect_used(model: Path | None, *, calibrate: bool) -> None:
+    """Refuse options that would change nothing."""
+    scene = {"cameras", "sizes", "gaussians"}
+    if calibrate:
+        why, unused = "--calibrate", {"model", *scene}
+    else:
+        why = "a generated scene" if model is None else "MODEL"
+        unused = {"out", "cameras" if model is None else "gaussians"}
+    for name in sorted(unused & given()):
+        option = {"model": "MODEL", "sizes": "--size"}.get(name, f"--{name}")
+        raise UsageError(
+            "options", f"{option} with {why}", "options that have an effect", f"Remove {option}."
+        )
+
+
+def _generated(gaussians: tuple[int, ...], sizes: list[Size], device: torch.device) -> list[Scene]:
+    """A generated scene for each count of Gaussians and image size."""
+    scenes: list[Scene] = []
+    for count in gaussians:
+        for size in sizes:
+            splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
+            cut = torch.full_like(splats.opacities, TRUNCATION)
+            scenes.append((f"bench-{count}", splats, view, cut, None))
+    return scenes
+
+
+def _of_model(
+    model: Path, cameras: Path | None, sizes: list[Size], device: torch.device
+) -> list[Scene]:
+    """A model from its first camera, in each image size."""
+    cameras = cameras or cameras_of(model)
+    if cameras is None:
+        raise UsageError(
+            "--cameras",
+            "no file, and no cameras.json of a training around MODEL",
+            "a camera to draw from",
+            "Pass --cameras FILE.",
+        )
+    loaded = load(model, device=device)
+    splats, first = loaded.splats(), load_cameras(cameras)[0][1].to(device)
+    scenes = []
+    for width, height in sizes:
+        view = replace(first, width=width, height=height)
+        cut = thresholds_for(RasterInputs(view, splats), loaded.thresholds)
+        cut = torch.full_like(splats.opacities, TRUNCATION) if cut is None else cut.detach()
+        scenes.append((model.stem, splats, view, cut, loaded.stop))
+    return scenes
+
+
+def _calibrate(out: Path | None, engine: EngineOptions) -> Report:
+    """Measure the prices of this machine and keep them."""
+    rasterizer, device = open_engine(engine)
+    before = load_average()
+    found = measure_prices(rasterizer, device, say=_say)
+    cost, path = found.cost, out or kept_at(rasterizer, device)
+    cost.save(path)
+    left_out = sum(frame["left_out"] for frame in found.frames)
+    loads = {"load_before": before, "load_after": load_average()}
+    data: dict[str, Any] = {
+        "prices": dict(cost.prices),
+        "error": cost.error,
+        "machine": dict(cost.machine) | loads,
+        "frames": list(found.frames),
+        "kept": str(path),
+    }
+    lines = [f"{'':<30}{'ns':>12}"]
+    lines += [f"{_UNITS[unit]:<30}{price:>12,.2f}" for unit, price in cost.prices.items()]
+    lines += [
+        f"Predicted times of {left_out} frames left out of the fit are off by "
+        f"{100 * cost.error:.0f} % (median; {len(found.frames) - left_out} frames in the fit).",
+        f"{rasterizer.name} engine on {cost.machine['processor']}, {cost.machine['threads']} "
+        f"threads; {_busy(loads)}",
+        f"Kept in {path}.",
+    ]
+    return Report(data, "\n".join(lines))
+
+
+_UNITS = {
+    "frame": "a frame, besides",
+    "pixel": "a pixel",
+    "gaussian": "a Gaussian",
+    "entry": "a list entry",
+    "evaluated": "an evaluated fragment",
+    "fragment": "a drawn fragment, on top",
+}
+
+
+def _table(data: dict[str, Any]) -> str:
+    results, machine = data["results"], data["machine"]
+    lines = [
+        f"{'scene':<16}{'size':>11}  {'pass':<17}{'cut':<5}{'frag/px':>8}{'tested':>8}"
+        f"{'median ms':>11}{'min':>9}{'±se':>7}{'ns/frag':>9}{'peak MB':>9}"
+    ]
+    for r in results:
+        peak = "-" if r["peak_mb"] is None else f"{r['peak_mb']:.0f}"
+        price = "-" if r["ns_per_fragment"] is None else f"{r['ns_per_fragment']:.2f}"
+        lines.append(
+            f"{r['scene']:<16}{r['width']:>6}x{r['height']:<4}  {r['pass']:<17}"
+            f"{'yes' if r['truncated'] else 'no':<5}{r['fragments_per_pixel']:>8.1f}"
+            f"{r['evaluated_per_pixel']:>8.1f}{r['ms_median']:>11.2f}{r['ms_min']:>9.2f}"
+            f"{r['ms_se']:>7.2f}{price:>9}{peak:>9}"
+        )
+        if r["stages"]:
+            parts = ", ".join(f"{name} {ms:.2f}" for name, ms in r["stages"].items())
+            lines.append(f"{'':<29}{parts}")
+    for name, saved in data["saved"].items():
+        lines.append(
+            f"{name}: {saved['fragments']:.2f}x fewer fragments, {saved['time']:.2f}x less time "
+            f"({100 * saved['share']:.0f}% of it)"
+        )
+    if (prices := data["scaling"]) is not None:
+        lines.append(
+            f"a fragment costs {prices['least']:.2f} to {prices['most']:.2f} ns: "
+            f"{prices['ratio']:.1f}x between the cheapest and the dearest scene and size"
+        )
+    first = results[0]
+    lines.append(
+        f"{first['engine']} engine ({machine['native']}) on {machine['gpu'] or first['device']}, "
+        f"{first['threads']} threads on {machine['processor']}; "
+        f"{_busy(machine)}"
+    )
+    return "\n".join(lines)
+
+
+def _busy(loads: dict[str, Any]) -> str:
+    """The machine's load before and after, as words."""
+    if loads["load_before"] is None:
+        return "load unknown on this system"
+    return f"load {loads['load_before']:.1f} to {loads['load_after']:.1f}"

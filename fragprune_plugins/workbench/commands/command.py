@@ -1,0 +1,184 @@
+"""A command: prints its report or its error, and sets the exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import click
+
+from fragprune_plugins.errors import (
+    FragpruneError,
+    Interrupted,
+    MemoryLimitError,
+    PathError,
+    Terminated,
+    UsageError,
+    printable,
+)
+from fragprune_plugins.files.records import strict
+from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
+from fragprune_plugins.workbench.ranks import launched, speaks
+
+JSON = "fragprune.json"
+"""Key of a bool in the context's ``meta``: stdout gets only one JSON object."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The output of a command.
+
+    Attributes:
+        data: the object that --json prints.
+        text: the text for a person.
+        exit_code: 0; 1 if the check failed; 130 or 143 if learning was interrupted and saved.
+    """
+
+    data: dict[str, Any]
+    text: str
+    exit_code: int = 0
+
+
+class Command(click.Command):
+    """A command whose function returns a ``Report``: prints it and sets the exit code.
+
+    Of several processes one prints; None says that another one reports.
+
+    A ``FragpruneError`` gives exit code 1, a usage error 2, Ctrl-C 130, SIGTERM during learning
+    143. Any other exception keeps its traceback.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.params.append(
+            click.Option(
+                ["--json", "as_json"], is_flag=True, help="Print one JSON object on stdout."
+            )
+        )
+
+    def make_context(
+        self,
+        info_name: str | None,
+        args: list[str],
+        parent: click.Context | None = None,
+        **extra: Any,
+    ) -> click.Context:
+        """Parse the words; with --json among them, a usage error is printed as JSON."""
+        words = list(args)
+        try:
+            return super().make_context(info_name, args, parent, **extra)
+        except click.UsageError as error:
+            raise usage_error(error, words) from error
+        except FragpruneError as error:  # of a type of an argument
+            raise _stated(error, as_json="--json" in _ours(words)) from error
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command, print its report or error, and exit with its code."""
+        as_json = ctx.meta[JSON] = bool(ctx.params.pop("as_json"))
+        try:
+            with _machine_stated(ctx.command_path):
+                report: Report | None = super().invoke(ctx)
+        except FragpruneError as error:
+            raise _stated(error, as_json=as_json) from error
+        except KeyboardInterrupt as error:
+            if speaks():
+                click.echo("Interrupted.", err=True)
+            ctx.exit(EXIT_CODE if isinstance(error, Terminate) else 130)
+        if report is None:
+            ctx.exit(0)
+        click.echo(json.dumps(strict(report.data)) if as_json else printable(report.text))
+        ctx.exit(report.exit_code)
+
+
+class Group(click.Group):
+    """Commands under one name; with --json, an unknown one is printed as JSON."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that the first word names, and the other words."""
+        words = list(args)
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            near = difflib.get_close_matches(words[0], self.list_commands(ctx))
+            meant = f"Did you mean {' or '.join(near)}?" if near else "The list: --help."
+            told = click.UsageError(f"{error.message} {meant}", error.ctx)
+            raise usage_error(told, words) from error
+
+
+def _stated(error: FragpruneError, *, as_json: bool) -> click.exceptions.Exit:
+    """Print an error, as JSON on stdout if asked for; returns the exit with its code."""
+    if speaks():
+        text = json.dumps({"error": error.as_dict()}) if as_json else str(error)
+        click.echo(text, err=not as_json)
+    codes = {UsageError: 2, Interrupted: 130, Terminated: EXIT_CODE}
+    return click.exceptions.Exit(codes.get(type(error), 1))
+
+
+def _ours(words: list[str]) -> list[str]:
+    """The words of a command line that are not a host's command."""
+    return words[: words.index("--")] if "--" in words else words
+
+
+@contextlib.contextmanager
+def _machine_stated(where: str) -> Iterator[None]:
+    """State what the machine refuses wherever a command meets it: a path, or memory."""
+    try:
+        os.getcwd()  # where that folder is gone, torch ends the process without a word of ours
+        yield
+    except OSError as error:
+        if not (error.filename or isinstance(error, FileNotFoundError)):  # a closed pipe, for one
+            raise
+        raise PathError(
+            str(error.filename or where),
+            error.strerror or str(error),
+            "a path that the system takes",
+            "Choose another name or place, or free space and permissions there.",
+        ) from error
+    except (MemoryError, RuntimeError) as error:
+        words = str(error).split("\n", 1)[0][:200]
+        known = "allocate memory" in words or "out of memory" in words  # torch's, of CPU and GPU
+        if not (known or isinstance(error, MemoryError)):
+            raise
+        raise MemoryLimitError(
+            where,
+            f"no memory left ({words or 'MemoryError'})",
+            "a model and pictures that fit",
+            "Close other programs, or lower the pictures' size with --resolution.",
+        ) from error
+
+
+def usage_error(error: click.UsageError, words: list[str]) -> Exception:
+    """The exception to raise for a usage error. With --json, prints the error and returns an exit.
+
+    Args:
+        error: click's error.
+        words: words of the command line. Words after ``--`` belong to the host's command.
+    """
+    if not speaks():
+        return click.exceptions.Exit(2)
+    if "--json" not in _ours(words):
+        return error
+    where = error.ctx.command_path if error.ctx else "fragprune"
+    found, remedy = error.format_message(), f"Run {where} --help."
+    return _stated(UsageError(where, found, "options of this command", remedy), as_json=True)
+
+
+@contextlib.contextmanager
+def first_process_prints() -> Iterator[None]:
+    """Inside, only the first of several processes prints."""
+    if launched().first:
+        yield
+        return
+    with (
+        open(os.devnull, "w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+    ):
+        yield

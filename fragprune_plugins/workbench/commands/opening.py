@@ -1,0 +1,126 @@
+"""Opens what options name: an engine, photographs, cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+
+from fragprune_plugins.engines import Engine, device_for
+from fragprune_plugins.errors import UsageError, printable
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.ranks import launched, local_rank
+from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
+from fragprune_plugins.workbench.scenes.generated import around
+from fragprune_plugins.workbench.scenes.itself import own_pictures
+from fragprune_plugins.workbench.scenes.output import (
+    ARGUMENTS,
+    CAMERAS,
+    output_folder,
+    trained_on,
+)
+
+
+def bound_threads(threads: int | None) -> None:
+    """Limit torch and the engines to this many CPU threads; None sets no limit."""
+    if threads is not None:
+        torch.set_num_threads(threads)
+
+
+def open_engine(options: EngineOptions) -> tuple[Engine, torch.device]:
+    """Open the engine of the options; its threads are bounded.
+
+    Returns:
+        The engine, and the device for models and views.
+
+    Raises:
+        UsageError: the device does not exist.
+        EngineError: the engine does not exist or cannot run here.
+    """
+    bound_threads(options.threads)
+    device = device_for(options.device, options.name)
+    if launched().several and options.device in ("auto", "cuda") and device.type == "cuda":
+        device = device_for(f"cuda:{local_rank()}", options.name)
+    return engine_for(options.name, device), device
+
+
+def cameras_of(model: Path) -> Path | None:
+    """The cameras that a host wrote beside a model, if its output folder has them."""
+    folder = output_folder(model)
+    return folder / CAMERAS if folder is not None and (folder / CAMERAS).is_file() else None
+
+
+def photographs_for(
+    model: Path, scene: SceneOptions, *, remedy: str = "Name the scene's folder with --data."
+) -> Photographs:
+    """The photographs that the options name; without --data those that the model was trained on.
+
+    Options that were given override what the training says.
+
+    Raises:
+        UsageError: there is no folder, and the model lies in no output folder with arguments.
+        DatasetError: the training's arguments cannot be read.
+    """
+    if scene.data is not None:
+        size = Resolution(scene.resolution)
+        return Photographs(scene.data, size, scene.white_background, scene.images)
+    trained = trained_on(model)
+    if trained is None:
+        raise UsageError(
+            "--data",
+            f"no folder, and no {ARGUMENTS} of a training around {model}",
+            "photographs",
+            remedy,
+        )
+    click.echo(
+        printable(f"Photographs: {trained.folder}, which the model was trained on"), err=True
+    )
+    return overridden(trained, scene)
+
+
+def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:
+    """Photographs of a record, with the options that the user gave in place of what it says."""
+    values: dict[str, Any] = {
+        "folder": scene.data,
+        "images": scene.images if "images" in scene.given else None,
+        "resolution": Resolution(scene.resolution) if "resolution" in scene.given else None,
+        "white_background": scene.white_background or None,
+    }
+    return replace(photographs, **{key: each for key, each in values.items() if each is not None})
+
+
+def chosen(dataset: Dataset, views: str) -> Sequence[Shot]:
+    """The views that ``--views`` names: "test", "train" or "all"."""
+    return {
+        "test": dataset.test,
+        "train": dataset.train,
+        "all": [*dataset.train, *dataset.test],
+    }[views]
+
+
+def pictures_of(
+    model: Model, scene: SceneOptions, cameras: Path | None, engine: Engine, *, seed: int = 0
+) -> Dataset:
+    """A model's own pictures from the cameras that options name; all around it without any.
+
+    Raises:
+        DatasetError: the cameras cannot be read.
+    """
+    held_out = None
+    if scene.data is not None:
+        views, test = load_scene_cameras(scene.data, white_background=scene.white_background)
+        held_out = divided(test, scene.resolution)
+    elif cameras is not None:
+        views = load_cameras(cameras, white_background=scene.white_background)
+    else:
+        background = torch.full((3,), float(scene.white_background))
+        views = around(model, background=background, seed=seed)
+    return own_pictures(model, divided(views, scene.resolution), held_out, engine=engine, seed=seed)

@@ -1,0 +1,344 @@
+"""The options that several commands share, and the values that they become."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from click.core import ParameterSource
+
+from fragprune_plugins.errors import ModelFileError, UsageError, printable
+from fragprune_plugins.workbench.ranks import launched
+from fragprune_plugins.workbench.scenes.output import newest_model
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+FILE = click.Path(path_type=Path)
+
+
+class OutFile(click.Path):
+    """Type of an option for a file to write; refuses a name without a suffix before any work.
+
+    Args:
+        suffixes: one is required, such as ".ply"; upper and lower case are equal.
+    """
+
+    def __init__(self, *suffixes: str) -> None:
+        super().__init__(path_type=Path)
+        self.suffixes = suffixes
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The option's value as a path; a usage error if it lacks the suffix."""
+        path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
+        if path.suffix.lower() not in self.suffixes:
+            self.fail(f"'{path}' does not end with {' or '.join(self.suffixes)}.", param, ctx)
+        return path
+
+
+class Number(click.FloatRange):
+    """Type of an option for a number; refuses NaN, which passes every range, and infinity."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The option's value; a usage error if it is not finite or out of range."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{number} is not a number in a range.", param, ctx)
+        return number
+
+
+class ModelFile(click.Path):
+    """Type of an argument for a model: its file, or the output folder of a training."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The file; of an output folder that of the highest iteration, which is named on stderr."""
+        path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
+        try:
+            os.lstat(path)
+        except OSError as error:
+            missing = isinstance(error, FileNotFoundError)
+            raise ModelFileError(
+                str(path),
+                "no such file" if missing else f"cannot be opened ({error.strerror})",
+                "a trained splat, or the output folder of a training",
+                "Check the path.",
+            ) from error
+        if not os.path.isdir(path):
+            return path
+        try:
+            newest = newest_model(path)
+        except ModelFileError as error:
+            self.fail(f"'{path}' is {error.found}. {error.remedy}", param, ctx)
+        if launched().first:
+            click.echo(printable(f"Model: {newest}"), err=True)
+        return newest
+
+
+MODEL = ModelFile()
+
+
+def together(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:
+    """Several options as one decorator; --help shows them in this order."""
+
+    def decorate(function: Function) -> Function:
+        return functools.reduce(lambda f, option: option(f), reversed(options), function)
+
+    return decorate
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    """What draws: the options ``--engine``, ``--device`` and ``--threads``."""
+
+    name: str = "auto"
+    device: str = "auto"
+    threads: int | None = None
+
+
+def engine_options(
+    what: str = "Engine that rasterizes",
+    device: str = "Device; auto takes a GPU if our cuda engine can draw on it, else the CPU.",
+    default: str = "auto",
+) -> Callable[[Function], Function]:
+    """The options of ``EngineOptions``, which a command gets as ``engine``.
+
+    Args:
+        what: what the engine is used for, for --help.
+        device: help of ``--device``.
+        default: default of ``--device``.
+    """
+    names = "auto (the fastest that runs here), reference, cpu, cuda, or a plugin's engine."
+
+    def decorate(function: Function) -> Function:
+        @functools.wraps(function)
+        def with_engine(
+            *args: Any, engine: str, device: str, threads: int | None, **kwargs: Any
+        ) -> Any:
+            return function(*args, engine=EngineOptions(engine, device, threads), **kwargs)
+
+        options = together(
+            click.option(
+                "--engine",
+                metavar="NAME",
+                default="auto",
+                show_default=True,
+                help=f"{what}: {names}",
+            ),
+            click.option(
+                "--device",
+                metavar="auto|cpu|cuda[:N]",
+                callback=_device,
+                default=default,
+                show_default=True,
+                help=device,
+            ),
+            click.option(
+                "--threads",
+                type=click.IntRange(min=1),
+                help="Number of CPU threads; default: all cores.",
+            ),
+        )
+        return options(with_engine)  # type: ignore[return-value]
+
+    return decorate
+
+
+def _device(ctx: click.Context, param: click.Parameter, value: str) -> str:
+    """Check that a word has the form of a device; ``engines.device_for`` checks that it exists."""
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,2})?", value):
+        raise click.BadParameter(f"{value!r} is not one of auto, cpu, cuda, cuda:N.")
+    return value
+
+
+DATA_HELP = (
+    "Scene folder: COLMAP (sparse/, images/), Blender (transforms_*.json) or nerfstudio "
+    "(transforms.json)."
+)
+
+CAMERAS_HELP = (
+    "cameras.json of a 3DGS model, transforms*.json, or nerfstudio's camera_path.json. "
+    "Default: the cameras.json that the training of MODEL wrote"
+)
+
+TRAINED_ON = "Default: the photographs that MODEL was trained on, by the cfg_args of its host."
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Photographs and their size: ``--data``, ``--images``, ``--resolution`` and so on.
+
+    Attributes:
+        data: the scene folder; None where no option names it.
+        images: folder of ``data`` with the images.
+        resolution: divisor of the images' sides.
+        white_background: transparent images are composited over white.
+        given: names of the options that the user gave, such as "resolution".
+    """
+
+    data: Path | None = None
+    images: str = "images"
+    resolution: int = 1
+    white_background: bool = False
+    given: frozenset[str] = frozenset()
+
+    def as_record(self, cameras: Path | None) -> dict[str, Any]:
+        """The cameras of a model's own pictures as plain values, for records.
+
+        Args:
+            cameras: a file with them.
+        """
+        return {
+            "data": None if self.data is None else str(self.data.resolve()),
+            "file": None if cameras is None else str(cameras.resolve()),
+            "resolution": self.resolution,
+            "white_background": self.white_background,
+        }
+
+
+def scene_options(data: str = f"{DATA_HELP} {TRAINED_ON}") -> Callable[[Function], Function]:
+    """The options of ``SceneOptions``, which a command gets as ``scene``.
+
+    Args:
+        data: help of ``--data``.
+    """
+
+    def decorate(function: Function) -> Function:
+        @functools.wraps(function)
+        def with_scene(
+            *args: Any,
+            data: Path | None,
+            images: str,
+            resolution: int,
+            white_background: bool,
+            **kwargs: Any,
+        ) -> Any:
+            scene = SceneOptions(data, images, resolution, white_background, given())
+            return function(*args, scene=scene, **kwargs)
+
+        options = together(
+            click.option("--data", type=FILE, help=data),
+            click.option(
+                "--images",
+                metavar="NAME",
+                default="images",
+                show_default=True,
+                help="Folder of --data with the images, such as images_4. Without images/, the "
+                "largest of images_2, images_4 and images_8 serves.",
+            ),
+            click.option(
+                "--resolution",
+                type=click.IntRange(1, 16),
+                default=1,
+                show_default=True,
+                help="Divide the images' sides by this.",
+            ),
+            click.option(
+                "--white-background",
+                is_flag=True,
+                help="Composite transparent images over white, as the model was trained.",
+            ),
+        )
+        return options(with_scene)  # type: ignore[return-value]
+
+    return decorate
+
+
+def own_picture_options(function: Function) -> Function:
+    """``--self``, ``--cameras`` and ``--orbit``, for what is compared with a model's own pictures.
+
+    A command gets ``itself``, whether one of them was given, and ``cameras``, of a file or None.
+
+    Raises:
+        UsageError: several options name cameras.
+    """
+
+    @functools.wraps(function)
+    def with_own_pictures(
+        *args: Any, itself: bool, cameras: Path | None, orbit: bool, **kwargs: Any
+    ) -> Any:
+        data = kwargs["scene"].data
+        expect_one(("--cameras", cameras), ("--data", data), ("--orbit", orbit))
+        itself = itself or orbit or cameras is not None
+        return function(*args, itself=itself, cameras=cameras, **kwargs)
+
+    options = together(
+        click.option(
+            "--self",
+            "itself",
+            is_flag=True,
+            help="Measure against the model's own pictures instead of photographs, from the "
+            "cameras of --data, or as --orbit.",
+        ),
+        click.option(
+            "--cameras", type=FILE, help="Likewise, from a cameras.json or transforms*.json."
+        ),
+        click.option("--orbit", is_flag=True, help="Likewise, from cameras all around the model."),
+    )
+    return options(with_own_pictures)  # type: ignore[return-value]
+
+
+def given() -> frozenset[str]:
+    """Names of the parameters of the running command that the user gave."""
+    context = click.get_current_context()
+    return frozenset(
+        name
+        for name in context.params
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT
+    )
+
+
+def expect_one(*options: tuple[str, object], none: bool = True) -> None:
+    """Raise UsageError if more than one of some options was given, or none of them.
+
+    Args:
+        options: name and value of each; None and False are values of options not given.
+        none: whether it is fine to give none of them.
+    """
+    found = [name for name, value in options if value is not None and value is not False]
+    if len(found) > 1 or not (found or none):
+        names = [name for name, _ in options]
+        one = f"one of {', '.join(names[:-1])} and {names[-1]}"
+        raise UsageError("options", " with ".join(found) or "none of them", one, "Pass one.")
+
+
+truncation_option = click.option(
+    "--no-truncation", is_flag=True, help="Ignore the thresholds stored with the model."
+)
+
+views_option = click.option(
+    "--views",
+    type=click.Choice(["test", "train", "all"]),
+    default="test",
+    show_default=True,
+    help="Views to use; test means the held-out views (COLMAP: every 8th).",
+)
+
+shard_option = click.option(
+    "--shard-gaussians",
+    "shard",
+    is_flag=True,
+    help="Under torchrun: divide MODEL's Gaussians among the processes, for a model that does not "
+    "fit one GPU. Without it each process holds them all.",
+)
+
+
+def require_several() -> None:
+    """Raise UsageError unless this is one of several processes: --shard-gaussians divides."""
+    if not launched().several:
+        raise UsageError(
+            "--shard-gaussians",
+            "one process",
+            "several, among which Gaussians can be divided",
+            "Start with torchrun --nproc_per_node N -m fragprune_plugins, or leave it out.",
+        )

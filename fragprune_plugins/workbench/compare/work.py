@@ -1,0 +1,172 @@
+"""Measures two models on the same pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files import records
+from fragprune_plugins.files.atomic import writable_folder
+from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import (
+    chosen,
+    open_engine,
+    overridden,
+    pictures_of,
+)
+from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.panels import draw_panels
+from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
+from fragprune_plugins.workbench.figures.wording import (
+    ITSELF,
+    describe,
+    gain,
+    nothing_drawn,
+    strangers,
+)
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.scenes.dataset import load_photographs
+from fragprune_plugins.workbench.scenes.output import trained_on
+
+
+@dataclass(frozen=True)
+class _OwnPictures:
+    """The cameras of a comparison with A's own pictures, and the seed of what is generated."""
+
+    scene: SceneOptions
+    cameras: Path | None
+    seed: int = 0
+
+
+def compare(
+    *,
+    a: Path,
+    b: Path,
+    itself: bool,
+    cameras: Path | None,
+    scene: SceneOptions,
+    out: Path | None,
+    views: str,
+    no_truncation: bool,
+    enlarge: int,
+    engine: EngineOptions,
+) -> Report:
+    """Do what ``fragprune compare`` promises; its options are the arguments."""
+    rasterizer, device = open_engine(engine)
+    if out is not None:
+        writable_folder(out)
+    known = _records(a, b)
+    own = _OwnPictures(scene, cameras) if itself else None
+    if own is None and scene.data is None:
+        own = _own_pictures(scene, a, b)
+    photographs = None if own else _photographs(scene, known, a, b)
+    models, candidates = [], []
+    for path in (a, b):
+        how = known.get(path)
+        filtered, drawing = (how.filtered, how.drawing) if how else (False, {})
+        model = load(path, truncation=not no_truncation, filtered=filtered, device=device)
+        models.append(model)
+        candidates.append(Candidate(model, drawing))
+    if photographs is not None:
+        dataset, shown = load_photographs(photographs).to(device), f"{photographs.folder}"
+    else:
+        assert own is not None
+        dataset = pictures_of(models[0], own.scene, own.cameras, rasterizer, seed=own.seed)
+        shown = "of A itself"
+    shots = chosen(dataset, views)
+    before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)
+    drawn = [each["fragments_per_pixel"] for each in (before, after)]
+    report: dict[str, Any] = {
+        "a": {"model": str(a)} | before,
+        "b": {"model": str(b)} | after,
+        "target": after["target"],
+        "speedup": drawn[0] / max(drawn[1], 1e-9),
+        "psnr_change": after["psnr"] - before["psnr"],
+        "ssim_change": after["ssim"] - before["ssim"],
+        "engine": rasterizer.name,
+        "device": before["device"],
+        "enlarge": enlarge,
+        "scene": photographs.as_dict() if photographs else None,
+        "warnings": nothing_drawn(drawn) + strangers(before, after),
+    }
+    width, height = shots[0].view.width, shots[0].view.height
+    pictures = "Photographs" if photographs else "Pictures"
+    lines = [
+        f"A: {a}\nB: {b}\n{pictures}: {shown}, the first of {width}x{height} pixels\n",
+        describe({"A": before, "B": after}),
+        *([f"Frames of {enlarge * width}x{enlarge * height} pixels."] if enlarge > 1 else []),
+        f"\nB against A: {gain(before, after)}.",
+        *(f"Warning: {each}" for each in report["warnings"]),
+    ]
+    if out is not None:
+        columns = dict(zip("AB", candidates, strict=True))
+        files = draw_panels(out, columns, shots, rasterizer)
+        report["files"] = [str(file) for file in files]
+        records.leave(out / "compare", "compare", report)
+        lines.append(f"Wrote {len(files)} pictures to {out}.")
+    return Report(report, "\n".join(lines))
+
+
+def _records(*models: Path) -> dict[Path, Recorded]:
+    """By model, what the record of the command that wrote it says, if there is one."""
+    known: dict[Path, Recorded] = {}
+    for model in models:
+        record = records.beside(model)
+        read = recorded(record) if record else None
+        if read:
+            known[model] = read
+            known |= {other: read for other in models if other.resolve() == read.models[0]}
+    return known
+
+
+def _own_pictures(scene: SceneOptions, *models: Path) -> _OwnPictures | None:
+    """The cameras of the fine-tuning with --self that wrote one of the models; None without one.
+
+    Raises:
+        RecordError: its record is malformed.
+    """
+    for record in filter(None, map(records.beside, models)):
+        if record.data.get("target") != ITSELF:
+            continue
+        with records.DOOR.stated(record.path) as reading:
+            reading.place = "data.cameras"
+            values = record.data.get("cameras") or {}
+            folder = record.path.parent
+            data, cameras = (
+                records.located(values[name], folder) if values.get(name) else None
+                for name in ("data", "file")
+            )
+            if "resolution" not in scene.given:
+                scene = replace(scene, resolution=int(values.get("resolution", 1)))
+            white = scene.white_background or bool(values.get("white_background"))
+            scene = replace(scene, data=data, white_background=white)
+            return _OwnPictures(scene, cameras, int(record.data["seed"]))
+    return None
+
+
+def _photographs(scene: SceneOptions, known: dict[Path, Recorded], *models: Path) -> Photographs:
+    """The photographs that the options name; else those of the records or of the trainings.
+
+    Raises:
+        UsageError: there is no folder, and nothing says which, or the models differ in it.
+        DatasetError: a training's arguments cannot be read.
+    """
+    read = {each.photographs for each in known.values()}
+    if not read and scene.data is None:
+        read = {each for each in map(trained_on, models) if each is not None}
+    if len(read) == 1:
+        return overridden(read.pop(), scene)
+    if scene.data is None:
+        raise UsageError(
+            "--data",
+            "no folder, and the models' runs read photographs in two ways"
+            if read
+            else "no folder, and no record of a run or cfg_args of a training beside the models",
+            "a scene folder, or A's own pictures",
+            "Name it with --data; without photographs, pass --self.",
+        )
+    return overridden(Photographs(scene.data), scene)

@@ -1,0 +1,75 @@
+"""Where a model is to be written, and what a person is told of the file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fragprune_plugins.errors import OutputError, UsageError
+from fragprune_plugins.files.atomic import writable_folder
+from fragprune_plugins.workbench.models import formats
+
+
+def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
+    """Check, before any work, that ``out`` can be written and is not ``model``.
+
+    Args:
+        out: the model to write, of any format.
+        model: the model to read.
+        thresholds: whether ``out`` is to have thresholds.
+
+    Raises:
+        UsageError: ``out`` and ``model`` have the same name, or of two PLYs the same sidecar.
+        OutputError: ``out`` cannot be written, or its format cannot hold thresholds.
+    """
+    form = formats.named(out)
+    if thresholds:
+        formats.expect_carrier(form, out)
+    own, other = out.resolve(), model.resolve()
+    if form.paired and other.suffix.lower() == ".ply":
+        own, other = own.with_suffix(""), other.with_suffix("")
+    if own == other:
+        raise UsageError(
+            "--out", f"{out}, the model's name", "another name", "Choose another name."
+        )
+    writable_folder(out.parent)
+    if out.is_dir():
+        raise OutputError(
+            str(out), "a folder", f"a {form.suffix} file", "Name a file in the folder."
+        )
+
+
+def describe_written(out: Path, held: str = "") -> str:
+    """What a model was written into, and what its format does not keep.
+
+    Args:
+        out: the file.
+        held: how it holds thresholds, as words; "" where there are none.
+    """
+    form = formats.named(out)
+    kept = f" A {form.suffix} file keeps {form.keeps}." if form.keeps else ""
+    return f"Wrote {out}{held}.{kept}"
+
+
+def dropping(out: Path, bytes_before: int, before: int, after: int) -> dict[str, int]:
+    """Counts of dropped Gaussians and bytes, for --json.
+
+    Args:
+        out: the file without the dropped Gaussians.
+        bytes_before: size of the file with all Gaussians.
+        before: number of all Gaussians.
+        after: number of Gaussians left.
+    """
+    return {
+        "gaussians": before - after,
+        "of": before,
+        "bytes_before": bytes_before,
+        "bytes_after": out.stat().st_size,
+    }
+
+
+def describe_dropped(dropped: dict[str, int], why: str) -> str:
+    """The counts of ``dropping`` as a line of text; ``why`` describes the dropped Gaussians."""
+    return (
+        f"Dropped {dropped['gaussians']:,} of {dropped['of']:,} Gaussians, {why}: "
+        f"{dropped['bytes_before']:,} -> {dropped['bytes_after']:,} bytes."
+    )

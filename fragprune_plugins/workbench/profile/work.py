@@ -1,0 +1,78 @@
+"""Measures a model with and without its thresholds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fragprune_plugins.files import records
+from fragprune_plugins.files.atomic import writable_folder
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import (
+    chosen,
+    open_engine,
+    photographs_for,
+    pictures_of,
+)
+from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.panels import draw_panels
+from fragprune_plugins.workbench.figures.wording import describe, nothing_drawn
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.scenes.dataset import load_photographs
+
+
+def profile(
+    *,
+    model: Path,
+    itself: bool,
+    cameras: Path | None,
+    scene: SceneOptions,
+    out: Path | None,
+    views: str,
+    no_truncation: bool,
+    engine: EngineOptions,
+) -> Report:
+    """Do what ``fragprune profile`` promises; its options are the arguments."""
+    rasterizer, device = open_engine(engine)
+    if out is not None:
+        writable_folder(out)
+    loaded = load(model, truncation=not no_truncation, device=device)
+    if itself:
+        dataset = pictures_of(loaded.untruncated(), scene, cameras, rasterizer)
+    else:
+        remedy = "Name the scene's folder with --data; without photographs, pass --self."
+        dataset = load_photographs(photographs_for(model, scene, remedy=remedy)).to(device)
+    shots = chosen(dataset, views)
+    columns = {"untruncated": Candidate(loaded.untruncated())}
+    if loaded.falloff is not None:
+        columns["truncated"] = Candidate(loaded)
+    measurements = measure_all(list(columns.values()), shots, engine=rasterizer)
+    measured = dict(zip(columns, measurements, strict=True))
+    warnings = nothing_drawn([each["fragments_per_pixel"] for each in measurements])
+    report: dict[str, Any] = {
+        "model": str(model),
+        "truncated": loaded.falloff is not None,
+        **measurements[-1],
+        "columns": measured,
+        "warnings": warnings,
+    }
+    lines = [describe(measured), *(f"Warning: {each}" for each in warnings)]
+    if loaded.falloff is not None:
+        points = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
+        thresholds = loaded.falloff.cpu()
+        step = max(1, len(thresholds) // 100_000)
+        quantiles = torch.quantile(thresholds[::step], points).tolist()
+        report["threshold_quantiles"] = quantiles
+        lines.append(
+            "learned thresholds (5, 25, 50, 75, 95 %): "
+            + ", ".join(f"{value:.3f}" for value in quantiles)
+        )
+    if out is not None:
+        files = draw_panels(out, columns, shots, rasterizer)
+        report["files"] = [str(file) for file in files]
+        records.leave(out / "profile", "profile", report)
+        lines.append(f"Wrote {len(files)} pictures to {out}.")
+    return Report(report, "\n".join(lines))

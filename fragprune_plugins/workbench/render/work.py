@@ -1,0 +1,231 @@
+"""Draws a model from many cameras, into pictures or a film."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files.atomic import writable_folder
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.plugins.hooks import thresholds_for
+from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import (
+    cameras_of,
+    chosen,
+    open_engine,
+    photographs_for,
+)
+from fragprune_plugins.workbench.commands.options import (
+    EngineOptions,
+    SceneOptions,
+    expect_one,
+    require_several,
+)
+from fragprune_plugins.workbench.distributed.processes import part_of
+from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.figures.pictures import save_heatmap, save_image, stems
+from fragprune_plugins.workbench.figures.wording import nothing_drawn
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.ranks import Ranks, joined
+from fragprune_plugins.workbench.render import filming
+from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras
+from fragprune_plugins.workbench.scenes.dataset import load_photographs
+from fragprune_plugins.workbench.scenes.generated import Named
+
+FPS = 30
+"""Frames a second of a film."""
+
+_NO_FOLDER = (".gif", ".webm", ".mov", ".avi", ".mkv", ".png", ".jpg", ".jpeg", ".webp")
+
+
+def render(
+    *,
+    model: Path,
+    cameras: Path | None,
+    out: Path,
+    orbit: bool,
+    up: tuple[float, float, float],
+    seconds: float,
+    heatmap: bool,
+    views: str,
+    scene: SceneOptions,
+    no_truncation: bool,
+    shard: bool,
+    engine: EngineOptions,
+) -> Report | None:
+    """Do what ``fragprune render`` promises; its options are the arguments."""
+    film = out.suffix.lower() == ".mp4"
+    expect_one(("--cameras", cameras), ("--data", scene.data), ("--orbit", orbit))
+    _expect_place(out, film=film, heatmap=heatmap, shard=shard)
+    if scene.data is None and not orbit:
+        cameras = cameras or cameras_of(model)
+        _expect_cameras(cameras)
+    if scene.data is None:
+        _refuse_options_of_data(scene, views)
+    rasterizer, device = open_engine(engine)
+    writable_folder(out.parent if film else out)
+    whole = load(model, truncation=not no_truncation, device="cpu" if shard else device)
+    frames = max(1, round(seconds * FPS))
+    if scene.data is not None:
+        dataset = load_photographs(photographs_for(model, scene))
+        named = [(shot.name, shot.view) for shot in chosen(dataset, views)]
+    else:
+        named = _views(whole, cameras, scene, frames, up)
+    if film and not orbit:
+        named = filming.along(named, frames)
+    with joined(device) if shard else nullcontext(Ranks()) as ranks:
+        drawing = _Drawing(whole, named, rasterizer, device, ranks, shard, heatmap)
+        files = [out] if film else drawing.save(out)
+        if film:
+            filming.write_mp4(out, drawing.film(), FPS)
+        everybody = ranks.gather(drawing.fragments)
+    if not ranks.first:
+        return None
+    fragments = [figure for each in everybody for figure in each.values()]
+    mean = sum(fragments) / len(fragments)
+    warnings = nothing_drawn(fragments)
+    truncated = whole.falloff is not None
+    wrote = f"{out}, {len(fragments)} frames" if film else f"{len(files)} pictures to {out}"
+    figures = f"({mean:.1f} fragments per pixel, {'' if truncated else 'not '}truncated)"
+    return Report(
+        {
+            "model": str(model),
+            "files": [str(file) for file in files],
+            "fragments_per_pixel": mean,
+            "gaussians": len(whole),
+            "truncated": truncated,
+            "engine": rasterizer.name,
+            "device": str(device),
+            "warnings": warnings,
+        },
+        "\n".join([f"Wrote {wrote} {figures}.", *(f"Warning: {each}" for each in warnings)]),
+    )
+
+
+def _expect_place(out: Path, *, film: bool, heatmap: bool, shard: bool) -> None:
+    """Check, before any work, that ``out`` can be what was asked for."""
+    if shard:
+        require_several()
+    for option, given in (("--heatmap", heatmap), ("--shard-gaussians", shard)):
+        if film and given:
+            raise UsageError(
+                "options", f"{option} with a film", "a folder for --out", "Name a folder."
+            )
+    if out.suffix.lower() in _NO_FOLDER:
+        raise UsageError(
+            "--out", str(out), "a folder for PNG files, or a film in .mp4", "Choose another name."
+        )
+    if film:
+        filming.require_encoder()
+
+
+def _expect_cameras(cameras: Path | None) -> None:
+    if cameras is None:
+        raise UsageError(
+            "options",
+            "neither --cameras, --data nor --orbit, and no cameras.json of a training around MODEL",
+            "cameras to draw from",
+            "Pass --cameras FILE, --data FOLDER or --orbit.",
+        )
+
+
+def _refuse_options_of_data(scene: SceneOptions, views: str) -> None:
+    """Refuse options that choose among photographs where there are only cameras."""
+    asked = {"--images": "images" in scene.given, f"--views {views}": "views" in scene.given}
+    if views == "all":
+        asked.pop("--views all")
+    for option, given in asked.items():
+        if given:
+            raise UsageError(
+                "options",
+                f"{option} without --data",
+                "a scene folder, which says what its images are and which are held out",
+                f"Pass --data FOLDER, or remove {option}.",
+            )
+
+
+def _views(
+    whole: Model,
+    cameras: Path | None,
+    scene: SceneOptions,
+    frames: int,
+    up: tuple[float, float, float],
+) -> Named:
+    """The named views of a file, or without one those of an orbit."""
+    if cameras is not None:
+        named = load_cameras(cameras, white_background=scene.white_background)
+    else:
+        background = torch.full((3,), float(scene.white_background))
+        orbit = filming.orbit(whole, frames, up)
+        named = [(name, replace(view, background=background)) for name, view in orbit]
+    return divided(named, scene.resolution)
+
+
+class _Drawing:
+    """Draws the views, of several processes each its share, and keeps the counts.
+
+    Attributes:
+        fragments: per pixel, by number of the view.
+    """
+
+    def __init__(
+        self,
+        whole: Model,
+        named: Named,
+        engine: Engine,
+        device: torch.device,
+        ranks: Ranks,
+        shard: bool,
+        heatmap: bool,
+    ) -> None:
+        self.fragments: dict[int, float] = {}
+        self._named, self._device, self._ranks, self._heatmap = named, device, ranks, heatmap
+        self._model = part_of(whole, ranks, device) if shard else whole
+        self._splats = self._model.splats()
+        self._engine = ShardedEngine(engine, ranks) if shard else engine
+
+    @torch.no_grad()
+    def draw(self, index: int) -> RasterOutputs:
+        view = self._named[index][1].to(self._device)
+        stop = self._model.stop
+        inputs = RasterInputs(view, self._splats, counts=self._heatmap, planes=(), stop=stop)
+        thresholds = thresholds_for(inputs, self._model.thresholds)
+        outputs = self._engine.rasterize(inputs, thresholds)
+        self.fragments[index] = float(outputs.fragments_per_pixel)
+        return outputs
+
+    def film(self) -> Iterator[Tensor]:
+        bar = tqdm(range(len(self._named)), desc="filming", unit="frame", leave=None)
+        return (self.draw(index).image for index in bar)
+
+    def save(self, out: Path) -> list[Path]:
+        """Write a picture of each view, and its map of fragments if asked for; all their paths."""
+        files = [out / f"{stem}.png" for stem in stems([name for name, _ in self._named])]
+        maps: dict[int, Tensor] = {}
+        last, turns = len(files) - 1, -(-len(files) // self._ranks.size)
+        for index in self._ranks.share(range(turns * self._ranks.size)):
+            outputs = self.draw(min(index, last))  # shards draw together, as often as each other
+            if index > last:
+                continue
+            save_image(files[index], outputs.image)
+            if outputs.fragments is not None:
+                maps[index] = outputs.fragments.cpu()
+        most = max((float(counts.max()) for counts in maps.values()), default=0.0)
+        limit = max(self._ranks.gather(most))
+        for index, counts in maps.items():
+            save_heatmap(_map_of(files[index]), counts, limit)
+        return [*files, *map(_map_of, files)] if self._heatmap else files
+
+
+def _map_of(picture: Path) -> Path:
+    """Where a picture's map of fragments lies."""
+    return picture.with_name(picture.stem + "_fragments.png")

@@ -1,0 +1,269 @@
+"""Makes the page of the results in a folder."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
+from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
+from fragprune_plugins.files.records import DOOR, Record, control_of, find, portable
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import open_engine
+from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.figures.evaluate import Candidate
+from fragprune_plugins.workbench.figures.page import Table, embedded
+from fragprune_plugins.workbench.figures.recorded import recorded
+from fragprune_plugins.workbench.figures.wording import (
+    IS_CONTROL,
+    fewer,
+    gain,
+    headlines,
+    missed,
+    outcome,
+)
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.report import page as report_page
+from fragprune_plugins.workbench.report.page import Drawn
+from fragprune_plugins.workbench.scenes.dataset import load_photographs
+
+PAGE = "report.html"
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+_PICTURE = Door(RecordError, "no picture", "a PNG", "Remove it.", limit=64 * MEBIBYTE)
+
+_HOW = "Name the scene with --data: then it is read, and so are the models of the record."
+
+_ONLY_CONTROLS = (
+    "This folder holds only controls, and no run or fine-tuning that truncates. "
+    "Run the same command without --control, then report again."
+)
+
+
+def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineOptions) -> Report:
+    """Do what ``fragprune report`` promises; its options are the arguments."""
+    records = find(folder)
+    for record in records:
+        _check(record)
+    results = [record for record in records if record.command in ("run", "finetune")]
+    pruned = [record for record in results if record.data.get("settings", {}).get("truncate")]
+    main = [*records, *results, *pruned][-1]
+    control = main.data.get("settings", {}).get("truncate") is False
+    others = [record for record in records if record is not main]
+    files = [record.path for record in records]
+    line = _sentence(main, files)
+    with TemporaryDirectory() as name:
+        pictures = Path(name)
+        drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
+        more = [*learning, *_files(records, folder, pictures)]
+        text = report_page.compose(
+            report_page.TEMPLATE,
+            drawn,
+            lambda file: embedded(pictures / file),
+            title=f"{_heading(main)} of {folder.resolve().name}",
+            facts=_facts(main, files),
+            quote=line,
+            notes=filter(None, [_ONLY_CONTROLS if control else "", portable(missing, folder)]),
+            table=_table(main),
+            plots=more,
+            others=[
+                {
+                    "heading": _heading(each),
+                    "sentence": _sentence(each, files),
+                    "table": _table(each),
+                }
+                for each in others
+            ],
+            settings=Table(["", ""], _settings(main), words=2),
+        )
+    target = out or folder / PAGE
+    with replacing(target) as path:
+        path.write_text(text, encoding="utf-8")
+    summary = {
+        "page": str(target),
+        "result": line,
+        "command": main.command,
+        "control": control,
+        "record": str(main.path),
+        "views": [view.name for view in drawn.views] if drawn else [],
+        "pictures": (len(drawn.files) if drawn else 0) + len(more),
+    }
+    summary |= {key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")}
+    summary["notes"] = notes = [
+        note for note in (_ONLY_CONTROLS if control else "", missing) if note
+    ]
+    return Report(summary, "\n".join([line, *notes, f"Wrote {target}."]))
+
+
+def _check(record: Record) -> None:
+    """Raise RecordError if a record lacks what the page shows, or has it in other types."""
+    with DOOR.stated(record.path):
+        settings = record.data.get("settings", {})
+        settings.get("truncate")
+        _table(record)
+        _sentence(record, [])
+        _settings(record)
+        _facts(record, [])
+        for name in record.data.get("files", ()):
+            Path(name)
+
+
+def _columns(record: Record) -> dict[str, dict[str, Any]]:
+    """A record's measurements on held-out views, by name of the model."""
+    data = record.data
+    if record.command == "compare":
+        return {"A": data["a"], "B": data["b"]}
+    if record.command == "profile":
+        columns: dict[str, dict[str, Any]] = data["columns"]
+        return columns
+    names = {"original": "before", "pruned": "after"}
+    return {name: data[key] for name, key in names.items() if data.get(key)}
+
+
+def _table(record: Record) -> Table:
+    """A table of the measurements, else of the figures on training views."""
+    columns = _columns(record)
+    if columns:
+        return report_page.figures(columns)
+    seen = record.data["training_views"].items()
+    return Table(["", "training views"], [[key, _number(value)] for key, value in seen])
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f}"
+
+
+def _sentence(record: Record, among: Sequence[Path]) -> str:
+    """The outcome as a sentence to quote; ``among`` are the files that may record its control."""
+    data, columns = record.data, list(_columns(record).values())
+    name = data.get("adapter") or ""
+    of = f"{name}, {data['iterations']:,} iterations: " if name else ""
+    if len(columns) > 1 and record.command in ("run", "finetune"):
+        control = data.get("control") or control_of(data, among)
+        return of + outcome(record.command, data, control)
+    if len(columns) > 1:
+        return f"{gain(columns[0], columns[-1])}."
+    if columns:
+        drawn, frame = columns[0]["fragments_per_pixel"], columns[0]["frame_ms"]
+        return f"{drawn:.1f} fragments per pixel drawn, frames of {frame:.2f} ms."
+    seen = data["training_views"]
+    before, after = seen["fragments_per_pixel_before"], seen["fragments_per_pixel_after"]
+    if not before or not after:
+        return f"{of}nothing was learned."
+    said = f"{of}{fewer(before, after)} on training views; frame times were not measured"
+    if data.get("settings", {}).get("truncate") is False:
+        return said + IS_CONTROL
+    return f"{said}.{missed(data)}"
+
+
+def _heading(record: Record) -> str:
+    """What a record is about, in words."""
+    if record.command in ("compare", "profile"):
+        return {"compare": "Comparison", "profile": "Profile"}[record.command]
+    if record.data.get("settings", {}).get("truncate") is False:
+        return "The control: the same training without pruning"
+    return "Pruning"
+
+
+def _facts(record: Record, among: Sequence[Path]) -> list[tuple[str, str]]:
+    """The three figures of a fine-tuning that was measured; else none."""
+    data = record.data
+    if record.command not in ("run", "finetune") or not (data.get("before") and data.get("after")):
+        return []
+    return headlines(data, data.get("control") or control_of(data, among))
+
+
+def _settings(record: Record) -> list[list[str]]:
+    """The settings and files of a record, one a row."""
+    keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
+    facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
+    facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
+    facts = portable(facts, record.path.parent)  # records of earlier versions have whole paths
+    return [
+        [key, f"{value:.4g}" if isinstance(value, float) else str(value)]
+        for key, value in facts.items()
+        if value is not None
+    ]
+
+
+def _draw(
+    record: Record,
+    inside: Path,
+    folder: Path,
+    data: Path | None,
+    opened: Callable[[], tuple[Engine, torch.device]],
+) -> tuple[Drawn | None, list[tuple[str, str]], str]:
+    """Draw held-out views and learning curves into a folder.
+
+    Args:
+        record: the record of the models.
+        inside: the folder whose files may be read without ``data``.
+        folder: the folder for the pictures.
+        data: the scene folder that the user named.
+        opened: opens the engine; called only if there is something to draw.
+
+    Returns:
+        The views, if any were drawn, (heading, file) of further pictures, and a sentence that
+        tells why views are missing ("" if none are).
+    """
+    drawn, curves = recorded(record), record.data.get("curves")
+    if drawn is None:
+        return None, [], ""
+    scene = drawn.photographs if data is None else replace(drawn.photographs, folder=data)
+    allowed = [each for each in drawn.models if data is not None or lies_in(each, inside)]
+    learning: list[tuple[str, str]] = []
+    try:
+        engine, device = opened()
+        loaded = [load(path, filtered=drawn.filtered, device=device) for path in allowed]
+        if curves:
+            values = loaded[-1].falloff if drawn.models[-1] in allowed else None
+            with DOOR.stated(record.path) as reading:
+                reading.place = "data.curves"
+                report_page.save_learning(folder / report_page.LEARNING, curves, values)
+            learning = [("How it learned", report_page.LEARNING)]
+        if len(drawn.models) == 1:  # of joint learning, which leaves no model of before
+            return None, learning, ""
+        if data is None and not (len(allowed) == 2 and lies_in(scene.folder, inside)):
+            return (
+                None,
+                learning,
+                f"No views are shown: they need files outside of the folder. {_HOW}",
+            )
+        dataset = load_photographs(scene)
+    except (DatasetError, ModelFileError, SidecarError) as error:
+        if data is not None:  # the user asked for the views
+            raise
+        return None, learning, f"No views are shown: {error}"
+    before, after = (Candidate(each, drawn.drawing) for each in loaded)
+    views = report_page.draw_views(folder, before, after, dataset.test, engine)
+    return views, learning, ""
+
+
+def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
+    """Copy pictures of compare and profile into the folder; returns (heading, file) of each.
+
+    Only PNGs beside the record, and no link out of ``inside``.
+    """
+    found: list[tuple[str, str]] = []
+    for record in records:
+        for name in record.data.get("files", ()):
+            file = record.path.parent / Path(name).name
+            if not lies_in(file, inside):
+                continue
+            with contextlib.suppress(RecordError), _PICTURE.reading(file) as reading:
+                content = reading.file.read()
+                if content.startswith(_PNG):
+                    copy = f"{len(found)}.png"
+                    (folder / copy).write_bytes(content)
+                    found.append((f"{record.command}: {file.stem}", copy))
+    return found

@@ -1,0 +1,222 @@
+"""Runs a host's command, and measures what stage 2 did on the views that the host holds out."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fragprune_plugins.errors import FragpruneError, UsageError
+from fragprune_plugins.files import records
+from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.injection import launch
+from fragprune_plugins.injection.process import current_gpu
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.workbench.commands.command import JSON, Report
+from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
+from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
+from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.wording import describe, fewer, missed, outcome
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.scenes.dataset import load_photographs
+
+_WHERE = {"joint": "inside the training"}
+_CONTROL = (
+    "To see what truncation did, train as long with --stage off and another output folder, and run "
+    "fragprune compare."
+)
+"""Joint learning has no model of before."""
+
+
+def run(
+    *,
+    host_command: tuple[str, ...],
+    adapter: str | None,
+    stage: Any,
+    from_iter: int | None,
+    settings: Settings,
+    max_drop: float | None,
+    engine: EngineOptions,
+    evaluate: bool,
+    again: bool,
+) -> Report:
+    """Do what ``fragprune run`` promises; its options are the arguments."""
+    if from_iter is not None and stage not in ("finetune", "joint"):
+        raise UsageError(
+            "--from-iter",
+            f"--stage {stage}",
+            "--stage finetune or joint, which learn inside one run",
+            "Add one of them, or remove --from-iter.",
+        )
+    if settings.target_time is not None:
+        raise UsageError(
+            "--target-time",
+            "fragprune run: a host keeps no model as it came in to time frames against",
+            "--target-speedup, a ratio of fragments",
+            "Use --target-speedup, or --target-time with fragprune finetune on the trained PLY.",
+        )
+    if max_drop is not None:
+        raise UsageError(
+            "--max-drop",
+            "fragprune run: it would repeat the host's stage 2 many times",
+            "a bound for fragprune finetune",
+            "Use fragprune finetune with --max-drop on the trained PLY.",
+        )
+
+    bound_threads(engine.threads)
+    logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
+    options = launch.RunOptions(
+        adapter=adapter,
+        stage=stage,
+        settings=settings,
+        from_iter=from_iter,
+        engine=engine.name,
+        device=engine.device,
+        again=again,
+    )
+    before = after = None
+    # A host prints to stdout; with --json, stdout gets only our object.
+    as_json = click.get_current_context().meta[JSON]
+    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        with logging_steps([Bar(settings.iterations)]):
+            summary = launch.run(list(host_command), options)
+        photographs = photographs_of(summary)
+        not_compared: FragpruneError | None = summary.not_compared
+        if photographs and evaluate:
+            try:
+                with current_gpu(engine.device):
+                    *first, after = measure_models(photographs, engine)
+                    before = first[0] if first else None
+            except FragpruneError as error:  # the trained model is saved already
+                not_compared = error
+    data = _figures(summary, settings, before, after, not_compared)
+    if summary.iterations and summary.model_after:
+        more = {"curves": summary.curves, "photographs": photographs}
+        records.leave(summary.model_after, "run", data | more)
+    return Report(data, _describe(summary, data, not_compared))
+
+
+def _figures(
+    summary: launch.RunSummary,
+    settings: Settings,
+    before: dict[str, Any] | None,
+    after: dict[str, Any] | None,
+    not_compared: FragpruneError | None,
+) -> dict[str, Any]:
+    """What --json prints."""
+    data: dict[str, Any] = {
+        "adapter": summary.adapter,
+        "engine": summary.engine,
+        "device": summary.device,
+        "stage": summary.stage,
+        "iterations": summary.iterations,
+        "gaussians": summary.gaussians,
+        "training_views": {
+            "fragments_per_pixel_before": summary.fragments_before,
+            "fragments_per_pixel_after": summary.fragments_after,
+        },
+        "before": before,
+        "after": after,
+        "not_compared": not_compared and not_compared.as_dict(),
+        "model_before": _text(summary.model_before),
+        "model_after": _text(summary.model_after),
+        "pressure": summary.curves[-1]["pressure"] if summary.curves else None,
+        "train_seconds": summary.train_seconds,
+        "target_reached": summary.target_reached,
+        "already_finished": summary.already_finished,
+        "seed": settings.seed,
+        "settings": summary.settings,
+    }
+    of_folder = records.files(summary.output, below=True) if summary.output else []
+    data["control"] = records.control_of(data, of_folder)
+    return data
+
+
+def _saved(summary: launch.RunSummary) -> str:
+    """Where a model is that is no PLY."""
+    kept = summary.output is not None and any(summary.output.glob("*.ckpt"))
+    return f"the last checkpoint in {summary.output}" if kept else "not saved by the host"
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def photographs_of(summary: launch.RunSummary) -> dict[str, Any] | None:
+    """The record's "photographs": how to read the host's data and draw its models.
+
+    None if the models cannot be measured. Joint learning leaves one model.
+    """
+    left = [path for path in (summary.model_before, summary.model_after) if path]
+    if not summary.photographs:
+        return None
+    return {
+        **summary.photographs.as_dict(),
+        "models": [str(path.resolve()) for path in left],
+        "filtered": True,
+        "drawing": summary.drawing,
+    }
+
+
+def measure_models(photographs: dict[str, Any], engine: EngineOptions) -> list[dict[str, Any]]:
+    """Measure the models on held-out views, on the host's device if an engine can draw there.
+
+    Args:
+        photographs: of ``photographs_of``.
+        engine: what draws.
+
+    Returns:
+        The measurements before and after; after joint learning the latter alone.
+    """
+    device = "cpu" if engine.device == "cpu" else "auto"
+    rasterizer, where = open_engine(EngineOptions(engine.name, device))
+    dataset = load_photographs(Photographs.from_dict(photographs))
+    models = [load(path, filtered=True, device=where) for path in photographs["models"]]
+    candidates = [Candidate(model, photographs["drawing"]) for model in models]
+    return measure_all(candidates, dataset.test, engine=rasterizer)
+
+
+def _describe(
+    summary: launch.RunSummary, data: dict[str, Any], not_compared: FragpruneError | None
+) -> str:
+    if summary.already_finished:
+        return (
+            f"{summary.model_after} is finished: stage 2 with these settings wrote it before, and "
+            f"nothing was run. --again learns again.\n"
+            f"Compare: fragprune compare {summary.model_before} {summary.model_after}"
+        )
+    if not summary.iterations:
+        return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
+    lines = []
+    if data["before"]:
+        columns = {"before": data["before"], "after": data["after"]}
+        lines += [describe(columns), "", outcome("run", data, data["control"])]
+    else:
+        if data["after"]:
+            lines += [describe({"after": data["after"]}), "", _CONTROL]
+        if summary.fragments_before and summary.fragments_after:
+            change = fewer(summary.fragments_before, summary.fragments_after)
+            lines.append(
+                f"{change} on training views; frame times were not measured.{missed(data)}"
+            )
+        if not_compared:
+            why = f"{not_compared.where}: {not_compared.found}. {not_compared.remedy}"
+            lines.append(f"Not compared on held-out views because of {why}")
+        elif summary.photographs:
+            models = f"{summary.model_before or 'OTHER'} {summary.model_after}"
+            lines.append(f"Compare: fragprune compare {models}")
+    pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
+    control = not summary.settings["truncate"]
+    learned = "of the control" if control else _WHERE.get(summary.stage, "of stage 2")
+    lines.append(
+        f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
+        f"{summary.iterations} iterations {learned}{pressure}, "
+        f"{summary.train_seconds:.0f} s in all. "
+        f"Model: {summary.model_after or _saved(summary)}."
+    )
+    return "\n".join(lines)

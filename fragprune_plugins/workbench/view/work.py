@@ -1,0 +1,141 @@
+"""Makes the viewer's page of one or two models, and serves or writes it."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+
+from fragprune_plugins.errors import OutputError
+from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import cameras_of
+from fragprune_plugins.workbench.commands.options import expect_one
+from fragprune_plugins.workbench.figures.viewing import overview
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.scenes.cameras import load_cameras
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
+from fragprune_plugins.workbench.view.server import address, open_server
+from fragprune_plugins.workbench.view.site import (
+    Layer,
+    Shown,
+    Site,
+    make_site,
+    save_site,
+    single_page,
+)
+
+
+def view(
+    *,
+    model: Path,
+    other: Path | None,
+    data: Path | None,
+    cameras: Path | None,
+    out: Path | None,
+    white_background: bool,
+    port: int,
+    no_browser: bool,
+) -> Report:
+    """Do what ``fragprune view`` promises; its options are the arguments."""
+    expect_one(("--data", data), ("--cameras", cameras))
+    single = out is not None and out.suffix.lower() == ".html"
+    if out is not None:
+        _expect_our_page(out if single else out / "index.html")
+        writable_folder(out.parent if single else out)
+    models = [load(each) for each in (model, other) if each is not None]
+    shown = _cameras(data, cameras or cameras_of(model), white_background)
+    if shown:
+        start = shown[0].view
+    else:
+        start = overview(models[0])
+        start.background.copy_(torch.full((3,), float(white_background)))
+    site = make_site(model.name, models, _layers(model, other, models), shown, start)
+    facts: dict[str, Any] = {
+        "model": str(model),
+        "compare": None if other is None else str(other),
+        "gaussians": [len(each) for each in models],
+        "truncated": [each.falloff is not None for each in models],
+        "cameras": len(shown),
+        "bytes": sum(map(len, site.values())),
+        "address": None,
+        "files": [],
+    }
+    if out is None:
+        facts["address"] = _serve(site, port, browse=not no_browser)
+        return Report(facts, "The viewer is closed.")
+    if single:
+        page = single_page(site)
+        with replacing(out) as temporary:
+            temporary.write_bytes(page)
+        facts |= {"bytes": len(page), "files": [str(out)]}
+        wrote = f"Wrote {out} ({_mebibytes(len(page))}): open it in a browser."
+        return Report(facts, wrote)
+    save_site(out, site)
+    facts["files"] = [str(out / name) for name in sorted(site)]
+    return Report(
+        facts,
+        f"Wrote {len(site)} files to {out} ({_mebibytes(facts['bytes'])}). A web server has to "
+        f"serve them; here: python -m http.server -d {out}",
+    )
+
+
+def _layers(model: Path, other: Path | None, models: list[Model]) -> list[Layer]:
+    """The sides of the split."""
+    truncated = [each.falloff is not None for each in models]
+    if other is not None:
+        names = [model.stem, other.stem]
+        if names[0] == names[1]:
+            names = [str(model), str(other)]
+        return [Layer(name, index, truncated[index]) for index, name in enumerate(names)]
+    if truncated[0]:
+        return [Layer("Truncated", 0, True), Layer("Untruncated", 0, False)]
+    return [Layer(model.stem, 0, False)]
+
+
+def _mebibytes(count: int) -> str:
+    return f"{count / 2**20:.1f} MiB"
+
+
+def _cameras(data: Path | None, cameras: Path | None, white_background: bool) -> list[Shown]:
+    """The cameras of the page's list: held-out ones of a scene, or all of a file."""
+    if data is not None:
+        shots = load_dataset(data, white_background=white_background).test
+        return [Shown(shot.name, shot.view, shot) for shot in shots]
+    if cameras is not None:
+        named = load_cameras(cameras, white_background=white_background)
+        return [Shown(name, camera) for name, camera in named]
+    return []
+
+
+def _serve(site: Site, port: int, *, browse: bool) -> str:
+    """Serve until Ctrl-C; gives the address."""
+    with open_server(site, port) as server:
+        where = address(server)
+        click.echo(f"The viewer is at {where} until Ctrl-C.", err=True)
+        if browse:
+            webbrowser.open(where)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            click.echo("", err=True)
+        return where
+
+
+def _expect_our_page(page: Path) -> None:
+    """Raise OutputError if another page has the name of ours."""
+    if not page.is_file():
+        return
+    with open(page, "rb") as file:
+        ours = b'content="fragprune view"' in file.read(4096)
+    if not ours:
+        raise OutputError(
+            str(page),
+            "a page that fragprune view did not write",
+            "a folder of its own",
+            "Name one.",
+        )

@@ -1,0 +1,88 @@
+"""What commands make of words that are misspelt, missing or without effect."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from cli.commands import run, run_json
+from finetune import tiny
+from PIL import Image
+
+from fragprune_plugins.workbench.commands import cli
+
+
+def test_a_misspelt_option_of_run_is_not_the_hosts_command():
+    result = run("run", "--quik", "--", "python", "train.py")
+    assert result.exit_code == 2
+    assert "Did you mean '--quick'?" in result.stderr
+
+
+@pytest.mark.parametrize(("word", "meant"), [("dem", "demo"), ("finetun", "finetune")])
+def test_a_misspelt_command_is_guessed(word, meant):
+    result = run(word)
+    assert result.exit_code == 2
+    assert f"Did you mean {meant}?" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        for name in cli.list_commands(None)
+        if any(p.name in ("model", "a") for p in cli.get_command(None, name).params)
+    ],
+)
+def test_a_model_that_is_not_there_is_what_is_wrong(name, tmp_path):
+    out = tmp_path / "out"
+    words = [] if name in ("bench", "compare", "profile", "view") else ["--out", out / "x.ply"]
+    result = run(name, tmp_path / "no.ply", *([tmp_path / "b.ply"] * (name == "compare")), *words)
+    assert result.exit_code == 1
+    assert "[model-file]" in result.stderr
+    assert "no.ply: no such file" in result.stderr
+    assert not out.exists()
+
+
+def test_a_report_of_a_folder_that_is_not_there(tmp_path):
+    result = run("report", tmp_path / "nowhere")
+    assert result.exit_code == 1
+    assert "no such folder" in result.stderr
+
+
+@pytest.fixture
+def given(tmp_path):
+    """A model, and its cameras in a file."""
+    _, path, _ = tiny.scene(tmp_path)
+    content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
+    cameras = tmp_path / "path.json"
+    cameras.write_text(json.dumps(content))
+    return path, cameras
+
+
+def test_cameras_of_a_file_are_divided(given, tmp_path):
+    model, cameras = given
+    out = tmp_path / "pictures"
+    run_json("render", model, "--cameras", cameras, "--out", out, "--resolution", 2)
+    with Image.open(out / "a.png") as picture:
+        assert picture.size == (10, 6)
+
+
+@pytest.mark.parametrize("words", [("--views", "train"), ("--images", "images_2")])
+def test_options_of_photographs_are_refused_beside_cameras(given, tmp_path, words):
+    model, cameras = given
+    out = tmp_path / "pictures"
+    result = run("render", model, "--cameras", cameras, "--out", out, *words)
+    assert result.exit_code == 2
+    assert f"{words[0]}" in result.stderr
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["o.gif", "film.mp4"])
+def test_a_film_that_cannot_be_written_is_refused_before_it_is_drawn(
+    given, tmp_path, name, monkeypatch
+):
+    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr("fragprune_plugins.workbench.render.work.load", None)
+    result = run("render", given[0], "--orbit", "--out", tmp_path / name)
+    assert result.exit_code == 2
+    assert not (tmp_path / name).exists()
