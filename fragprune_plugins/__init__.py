@@ -1,6 +1,6 @@
 """fragprune: learned fragment pruning for every Gaussian-splatting codebase.
 
-A picture of a splat, truncated by the thresholds beside it::
+A picture of a splat, truncated by its thresholds::
 
     import fragprune_plugins as fp
     model = fp.load("model.ply")

@@ -2,9 +2,9 @@
 
 One ``vertex`` element of float32 columns, values before activation: x y z, nx ny nz (zeros),
 f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
-(logit), scale_0..2 (log), rot_0..3 (w x y z, any length). ``fragprune export`` adds one column,
-``trunc_threshold``: the threshold itself, in falloff, in (0, 1). A model's stop is a comment of the
-header, ``fragprune stop 0.01``. Unknown columns are ignored,
+(logit), scale_0..2 (log), rot_0..3 (w x y z, any length). A model with thresholds has one column
+more, ``trunc_threshold``: the threshold itself, in falloff, in (0, 1). A model's stop is a comment
+of the header, ``fragprune stop 0.01``. Unknown columns are ignored,
 except Mip-Splatting's ``filter_3D``: such a model is refused unless the caller draws by the rules
 of Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaussians are flat.
 """
@@ -28,9 +28,6 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import is_stop
 
 THRESHOLD_COLUMN = "trunc_threshold"
-
-MARK = "fragprune thresholds lie beside this file (.fragprune.safetensors)"
-"""A comment in the header of each PLY of ours that is half of a pair."""
 
 STOP = "fragprune stop"
 """Begins the comment that holds a model's stop."""
@@ -175,14 +172,13 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
     return splat
 
 
-def write_ply(path: Path, model: Model, *, marked: bool = False) -> None:
+def write_ply(path: Path, model: Model) -> None:
     """Write a model atomically in the hosts' layout, with the exact values that ``read_ply`` gave.
 
     Args:
         path: the file; an existing one is replaced only when the new one is complete.
         model: the Gaussians; thresholds that cut become the last column, ``trunc_threshold``, and
             a stop a comment.
-        marked: note in the header that a sidecar with thresholds belongs to the file.
 
     Raises:
         OutputError: the file cannot be written.
@@ -209,29 +205,36 @@ def write_ply(path: Path, model: Model, *, marked: bool = False) -> None:
     rows = np.ascontiguousarray(table.numpy()).view([(name, "<f4") for name in names])[:, 0]
     # An element's comments come after its line: some viewers read the number of Gaussians off the
     # header's third line, whatever it says.
-    comments = [MARK] if marked else []
-    if model.stop is not None:
-        comments.append(f"{STOP} {model.stop!r}")
+    comments = [] if model.stop is None else [f"{STOP} {model.stop!r}"]
     vertices = PlyElement.describe(rows, "vertex", comments=comments)
     with replacing(path) as temporary:
         PlyData([vertices], byte_order="<").write(str(temporary))
 
 
-def is_marked(path: Path) -> bool:
-    """Whether a file is a PLY with the mark that its thresholds are in a sidecar.
+def read_thresholds(path: Path) -> ThresholdStore | None:
+    """The thresholds and the stop that a PLY itself holds; None if it has neither, or is no PLY.
 
-    A file with a column of thresholds needs no sidecar, so it does not count as marked.
+    Raises:
+        ModelFileError: the file is truncated, or a threshold is outside (0, 1).
     """
-    if not path.is_file():
-        return False
     with open(path, "rb") as file:
-        head = file.read(HEADER_MAX)
-    try:
-        lines = [line.strip() for line in header_lines(head)[0]]
-    except ValueError:
-        return False
-    column = any(line.endswith(f" {THRESHOLD_COLUMN}".encode()) for line in lines)
-    return f"comment {MARK}".encode() in lines and not column
+        try:
+            lines = header_lines(file.read(HEADER_MAX))[0]
+        except ValueError:
+            return None
+    column, comment = f" {THRESHOLD_COLUMN}".encode(), f"comment {STOP} ".encode()
+    if not any(each.endswith(column) or each.startswith(comment) for each in lines):
+        return None
+    with _DOOR.reading(path) as reading:
+        stop = _stop_in(reading)
+        reading.file.seek(0)
+        columns = read_vertices(reading)
+    if (values := columns.get(THRESHOLD_COLUMN)) is None:
+        store = ThresholdStore(len(next(iter(columns.values()))))
+    else:
+        store = _store_of(path, torch.from_numpy(values.astype(np.float32)))
+    store.stop = stop
+    return store
 
 
 def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, Any]) -> None:

@@ -2,7 +2,7 @@
 
 ``point_cloud.ply`` gets ``point_cloud.fragprune.safetensors``. Its metadata names the model file's
 digest and row count, so a pair that does not match is refused. The host's file stays as the host
-wrote it. A PLY that fragprune writes has a mark in its header, so a missing sidecar is noticed.
+wrote it. What fragprune writes itself holds its thresholds in its own column, and has no sidecar.
 
 ``replace_pair`` renames twice, and the renaming of the model is what counts. Before it, a sidecar
 whose model is not there yet lies under an address that the model's digest gives; after it, the
@@ -31,7 +31,7 @@ from fragprune_plugins.files.atomic import (
     rename,
     replacing,
 )
-from fragprune_plugins.files.ply import is_marked
+from fragprune_plugins.files.ply import read_thresholds
 from fragprune_plugins.files.reading import Door, parse_json
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -65,22 +65,19 @@ def path_beside(model: Path) -> Path:
     return Path(model).with_suffix(SUFFIX)
 
 
-def lies_beside(model: Path) -> bool:
-    """Whether a model file has a sidecar.
+def thresholds_of(
+    model: Path, rows: int, device: torch.device | str = "cpu"
+) -> ThresholdStore | None:
+    """The thresholds of a file that a host reads: its own column's, else its sidecar's, else None.
 
     Raises:
-        SidecarError: it has none, but was saved with one.
+        ModelFileError: the column cannot be read.
+        SidecarError: the sidecar cannot be read, or is another model's.
     """
-    path = find(model)
-    if path is None and is_marked(model):
-        raise SidecarError(
-            str(path_beside(model)),
-            f"no such file, though {Path(model).name} was saved with thresholds beside it",
-            "its sidecar, under this name",
-            "Copy it here, and always rename both files together. "
-            "Or pass --no-truncation to commands that have it.",
-        )
-    return path is not None
+    store = read_thresholds(model)
+    if store is not None:
+        return store.clone(device)
+    return load(model, rows, device)[0] if find(model) else None
 
 
 def belongs(model: Path) -> bool:

@@ -50,12 +50,10 @@ def check_learned(session: SessionState, model: Any) -> None:
 
 
 def on_load(session: SessionState, call: SeamCall) -> Any:
-    """Load the sidecar of the file that the host read, if it has one."""
+    """Load the thresholds of the file that the host read, if it has some."""
     result = call.run()
     path = Path(call.how(call.first))
-    if sidecar.lies_beside(path):
-        session.load(call.model, path)
-    else:
+    if not session.load(call.model, path):
         session.models.pop(call.model, None)  # the model now has other Gaussians
     return result
 

@@ -172,9 +172,10 @@ def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterat
 def _learned(path: Path) -> bool:
     """Whether stage 2 or a control wrote the file, and not stage 1."""
     from fragprune_plugins.files import sidecar
+    from fragprune_plugins.files.ply import read_thresholds
 
     if path.suffix == ".ply":
-        return sidecar.belongs(path)
+        return sidecar.belongs(path) or read_thresholds(path) is not None
     return CHECKPOINT_KEY in optimizer_state(_read_checkpoint(path)[0], str(path))
 
 

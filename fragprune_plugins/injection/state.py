@@ -248,17 +248,23 @@ class SessionState:
             sidecar.replace_pair(path, whole, store, **about)
         self.plugins.tell(hookspecs.fragprune_saved, path=sidecar.path_beside(path))
 
-    def load(self, model: Any, path: Path) -> None:
-        """Load a model's thresholds from the sidecar of ``path``, the file that the host just read.
+    def load(self, model: Any, path: Path) -> bool:
+        """Load a model's thresholds with ``path``, the file that the host just read, if it has any.
 
         Raises:
-            SidecarError: the sidecar is missing or belongs to another file.
+            SidecarError: the sidecar belongs to another file.
+            AlignmentError: the file has another number of thresholds than the model has rows.
         """
         means = self.adapter.means(model)
-        store, _ = sidecar.load(path, len(means), means.device)
-        state = self.models[model] = ModelState(store, loaded=weakref.ref(means))
+        store = sidecar.thresholds_of(path, len(means), means.device)
+        if store is None:
+            return False
+        state = ModelState(store, loaded=weakref.ref(means))
+        self.expect_rows(model, state, str(path))
+        self.models[model] = state
         self.follow(model, state)
         self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)
+        return True
 
     def take_up(self, model: Any, saved: dict[str, Any]) -> None:
         """Give a model the thresholds that ``ThresholdStore.state_dict`` gave for its Gaussians.

@@ -328,7 +328,7 @@ def test_ctrl_c_leaves_a_ply_and_its_network(mini, tmp_path):
         for iteration in (1, 2):
             host.step(model, camera, iteration)
         ply = host.save_interrupted()
-        assert sidecar.lies_beside(ply)
+        assert sidecar.find(ply)
         assert same(network(ply), model._deformation.state_dict())
 
 

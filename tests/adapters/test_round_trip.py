@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from miniatures.vanilla_3dgs import joint
 
-from fragprune_plugins.errors import OutputError, SidecarError
+from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
 
 
 def trained(host, count=20):
@@ -68,14 +71,17 @@ def test_a_model_loaded_without_a_sidecar_forgets_the_thresholds_it_had(tmp_path
         assert host.render(host.camera(), model)["render"].isfinite().all()
 
 
-def test_a_model_that_lost_its_sidecar_is_not_loaded_without_it(tmp_path):
+def test_a_host_loads_the_thresholds_of_a_file_with_a_column(tmp_path):
     path = tmp_path / "pruned.ply"
     with joint() as host:
-        trained(host).save_ply(str(path))
-        write_ply(path, read_ply(path), marked=True)  # as finetune writes it
+        learned = trained(host)
+        learned.save_ply(str(path))
+        values = host.store(learned).values.detach()
+        write_ply(path, replace(read_ply(path), thresholds=ThresholdStore.from_falloff(values)))
         sidecar.path_beside(path).unlink()
-        with pytest.raises(SidecarError, match="saved with thresholds beside it"):
-            host.model(5).load_ply(str(path))
+        model = host.model(5)
+        model.load_ply(str(path))
+        assert torch.equal(host.store(model).values, values)
 
 
 def test_a_save_that_is_cut_off_leaves_the_pair_before(tmp_path, monkeypatch):

@@ -173,7 +173,7 @@ def test_a_failed_write_touches_nothing(scene, monkeypatch):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("safetensors.torch.save_file", full)
+    monkeypatch.setattr("plyfile.PlyData.write", full)
     arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 2)
     result = run(*arguments)
     assert result.exit_code == 1

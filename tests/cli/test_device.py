@@ -14,7 +14,6 @@ from cli.commands import run
 from finetune import tiny
 
 from fragprune_plugins import engines
-from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -76,9 +75,9 @@ def test_what_was_learned_there_is_saved_here(scene, engine):
     data, path, _, out = scene
     words = ("--data", data, "--out", out / "small.ply", "--iters", 5, "--pressure", 1e-3)
     assert run("finetune", path, *words).exit_code == 0
-    store, _ = sidecar.load(out / "small.ply")
-    assert not store.neutral
-    assert not torch.equal(read_ply(out / "small.ply").opacity, read_ply(path).opacity)
+    small = read_ply(out / "small.ply")
+    assert small.falloff is not None
+    assert not torch.equal(small.opacity, read_ply(path).opacity)
     drawn = engine.frames
     assert run("report", out, "--data", data).exit_code == 0
     assert engine.frames > drawn
@@ -104,5 +103,5 @@ def test_learning_there_and_here_is_the_same(scene, engine, monkeypatch):
     monkeypatch.undo()
     installed.cache_clear()
     assert run("finetune", path, "--out", out / "here.ply", *words).exit_code == 0
-    logits = [sidecar.load(out / f"{name}.ply")[0].logits for name in ("there", "here")]
-    torch.testing.assert_close(*logits)
+    falloffs = [read_ply(out / f"{name}.ply").falloff for name in ("there", "here")]
+    torch.testing.assert_close(*falloffs)

@@ -8,8 +8,9 @@ from cli.commands import run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.errors import OutputError, SidecarError
+from fragprune_plugins.errors import DivergedError, OutputError
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import write_ply
 
 
 @pytest.fixture
@@ -17,19 +18,29 @@ def model():
     return tiny.cut(tiny.random_model(), torch.linspace(0.01, 0.5, 60))
 
 
-def test_what_was_saved_comes_back(model, tmp_path):
-    beside = fp.save(str(tmp_path / "a.ply"), model)
-    assert beside == tmp_path / "a.fragprune.safetensors"
-    read = tiny.state(fp.load(str(tmp_path / "a.ply")))
-    assert all(torch.equal(each, read[name]) for name, each in tiny.state(model).items())
-    assert fp.load(tmp_path / "a.ply", truncation=False).thresholds is None
+def test_what_was_saved_comes_back_from_one_file(model, tmp_path):
+    fp.save(str(tmp_path / "a.ply"), model)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.ply"]
+    (tmp_path / "a.ply").rename(tmp_path / "b.ply")
+    read = fp.load(str(tmp_path / "b.ply"))
+    assert all(torch.equal(each, model.tensors[name]) for name, each in read.tensors.items())
+    assert torch.equal(read.falloff, model.falloff)
+    assert fp.load(tmp_path / "b.ply", truncation=False).thresholds is None
+
+
+def test_learned_thresholds_come_back_to_the_bit(model, tmp_path):
+    model.thresholds.logits.grad = torch.linspace(-1, 1, 60)
+    model.thresholds.step()
+    fp.save(tmp_path / "a.ply", model)
+    fp.save(tmp_path / "b.ply", fp.load(tmp_path / "a.ply"))
+    assert torch.equal(fp.load(tmp_path / "b.ply").falloff, model.thresholds.values.detach())
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_others_may_read_what_a_plain_open_lets_them(model, tmp_path):
     (tmp_path / "plain").write_text("")
-    beside = fp.save(tmp_path / "a.ply", model)
-    for path in (tmp_path / "a.ply", beside):
-        assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+    fp.save(tmp_path / "a.ply", model)
+    assert (tmp_path / "a.ply").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 def test_a_model_without_thresholds_replaces_one_with_them(model, tmp_path):
@@ -38,25 +49,30 @@ def test_a_model_without_thresholds_replaces_one_with_them(model, tmp_path):
     assert fp.load(tmp_path / "a.ply").thresholds is None
 
 
-def test_the_pair_is_the_one_that_the_command_line_writes(tmp_path):
+def test_a_pair_is_read_and_replaced_by_one_file(model, tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(path, model.untruncated())
+    sidecar.save(path, model.thresholds)
+    read = fp.load(path)
+    assert torch.equal(read.thresholds.logits, model.thresholds.logits)
+    fp.save(path, read)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.ply"]
+    assert torch.equal(fp.load(path).falloff, read.falloff)
+
+
+def test_the_file_is_the_one_that_the_command_line_writes(tmp_path):
     data, path, _ = tiny.scene(tmp_path)
     out, again = tmp_path / "out.ply", tmp_path / "again.ply"
-    report = run_json("finetune", path, "--data", data, "--out", out, "--iters", 3)
-    fp.save(again, fp.load(out), settings=report["settings"])
+    run_json("finetune", path, "--data", data, "--out", out, "--iters", 3)
+    fp.save(again, fp.finetune(path, fp.load_dataset(data), fp.Settings(3)))
     assert again.read_bytes() == out.read_bytes()
-    (ours, said), (theirs, told) = sidecar.load(again), sidecar.load(out)
-    assert said == told
-    assert all(map(torch.equal, ours.numbers.values(), theirs.numbers.values()))
-
-
-def test_the_sidecar_says_that_it_belongs_to_the_file(model, tmp_path):
-    fp.save(tmp_path / "a.ply", model)
-    sidecar.path_beside(tmp_path / "a.ply").unlink()
-    with pytest.raises(SidecarError, match="no such file"):
-        fp.load(str(tmp_path / "a.ply"))
 
 
 def test_what_cannot_be_saved_leaves_nothing(model, tmp_path):
     with pytest.raises(OutputError):
         fp.save(tmp_path / "a.png", model)
+    with torch.no_grad():
+        model.thresholds.logits[3] = torch.nan
+    with pytest.raises(DivergedError):
+        fp.save(tmp_path / "a.ply", model)
     assert list(tmp_path.iterdir()) == []

@@ -28,7 +28,7 @@ from fragprune_plugins.errors import (
     UsageError,
 )
 from fragprune_plugins.files import records, sidecar
-from fragprune_plugins.files.ply import is_marked, read_ply, write_ply
+from fragprune_plugins.files.ply import read_ply, read_thresholds, write_ply
 from fragprune_plugins.files.reading import NESTING, Door, lies_in, parse_json
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
@@ -214,7 +214,7 @@ def test_a_header_is_checked_against_the_file(tmp_path, content, words):
     path.write_bytes(content)
     with pytest.raises(ModelFileError, match=words):
         read_ply(path)
-    assert not is_marked(path)
+    assert read_thresholds(path) is None
 
 
 @pytest.mark.parametrize(

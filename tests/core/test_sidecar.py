@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from finetune import tiny
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from fragprune_plugins.errors import DivergedError, OutputError, SidecarError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import MARK
+from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 
@@ -47,17 +48,14 @@ def test_what_is_saved_is_loaded_bit_for_bit(model, trained, stop):
         assert info.settings == {"iterations": 3}
 
 
-def test_only_a_marked_model_must_have_a_sidecar(tmp_path, model, trained):
-    assert not sidecar.lies_beside(model)  # a host's own file
-    assert not sidecar.lies_beside(tmp_path)
-    assert not sidecar.lies_beside(tmp_path / "nothing.ply")
-    header = f"ply\nelement vertex 6\ncomment {MARK}\nend_header\n".encode()
-    for ours in (header, header.replace(b"\n", b"\r\n")):  # as other tools may rewrite it
-        model.write_bytes(ours)
-        with pytest.raises(SidecarError, match=r"point_cloud\.ply was saved with thresholds"):
-            sidecar.lies_beside(model)
-    sidecar.save(model, trained)
-    assert sidecar.lies_beside(model)
+def test_a_column_of_the_file_counts_more_than_a_sidecar(tmp_path, trained):
+    path = tmp_path / "a.ply"
+    write_ply(path, tiny.random_model(6))
+    assert sidecar.thresholds_of(path, 6) is None
+    sidecar.save(path, trained)
+    assert torch.equal(sidecar.thresholds_of(path, 6).logits, trained.logits)
+    write_ply(path, tiny.cut(tiny.random_model(6), 0.25))  # the sidecar is another file's now
+    assert sidecar.thresholds_of(path, 6).values.tolist() == [0.25] * 6
 
 
 def test_a_sidecar_of_an_earlier_model_file_is_refused(model, trained):

@@ -11,14 +11,12 @@ from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
-from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.pressure import calibrate, calibrate_measured
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.finetune import loop, timing
-from fragprune_plugins.workbench.finetune.loop import finetune, mean_fragments, save
+from fragprune_plugins.workbench.finetune.loop import finetune, mean_fragments
 from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
@@ -210,33 +208,6 @@ def test_a_control_has_no_thresholds_even_of_a_model_with_some(default, dataset)
 def test_thresholds_of_another_model_are_refused_with_both_counts(model, rows):
     with pytest.raises(AlignmentError, match=f"{rows} thresholds; expected 60"):
         replace(model, thresholds=ThresholdStore(rows))
-
-
-def test_save_writes_a_pair_that_reads_back(default, tmp_path):
-    path = tmp_path / "deep" / "out.ply"
-    beside = save(path, default)
-    assert beside == sidecar.path_beside(path)
-    assert torch.equal(read_ply(path).opacity, default.model.opacity)
-    store, info = sidecar.load(path)
-    assert torch.equal(store.logits, default.model.thresholds.logits)
-    assert info.settings["iterations"] == 60
-    assert sorted(p.name for p in path.parent.iterdir()) == sorted([path.name, beside.name])
-
-
-def test_failed_save_leaves_both_files(default, tmp_path, monkeypatch):
-    path = tmp_path / "out.ply"
-    beside = save(path, default)
-    contents = path.read_bytes(), beside.read_bytes()
-    changed = replace(default, model=replace(default.model, opacity=default.model.opacity + 1))
-
-    def full(*args, **kwargs):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("safetensors.torch.save_file", full)
-    with pytest.raises(Exception, match="No space left"):
-        save(path, changed)
-    assert (path.read_bytes(), beside.read_bytes()) == contents
-    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_calibration_keeps_the_nearest_end_when_out_of_reach():

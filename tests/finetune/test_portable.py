@@ -71,22 +71,22 @@ def test_its_own_pictures_press_by_a_fixed_weight_from_the_first_step_on():
         assert schedule.at(1).learn
 
 
-def test_the_file_has_no_thresholds_and_needs_none(scene, tmp_path):
+def test_the_file_has_no_thresholds_and_takes_the_sidecar_of_an_earlier_one_away(scene, tmp_path):
     data, path, _ = scene
     out = tmp_path / "out.ply"
-    sidecar_of_before = sidecar.path_beside(out)
+    before = sidecar.path_beside(out)
     arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 20)
-    run_json(*arguments, "--pressure", 1e-3)
-    assert sidecar_of_before.exists()
+    fp.save(out, tiny.random_model())
+    sidecar.save(out, ThresholdStore(60))
     result = run(*arguments, "--portable", "--pressure", 1e-3)
     assert result.exit_code == 0, result.stderr
-    assert not sidecar_of_before.exists()
+    assert not before.exists()
     header = out.read_bytes().split(b"end_header")[0]
     assert b"fragprune" not in header
     assert b"trunc" not in header
     assert fp.load(out).thresholds is None  # nothing is missed
     assert "area/pixel" in result.stdout
-    assert "every viewer draws it as it is" in result.stdout
+    assert "which every viewer draws as it is" in result.stdout
     profile = run_json("profile", out, "--data", data)
     assert set(profile["columns"]) == {"untruncated"}
 
@@ -106,15 +106,13 @@ def test_the_record_has_the_area_of_both(scene, tmp_path, more):
     assert report["settings"]["portable"]
 
 
-def test_a_finished_command_does_nothing_and_a_sidecar_makes_it_unfinished(scene, tmp_path):
+def test_a_finished_command_does_nothing(scene, tmp_path):
     data, path, _ = scene
     words = ("finetune", path, "--data", data, "--iters", 5, "--portable")
     out = tmp_path / "out.ply"
     first = run_json(*words, "--out", out)
     assert first["already_finished"] is False
     assert run_json(*words, "--out", out) == first | {"already_finished": True}
-    sidecar.save(out, ThresholdStore(60))
-    assert run_json(*words, "--out", out)["already_finished"] is False
 
 
 def test_without_photographs(scene, tmp_path):

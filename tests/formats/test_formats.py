@@ -143,9 +143,10 @@ def test_a_format_without_thresholds_refuses_them(suffix, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_plain_ply_beside_other_formats_keeps_its_sidecar(tmp_path):
+def test_a_ply_beside_other_formats_keeps_its_sidecar(tmp_path):
     splat, store = random_splat(5, 0, 0), ThresholdStore.from_falloff(torch.full((5,), 0.4))
-    save(tmp_path / "a.ply", replace(splat, thresholds=store))
+    save(tmp_path / "a.ply", splat)
+    sidecar.save(tmp_path / "a.ply", store)
     for suffix in BOUNDS:
         save(tmp_path / f"a{suffix}", splat)
         assert load(tmp_path / f"a{suffix}").thresholds is None

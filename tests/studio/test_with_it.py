@@ -408,7 +408,7 @@ def test_a_model_without_thresholds_is_exported_without(run, tmp_path):
     def plain(state):
         del state["_model._extra_state"]
 
-    assert not sidecar.lies_beside(export(altered(run, tmp_path, plain), tmp_path))
+    assert not sidecar.find(export(altered(run, tmp_path, plain), tmp_path))
 
 
 def test_thresholds_follow_the_exporters_filter(run, tmp_path):

@@ -10,11 +10,10 @@ from typing import Any
 import torch
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.files import sidecar
+from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.prices.machine import describe_machine
 from fragprune_plugins.workbench.scenes.dataset import Dataset
@@ -45,8 +44,8 @@ def load_columns(
         if model.falloff is not None:
             values = model.falloff.cpu().numpy().tobytes()
             said[label]["thresholds"] = hashlib.sha256(values).hexdigest()
-        if formats.found(path).paired and sidecar.lies_beside(path):
-            said[label]["learned"] = sidecar.load(path)[1].settings
+        if record := records.beside(path):
+            said[label]["learned"] = record.data.get("settings")
         if model.falloff is not None and len(paths) == 1:
             columns[f"{label}, untruncated"] = Candidate(model.untruncated())
         columns[label] = Candidate(model)

@@ -344,7 +344,7 @@ class GraphdecoAdapter(ScriptAdapter):
             torch.save((capture, iteration), temporary)
 
     def captured(self, ply: Path) -> tuple[Any, ...]:
-        """The host's ``capture`` of a PLY: fresh moments, and the sidecar's thresholds."""
+        """The host's ``capture`` of a PLY: fresh moments, and the file's thresholds."""
         import torch
 
         from fragprune_plugins.files import sidecar
@@ -365,8 +365,8 @@ class GraphdecoAdapter(ScriptAdapter):
             eps=1e-15,
         )
         state: dict[str, Any] = optimizer.state_dict()
-        if sidecar.lies_beside(ply):
-            state[CHECKPOINT_KEY] = sidecar.load(ply, rows)[0].state_dict()
+        if (store := sidecar.thresholds_of(ply, rows)) is not None:
+            state[CHECKPOINT_KEY] = store.state_dict()
         return (
             m.sh_degree,
             parameters["xyz"],

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.atomic import put, staging
 from fragprune_plugins.files.ply import THRESHOLD_COLUMN
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.models.model import load, save
 from fragprune_plugins.workbench.models.written import (
     describe_dropped,
     describe_written,
@@ -30,18 +28,10 @@ def export(
     if splat.pruned:
         formats.expect_carrier(form, out)
     dropped, lines, count = None, [], len(splat)
-    with staging(out) as folder:
-        new = folder / out.name
-        formats.write(form, new, splat)
-        size = new.stat().st_size
-        if drop:
-            splat = splat.keep(visible(splat))
-            formats.write(form, new, splat)
-        if form.paired:  # removes the sidecar of an earlier model under this name
-            sidecar.replace_pair(out, new, None)
-        else:
-            put(new, out)
+    save(out, splat)
     if drop:
+        size, splat = out.stat().st_size, splat.keep(visible(splat))
+        save(out, splat)
         dropped = dropping(out, size, count, len(splat))
         lines.append(describe_dropped(dropped, "too faint for any view"))
     truncated = splat.falloff is not None

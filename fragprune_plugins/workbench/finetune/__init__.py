@@ -64,8 +64,8 @@ def _share(
     "--out",
     type=OutFile(*formats.ENDINGS),
     required=True,
-    help="New model: .ply, whose sidecar goes beside it, or .spz, .sog, .glb, which hold the "
-    "thresholds themselves. .splat and .compressed.ply cannot hold any.",
+    help="New model: .ply, .spz, .sog or .glb, which hold its thresholds. .splat and "
+    ".compressed.ply cannot hold any.",
 )
 @click.option(
     "--self",
@@ -142,16 +142,15 @@ def command(
 
     Thresholds and all other parameters adapt to each other on the photographs in --data. With
     --train opacity, positions, shapes and colours stay bit for bit. OUT has the columns of
-    MODEL, and the thresholds go beside it into OUT.fragprune.safetensors; a .spz, .sog or .glb
-    holds them itself. The table compares both models on held-out views. A line below it measures
-    OUT without its thresholds, as other viewers draw it. Ctrl-C (exit code 130) and SIGTERM (143)
-    save what was learned so far.
+    MODEL, and one more for the thresholds, trunc_threshold. The table compares both models on
+    held-out views. A line below it measures OUT without its thresholds, as other viewers draw it.
+    Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
 
     The same command goes on where it was interrupted or killed. If OUT is finished already, it says
     so and does nothing; --again begins anew.
 
-    With --portable no thresholds are learned: the Gaussians themselves cover less area, OUT needs
-    no sidecar, and every viewer draws it as it is. "area/pixel" in the table is what most web
+    With --portable no thresholds are learned: the Gaussians themselves cover less area, and every
+    viewer draws OUT as it is. "area/pixel" in the table is what most web
     viewers pay for: the pixels in all ellipses of sqrt(8) standard deviations.
 
     With --self no photograph is read: MODEL's own pictures are what it must go on showing, also
@@ -188,7 +187,6 @@ def command(
     from fragprune_plugins.workbench.figures.evaluate import Candidate
     from fragprune_plugins.workbench.finetune import finished as finetuned
     from fragprune_plugins.workbench.finetune import resuming
-    from fragprune_plugins.workbench.finetune.loop import save
     from fragprune_plugins.workbench.finetune.resuming import Checkpoints
     from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
@@ -230,7 +228,7 @@ def command(
             )
             saved = _whole(result, ranks) if shard else result
             if ranks.first:
-                save(out, saved)
+                models.save(out, saved)
             truncated = saved.model.falloff is not None
             over = finetuned.Finetuned(
                 model=model,
@@ -336,12 +334,11 @@ def _drop_invisible(
     out: Path, result: FinetuneResult, dataset: Dataset, engine: Engine
 ) -> tuple[FinetuneResult, dict[str, int]]:
     """Write the result again without Gaussians that no view shows; also give the counts."""
-    from fragprune_plugins.workbench.finetune.loop import save
     from fragprune_plugins.workbench.pruning.visibility import visible
 
     size, views = out.stat().st_size, [shot.view for shot in (*dataset.train, *dataset.test)]
     left = replace(result, model=result.model.keep(visible(result.model, views, engine=engine)))
-    save(out, left)
+    models.save(out, left)
     return left, dropping(out, size, len(result.model), len(left.model))
 
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fragprune_plugins.errors import RecordError, SidecarError
+from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files import records
 from fragprune_plugins.learning.interruption import EXIT_CODE
 from fragprune_plugins.workbench.commands.command import Report
@@ -145,7 +145,6 @@ class Finetuned:
             held_out: number of held-out views.
             views: number of all views.
         """
-        from fragprune_plugins.files import sidecar
         from fragprune_plugins.workbench.figures.wording import describe, outcome
 
         result, settings, before = self.result, self.result.settings, data["before"]
@@ -181,16 +180,10 @@ class Finetuned:
         if plain is not None:
             lines.append(describe_untruncated(before, plain))
         form = formats.named(self.out)
+        held = ", which holds the thresholds" if plain else ""
         if settings.portable:
-            held = ", which needs no sidecar: every viewer draws it as it is"
-            lines.append(describe_written(self.out, held))
-        elif not form.paired:
-            lines.append(
-                describe_written(self.out, ", which holds the thresholds" if plain else "")
-            )
-        else:
-            together = " Keep the two together." if plain is not None else ""
-            lines.append(f"Wrote {self.out} and {sidecar.path_beside(self.out).name}.{together}")
+            held = ", which every viewer draws as it is"
+        lines.append(describe_written(self.out, held))
         if form.keeps:
             lines.append("The figures above are of the model as it was learned, before rounding.")
         return "\n".join(lines)
@@ -198,25 +191,17 @@ class Finetuned:
 
 def finished(model: Path, out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
     """The report of the same command, if it has written ``out`` already; else None."""
-    from fragprune_plugins.files import sidecar
     from fragprune_plugins.workbench.models import model as models
 
     if not out.is_file():
         return None
     try:
         record = records.beside(out)
-        if not formats.named(out).paired:
-            whole = True  # the file holds its thresholds itself
-        elif asked["portable"]:
-            whole = sidecar.find(out) is None
-        else:
-            whole = sidecar.belongs(out)
-        done = record is not None and record.command == "finetune" and whole
-    except (RecordError, SidecarError):
+    except RecordError:
         return None
-    written = None if record is None else Path(str(record.data.get("out"))).name
-    if record is None or not done or record.data.get("configuration") != asked:
+    if record is None or record.command != "finetune" or record.data.get("configuration") != asked:
         return None
+    written = Path(str(record.data.get("out"))).name
     if written != out.name:  # a model of the same name in another format
         return None
     data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
@@ -244,10 +229,8 @@ def terminated(model: Path, out: Path, result: FinetuneResult, found: Bounded | 
         "engine": result.engine,
         "settings": asked.as_dict(),
     }
-    alone = asked.portable or not formats.named(out).paired
-    wrote = f"{out}" if alone else f"{out} and its sidecar"
     at = f"SIGTERM at {done.steps} of {asked.iterations} iterations."
-    text = f"{at} Wrote {wrote}. {_goes_on(found)}"
+    text = f"{at} Wrote {out}. {_goes_on(found)}"
     return Report(data, text, exit_code=EXIT_CODE)
 
 

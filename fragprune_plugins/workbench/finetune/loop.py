@@ -197,20 +197,6 @@ def mean_fragments(model: Model, shots: Sequence[Shot], engine: Engine) -> float
     return total / len(shots)
 
 
-def save(path: Path, result: FinetuneResult) -> Path | None:
-    """Write the model and its sidecar, both complete or neither; returns the sidecar's path.
-
-    A portable model gets no sidecar, and None is returned.
-
-    Raises:
-        OutputError: the place cannot be written; existing files stay as they were.
-    """
-    if result.settings.portable:
-        models.save(path, result)
-        return None
-    return models.save(path, result, settings=result.settings.as_dict())
-
-
 class _Run:
     """One fine-tuning under way: drives stage 2 over the photographs of a data set."""
 

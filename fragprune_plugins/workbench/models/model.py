@@ -1,10 +1,10 @@
-"""Loads a model with its thresholds, from the sidecar or from the file itself."""
+"""Loads models of any format with their thresholds, and writes them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     import torch
@@ -43,17 +43,17 @@ def load(
     filtered: bool = False,
     device: torch.device | str = "cpu",
 ) -> Model:
-    """Read a model and its thresholds: the sidecar's, else the file's own, else None.
+    """Read a model and its thresholds: the file's own, else the sidecar's of a PLY, else None.
 
     Args:
-        path: of the model, in any format of ``storage/formats``. Only a PLY has a sidecar.
+        path: of the model, in any format of ``formats``.
         truncation: False ignores thresholds.
         filtered: accept a model that the caller draws by its host's rules; see ``read_ply``.
         device: the device of the result.
 
     Raises:
         ModelFileError: the model cannot be read, or is drawn only after a network has moved it.
-        SidecarError: the sidecar is lost, broken, another model's, or has another number of rows.
+        SidecarError: the sidecar is broken, another model's, or has another number of rows.
     """
     from fragprune_plugins.errors import SidecarError
     from fragprune_plugins.files import sidecar
@@ -66,7 +66,7 @@ def load(
         before = _versions(path)
         try:
             model = formats.read(path, filtered=filtered).to(device)
-            if paired and sidecar.lies_beside(path):
+            if paired and model.thresholds is None and sidecar.find(path):
                 model = replace(model, thresholds=sidecar.load(path, len(model), device)[0])
         except SidecarError:
             if _versions(path) == before:
@@ -104,19 +104,15 @@ def _versions(path: Path) -> list[tuple[int, ...] | None]:
     return found
 
 
-def save(
-    path: str | Path, model: Model | Trained, *, settings: dict[str, Any] | None = None
-) -> Path:
-    """Write a model with its thresholds, whole or not at all, as ``fragprune finetune`` does.
+def save(path: str | Path, model: Model | Trained) -> None:
+    """Write a model with its thresholds into one file, whole or not at all.
+
+    The sidecar of a host's earlier PLY of this name goes with that model.
 
     Args:
-        path: of the model; its suffix names the format. A PLY with thresholds gets a sidecar beside
-            it, ``NAME.fragprune.safetensors``; other formats hold thresholds themselves.
+        path: of the file; its suffix names the format. A PLY holds thresholds in the column
+            ``trunc_threshold``, other formats by extensions of theirs.
         model: what to write, or the result of a training.
-        settings: recorded in the sidecar, such as ``Settings.as_dict`` gives.
-
-    Returns:
-        The path of the file that holds the thresholds: the sidecar's, or the model's.
 
     Raises:
         OutputError: the place cannot be written, its name is no model's, or the format cannot hold
@@ -124,21 +120,18 @@ def save(
         DivergedError: learned values are not finite.
     """
     from fragprune_plugins.files import sidecar
-    from fragprune_plugins.files.atomic import replacing, staging
-    from fragprune_plugins.files.ply import write_ply
+    from fragprune_plugins.files.atomic import put, staging
     from fragprune_plugins.learning.finite import expect_finite
     from fragprune_plugins.workbench.models import formats
 
     path, model = Path(path), of(model)
-    form, store = formats.named(path), model.thresholds
-    if store is not None:
-        expect_finite(store.numbers, str(path))
-    if not form.paired:
-        with replacing(path, durable=True) as new:
-            formats.write(form, new, model)
-        return path
+    form = formats.named(path)
+    if model.thresholds is not None:
+        expect_finite(model.thresholds.numbers, str(path))
     with staging(path) as folder:
-        whole, pair = folder / path.name, model.pruned
-        write_ply(whole, model.untruncated(), marked=pair)
-        sidecar.replace_pair(path, whole, store if pair else None, settings=settings)
-    return sidecar.path_beside(path) if pair else path
+        new = folder / path.name
+        formats.write(form, new, model)
+        if form.paired:
+            sidecar.replace_pair(path, new, None)
+        else:
+            put(new, path)

@@ -18,7 +18,7 @@ def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
         thresholds: whether ``out`` is to have thresholds.
 
     Raises:
-        UsageError: ``out`` and ``model`` have the same name, or of two PLYs the same sidecar.
+        UsageError: ``out`` and ``model`` have the same name, or of two PLYs that of their sidecar.
         OutputError: ``out`` cannot be written, or its format cannot hold thresholds.
     """
     form = formats.named(out)

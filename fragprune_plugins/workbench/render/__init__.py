@@ -1,4 +1,4 @@
-"""``fragprune render``: draws pictures of a splat with the thresholds of its sidecar."""
+"""``fragprune render``: draws pictures of a splat with its thresholds."""
 
 from __future__ import annotations
 
