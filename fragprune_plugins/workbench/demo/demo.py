@@ -26,7 +26,7 @@ REPORT = "report.json"
 """The report's file in the demo's folder; the demo writes it last."""
 
 
-_REPEATS = 20  # timed frames for each view: small frames are fast, and laptops are noisy
+_REPEATS = 5  # timed frames for each view
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,8 @@ from fragprune_plugins.workbench.commands.options import CAMERAS_HELP, FILE, MOD
 def command(**options: Any) -> Report:
     """Look at MODEL in the browser, with fragments, overdraw and frame times.
 
-    A model with thresholds is shown twice, with and without them, on both sides of a split. OTHER,
-    if given, is the model on the right side. The page needs WebGL2 and no network: it is served to
+    A model with thresholds is shown twice: without them left of a split, with them right of it.
+    OTHER, such as the original, is shown beside MODEL; the pruned one is right. The page needs WebGL2 and no network: it is served to
     this machine only, until Ctrl-C. With --out it is a folder that any web server can serve, or one
     HTML file that a browser opens from disk.
 

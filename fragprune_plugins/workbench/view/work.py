@@ -47,14 +47,15 @@ def view(
     if out is not None:
         _expect_our_page(out if single else out / "index.html")
         writable_folder(out.parent if single else out)
-    models = [load(each) for each in (model, other) if each is not None]
+    paths = [each for each in (model, other) if each is not None]
+    models = [load(each) for each in paths]
     shown = _cameras(data, cameras or cameras_of(model), white_background)
     if shown:
         start = shown[0].view
     else:
         start = overview(models[0])
         start.background.copy_(torch.full((3,), float(white_background)))
-    site = make_site(model.name, models, _layers(model, other, models), shown, start)
+    site = make_site(model.name, models, _layers(paths, models), shown, start)
     facts: dict[str, Any] = {
         "model": str(model),
         "compare": None if other is None else str(other),
@@ -84,17 +85,26 @@ def view(
     )
 
 
-def _layers(model: Path, other: Path | None, models: list[Model]) -> list[Layer]:
-    """The sides of the split."""
+def _layers(paths: list[Path], models: list[Model]) -> list[Layer]:
+    """The sides of the split, from left to right."""
     truncated = [each.falloff is not None for each in models]
-    if other is not None:
-        names = [model.stem, other.stem]
-        if names[0] == names[1]:
-            names = [str(model), str(other)]
-        return [Layer(name, index, truncated[index]) for index, name in enumerate(names)]
-    if truncated[0]:
-        return [Layer("Truncated", 0, True), Layer("Untruncated", 0, False)]
-    return [Layer(model.stem, 0, False)]
+    if len(paths) == 1:
+        pruned = [Layer("Without cutoffs", 0, False), Layer("Pruned", 0, True)]
+        return pruned if truncated[0] else [Layer(paths[0].stem, 0, False)]
+    if truncated[0] != truncated[1]:
+        pair = truncated.index(False), truncated.index(True)
+        return [Layer("Original", pair[0], False), Layer("Pruned", pair[1], True)]
+    names = _told_apart(*paths)
+    return [Layer(name, index, truncated[index]) for index, name in enumerate(names)]
+
+
+def _told_apart(left: Path, right: Path) -> tuple[str, str]:
+    """Names of two files: the first folder or name from the end in which their paths differ."""
+    ends = (reversed(path.with_suffix("").parts) for path in (left, right))
+    for one, other in zip(*ends, strict=False):
+        if one != other:
+            return one, other
+    return str(left), str(right)
 
 
 def _mebibytes(count: int) -> str:
