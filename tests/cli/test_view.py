@@ -59,7 +59,7 @@ def test_two_models_are_two_sides(scene, tmp_path):
     assert [each["model"] for each in held["layers"]] == [0, 1]
     sides = [(each["name"], each["truncated"]) for each in held["layers"]]
     assert sides == [("Original", False), ("Pruned", True)]
-    assert report["gaussians"] == [60, 20]
+    assert report["gaussians"] == [20, 60]
 
 
 def test_two_models_of_one_file_name_are_told_apart(tmp_path):

@@ -35,9 +35,9 @@ def command(**options: Any) -> Report:
     """Look at MODEL in the browser, with fragments, overdraw and frame times.
 
     A model with thresholds is shown twice: without them left of a split, with them right of it.
-    OTHER, such as the original, is shown beside MODEL; the pruned one is right. The page needs WebGL2 and no network: it is served to
-    this machine only, until Ctrl-C. With --out it is a folder that any web server can serve, or one
-    HTML file that a browser opens from disk.
+    OTHER is a second model, such as the original; the pruned one is right. The page needs WebGL2
+    and no network: it is served to this machine only, until Ctrl-C. With --out it is a folder that
+    any web server can serve, or one HTML file that a browser opens from disk.
 
     \b
     Examples:
