@@ -5,6 +5,7 @@ It runs ``fragprune demo`` and ``fragprune audit``, and puts what they wrote sid
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,18 +22,18 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         demo, audit = Path(folder, "demo"), Path(folder, "audit")
         fragprune("demo", "--out", demo)
-        trained = next((demo / "model").rglob("iteration_2000/point_cloud.ply"))
+        trained = next((demo / "model").rglob("iteration_1000/point_cloud.ply"))
         fragprune("audit", trained, "--data", demo / "scene", "--out", audit)
         for view in ("view_000", "view_024"):
-            shown = [demo / "pictures" / f"{view}_{what}.png" for what in ("before", "after")]
+            shown = [demo / "pictures" / f"{view}_{what}.png" for what in ("original", "pruned")]
             maps = [path.with_stem(f"{path.stem}_fragments") for path in shown]
             errors = [path.with_stem(f"{path.stem}_error") for path in shown]
             side_by_side(f"{view}.jpg", [shown, maps, errors])
         (drawn,) = sorted(audit.glob("*_overdraw.png"))[:1]
         names = (drawn.stem.removesuffix("_overdraw") + end for end in ("", "_fragments"))
         side_by_side("audit.jpg", [[*(drawn.with_stem(name) for name in names), drawn]])
-        curves = Image.open(demo / "pictures" / "learning.png").convert("RGB")
-        curves.quantize(32).save(GALLERY / "learning.png", optimize=True)
+        shutil.copyfile(demo / "pictures" / "learning.png", GALLERY / "learning.png")
+        shutil.copyfile(demo / "pictures" / "banner.jpg", GALLERY.with_name("demo.jpg"))
 
 
 def fragprune(*arguments: object) -> None:

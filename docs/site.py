@@ -1,8 +1,8 @@
 """What the site has beside the pages of this folder; a hook of mkdocs, named in mkdocs.yml.
 
-The README and its neighbours become pages, and so does what ``generate.py`` reads off the code. The
-tutorial is run, and becomes a page with what it
-printed and drew. The navigation is read off index.md, which lists every page.
+The changelog and its neighbours become pages, and so does what ``generate.py`` reads off the code.
+The tutorial is run, and becomes a page with what it printed and drew. The navigation is read off
+index.md, which lists every page.
 """
 
 from __future__ import annotations
@@ -23,14 +23,12 @@ from mkdocs.structure.pages import Page
 
 DOCS = Path(__file__).parent
 OUTSIDE = {
-    "README.md": "install.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
 }
 LINK = re.compile(r"(?<=\]\()([^)#\s:]+)")
 MOVED = {**OUTSIDE, "tutorial.ipynb": "tutorial.md"}
-TITLES = {"install.md": {"Install and use": "install.md"}}  # instead of the page's own
 Nav = list[Any]
 
 
@@ -52,7 +50,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
                 question = line.split("|")[1].strip()
                 pages.append({question[0].upper() + question[1:]: tables})
             else:
-                pages += [TITLES.get(at, at) for _, at in links]
+                pages += [at for _, at in links]
         nav.append({title.replace("`", ""): pages})
     config.nav = nav
     return config

@@ -13,16 +13,12 @@ import hashlib
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from fragprune_plugins.errors import OutputError
+from filelock import FileLock, Timeout
 
-try:
-    import fcntl
-except ImportError:  # no such locks on Windows: two writers are not kept apart there
-    fcntl = None  # type: ignore[assignment]
+from fragprune_plugins.errors import OutputError
 
 WAIT = 60.0
 """Seconds to wait for another process that writes the same file."""
@@ -60,50 +56,28 @@ def locked(path: Path, wait: float | None = None, what: str = "lock") -> Iterato
         OutputError: another process holds the lock.
     """
     name = in_flight(path, what)
-    handle = _taken(name, path, time.monotonic() + (WAIT if wait is None else wait))
+    lock = FileLock(name, timeout=WAIT if wait is None else wait)
     try:
-        yield handle is not None
+        lock.acquire(poll_interval=0.02)
+    except Timeout as error:
+        raise OutputError(
+            str(path),
+            "being written by another process",
+            "one process at a time",
+            "Wait for the other process, or choose another output.",
+        ) from error
+    except OSError as error:
+        if error.errno not in _WITHOUT_LOCKS:
+            raise
+        name.unlink(missing_ok=True)
+        yield False
+        return
+    try:
+        yield True
     finally:
-        if handle is not None:
-            name.unlink(missing_ok=True)  # first: whoever waits then finds that it is another file
-            os.close(handle)
-
-
-def _taken(name: Path, path: Path, deadline: float) -> int | None:
-    """An open handle of the lock file, locked; None where there are no locks."""
-    while fcntl is not None:
-        handle, taken = os.open(name, os.O_RDWR | os.O_CREAT, 0o666), False
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            taken = _is_named(handle, name)
-            if taken:
-                return handle
-        except BlockingIOError as error:
-            if time.monotonic() > deadline:
-                raise OutputError(
-                    str(path),
-                    "being written by another process",
-                    "one process at a time",
-                    "Wait for the other process, or choose another output.",
-                ) from error
-            time.sleep(0.02)
-        except OSError as error:
-            if error.errno not in _WITHOUT_LOCKS:
-                raise
-            name.unlink(missing_ok=True)
-            return None
-        finally:
-            if not taken:
-                os.close(handle)
-    return None
-
-
-def _is_named(handle: int, name: Path) -> bool:
-    """Whether an open file is still the one with this name; its last holder removes the name."""
-    try:
-        return os.path.samestat(os.fstat(handle), os.stat(name))
-    except FileNotFoundError:
-        return False
+        with contextlib.suppress(OSError):  # Windows keeps a file that is open
+            name.unlink()  # first: whoever waits then finds that it is another file
+        lock.release()
 
 
 @contextlib.contextmanager

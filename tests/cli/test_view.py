@@ -26,7 +26,7 @@ def test_a_folder_with_cameras_and_photographs(scene, tmp_path):
     out = tmp_path / "page"
     report = run_json("view", path, "--data", data, "--out", out)
     held = json.loads((out / "scene.json").read_text())
-    assert [each["name"] for each in held["layers"]] == ["Truncated", "Untruncated"]
+    assert [each["name"] for each in held["layers"]] == ["Without cutoffs", "Pruned"]
     assert [each["name"] for each in held["cameras"]] == ["view00.png", "view08.png"]
     assert all((out / each["photograph"]).exists() for each in held["cameras"])
     assert held["start"]["position"] == held["cameras"][0]["position"]
@@ -57,8 +57,22 @@ def test_two_models_are_two_sides(scene, tmp_path):
     report = run_json("view", path, other, "--out", tmp_path / "page")
     held = json.loads((tmp_path / "page" / "scene.json").read_text())
     assert [each["model"] for each in held["layers"]] == [0, 1]
-    assert [each["truncated"] for each in held["layers"]] == [True, False]
-    assert report["gaussians"] == [60, 20]
+    sides = [(each["name"], each["truncated"]) for each in held["layers"]]
+    assert sides == [("Original", False), ("Pruned", True)]
+    assert report["gaussians"] == [20, 60]
+
+
+def test_two_models_of_one_file_name_are_told_apart(tmp_path):
+    """As hosts name theirs: by the folder, and not by the end of a long path that is cut off."""
+    words = []
+    for number in (7, 9):
+        folder = tmp_path / "out" / "point_cloud" / f"iteration_{number}"
+        folder.mkdir(parents=True)
+        write_ply(folder / "point_cloud.ply", tiny.random_model(20))
+        words.append(folder / "point_cloud.ply")
+    run_json("view", *words, "--out", tmp_path / "page")
+    held = json.loads((tmp_path / "page" / "scene.json").read_text())
+    assert [each["name"] for each in held["layers"]] == ["iteration_7", "iteration_9"]
 
 
 def test_the_cameras_of_a_training_are_found(scene, tmp_path):

@@ -3,8 +3,10 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import time
 import tracemalloc
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -123,22 +125,30 @@ def test_a_lock_is_for_one_at_a_time_and_leaves_nothing(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_whose_file_was_removed_meanwhile_is_no_lock(tmp_path):
-    with open(tmp_path / "lock", "w") as file:
-        assert atomic._is_named(file.fileno(), tmp_path / "lock") is True
-        (tmp_path / "other").touch()
-        assert atomic._is_named(file.fileno(), tmp_path / "other") is False
-        (tmp_path / "lock").unlink()
-        assert atomic._is_named(file.fileno(), tmp_path / "lock") is False
+def test_who_waits_for_a_lock_gets_it_after_its_file_was_removed(tmp_path):
+    path, order = tmp_path / "a.txt", []
+
+    def wait():
+        with locked(path, wait=20):
+            order.append("next")
+
+    with locked(path):
+        waiting = Thread(target=wait)
+        waiting.start()
+        time.sleep(0.1)
+        order.append("first")
+    waiting.join()
+    assert order == ["first", "next"]
+    assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EIO])
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.EIO])
 def test_where_there_are_no_locks_writing_goes_on_without(tmp_path, monkeypatch, number):
     def flock(*_):
         in_flight(tmp_path / "a.txt", "lock").unlink()  # as another process without locks may do
         raise OSError(number, "no")
 
-    monkeypatch.setattr(atomic.fcntl, "flock", flock)
+    monkeypatch.setattr("fcntl.flock", flock)
     left = in_flight(tmp_path / "a.txt", "new-left")
     left.mkdir()
     if number == errno.EIO:

@@ -23,7 +23,7 @@ from fragprune_plugins.workbench.commands.options import FILE, EngineOptions, en
 @click.option(
     "--iters",
     type=click.IntRange(min=100),
-    default=2000,
+    default=1000,
     show_default=True,
     help="Iterations of the training; the fine-tuning runs half as many.",
 )

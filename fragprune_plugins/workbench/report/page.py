@@ -148,7 +148,7 @@ def draw_views(
         limits[kind] = shared_limit(list(values.values()))
         for stem, each_map in values.items():
             save_map(folder / f"{stem}_{kind}.png", each_map, limits[kind])
-    target = "Photograph" if chosen[0].target == "photograph" else "The original's own picture"
+    target = "Photograph" if chosen[0].target == "photographs" else "The original's own picture"
     return Drawn(views, target, limits["fragments"], limits["error"])
 
 

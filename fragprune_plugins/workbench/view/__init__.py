@@ -34,10 +34,10 @@ from fragprune_plugins.workbench.commands.options import CAMERAS_HELP, FILE, MOD
 def command(**options: Any) -> Report:
     """Look at MODEL in the browser, with fragments, overdraw and frame times.
 
-    A model with thresholds is shown twice, with and without them, on both sides of a split. OTHER,
-    if given, is the model on the right side. The page needs WebGL2 and no network: it is served to
-    this machine only, until Ctrl-C. With --out it is a folder that any web server can serve, or one
-    HTML file that a browser opens from disk.
+    A model with thresholds is shown twice: without them left of a split, with them right of it.
+    OTHER is a second model, such as the original; the pruned one is right. The page needs WebGL2
+    and no network: it is served to this machine only, until Ctrl-C. With --out it is a folder that
+    any web server can serve, or one HTML file that a browser opens from disk.
 
     \b
     Examples:

@@ -11,7 +11,6 @@ import torch
 
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import replacing, writable_folder
-from fragprune_plugins.files.model import Model
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of
 from fragprune_plugins.workbench.commands.options import expect_one
@@ -47,19 +46,24 @@ def view(
     if out is not None:
         _expect_our_page(out if single else out / "index.html")
         writable_folder(out.parent if single else out)
-    models = [load(each) for each in (model, other) if each is not None]
+    paths = [each for each in (model, other) if each is not None]
+    models = [load(each) for each in paths]
+    truncated = [each.falloff is not None for each in models]
+    if truncated == [True, False]:  # the original stands left of the split
+        for each in (paths, models, truncated):
+            each.reverse()
     shown = _cameras(data, cameras or cameras_of(model), white_background)
     if shown:
         start = shown[0].view
     else:
-        start = overview(models[0])
+        start = overview(models[-1])
         start.background.copy_(torch.full((3,), float(white_background)))
-    site = make_site(model.name, models, _layers(model, other, models), shown, start)
+    site = make_site(model.name, models, _layers(paths, truncated), shown, start)
     facts: dict[str, Any] = {
         "model": str(model),
         "compare": None if other is None else str(other),
         "gaussians": [len(each) for each in models],
-        "truncated": [each.falloff is not None for each in models],
+        "truncated": truncated,
         "cameras": len(shown),
         "bytes": sum(map(len, site.values())),
         "address": None,
@@ -84,17 +88,22 @@ def view(
     )
 
 
-def _layers(model: Path, other: Path | None, models: list[Model]) -> list[Layer]:
-    """The sides of the split."""
-    truncated = [each.falloff is not None for each in models]
-    if other is not None:
-        names = [model.stem, other.stem]
-        if names[0] == names[1]:
-            names = [str(model), str(other)]
-        return [Layer(name, index, truncated[index]) for index, name in enumerate(names)]
-    if truncated[0]:
-        return [Layer("Truncated", 0, True), Layer("Untruncated", 0, False)]
-    return [Layer(model.stem, 0, False)]
+def _layers(paths: list[Path], truncated: list[bool]) -> list[Layer]:
+    """The sides of the split, from left to right."""
+    if len(paths) == 1:
+        pruned = [Layer("Without cutoffs", 0, False), Layer("Pruned", 0, True)]
+        return pruned if truncated[0] else [Layer(paths[0].stem, 0, False)]
+    names = ("Original", "Pruned") if truncated == [False, True] else _told_apart(*paths)
+    return [Layer(name, index, truncated[index]) for index, name in enumerate(names)]
+
+
+def _told_apart(left: Path, right: Path) -> tuple[str, str]:
+    """Names of two files: the first folder or name from the end in which their paths differ."""
+    ends = (reversed(path.with_suffix("").parts) for path in (left, right))
+    for one, other in zip(*ends, strict=False):
+        if one != other:
+            return one, other
+    return str(left), str(right)
 
 
 def _mebibytes(count: int) -> str:

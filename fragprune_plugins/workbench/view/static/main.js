@@ -48,7 +48,7 @@ class Viewer {
         this.drawing.options.fixed = asked.get("quads") === "fixed";
         this.layers = []; // { splats, truncated, name }
         this.camera = scene.start;
-        this.distance = this.#ahead();
+        this.distance = this.ahead();
         this.up = scene.up;
         this.background = scene.background;
         this.show = "split";
@@ -73,7 +73,7 @@ class Viewer {
     }
 
     // How far ahead the orbit's centre is: beside the middle of the scene.
-    #ahead() {
+    ahead() {
         const { centre, radius } = this.scene;
         const way = dot(add(centre, this.camera.position, -1), axis(this.camera, 2));
         return Math.max(way, 0.3 * radius);
@@ -270,7 +270,7 @@ class Viewer {
             const values = this.counted.map(each => each[name]), cells = rows[r].querySelectorAll("td");
             values.forEach((value, i) => { cells[i].textContent = value.toFixed(value < 100 ? 1 : 0); });
             if (values.length > 1)
-                cells[2].textContent = values[0] > 0 ? `${(values[1] / values[0]).toFixed(2)}×` : "–";
+                cells[2].textContent = values[1] > 0 ? `${(values[0] / values[1]).toFixed(2)}×` : "–";
         });
         $("#figures").classList.remove("stale");
         this.legend();
@@ -399,6 +399,18 @@ function wire(viewer) {
         viewer.change(false);
     });
     $("#ask").addEventListener("click", () => $("#help").showModal());
+    $("#reset").addEventListener("click", () => {
+        viewer.go(scene.start, false);
+        viewer.distance = viewer.ahead();
+    });
+    const bare = () => {
+        document.body.classList.toggle("bare");
+        viewer.change(false);
+    };
+    for (const name of ["#hide", "#back"]) $(name).addEventListener("click", bare);
+    $("#whole").hidden = !document.fullscreenEnabled;
+    $("#whole").addEventListener("click", () =>
+        document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen());
 
     const split = $("#split");
     const place = share => {
@@ -455,7 +467,8 @@ function wire(viewer) {
         else if (key === "p") photo.click();
         else if (key === "b") $("#ground").click();
         else if (key === "t") $("#theme").click();
-        else if (key === "h") document.body.classList.toggle("bare");
+        else if (key === "h") bare();
+        else if (key === "r") $("#reset").click();
         else if (key === "?") $("#help").showModal();
     });
     addEventListener("keyup", event => {
@@ -492,6 +505,7 @@ async function start() {
     const scene = JSON.parse(new TextDecoder().decode(await asset("scene.json")));
     const viewer = window.viewer = new Viewer(scene);
     $("#title").textContent = document.title = scene.title;
+    $("#loading span").textContent = "Loading";
     const bar = $("#loading progress");
     const loaded = new Map();
     wire(viewer);
