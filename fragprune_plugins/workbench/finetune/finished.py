@@ -273,7 +273,7 @@ def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
 
     Args:
         before: measurement of the model before fine-tuning.
-        plain: measurement of the fine-tuned model without thresholds.
+        plain: measurement of the fine-tuned model without thresholds and stop.
     """
     from fragprune_plugins.workbench.figures.wording import FELL
 
