@@ -20,11 +20,11 @@ LAZY = ("files.ply", "engines", "hosts.graphdeco.stand_ins")  # by name, in adap
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (14_840, 12_000),
+    "core lines": (14_850, 12_000),
     "core imports of the workbench": (0, 0),
-    "imports inside functions": (287, 60),
-    "functions over 60 lines": (25, 10),
-    "longest function": (153, 80),
+    "imports inside functions": (175, 60),
+    "functions over 60 lines": (19, 10),
+    "longest function": (142, 80),
     "members of an adapter": (24, 24),
     "members of a dialect": (7, 7),
     "members with one user": (5, 5),
