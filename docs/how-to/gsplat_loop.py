@@ -3,7 +3,7 @@
 python gsplat_loop.py SCENE OUT [--strategy mcmc] [--steps 3000] [--stage2 1000]
 python gsplat_loop.py SCENE OUT --start MODEL.ply        (trained already: stage 2 alone)
 
-SCENE is a COLMAP folder with sparse/0/points3D.ply. OUT gets trained.ply and finetuned.ply, the
+SCENE is a COLMAP folder with sparse/0/points3D.txt. OUT gets trained.ply and finetuned.ply, the
 thresholds beside the latter.
 """
 
@@ -38,7 +38,6 @@ session = fragprune_plugins.activate("gsplat", from_iter=args.steps, settings=se
 import gsplat  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from plyfile import PlyData  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
 from fragprune_plugins.engines.losses import photometric_loss  # noqa: E402
@@ -52,9 +51,9 @@ random.seed(0)
 torch.manual_seed(0)
 
 dataset = load_dataset(args.scene)
-cloud = PlyData.read(str(args.scene / "sparse/0/points3D.ply"))["vertex"]
-points = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=1)
-colors = np.stack([cloud["red"], cloud["green"], cloud["blue"]], axis=1) / 255
+rows = (args.scene / "sparse/0/points3D.txt").read_text().splitlines()
+cloud = np.array([row.split()[1:7] for row in rows if not row.startswith("#")], dtype=float)
+points, colors = cloud[:, :3], cloud[:, 3:] / 255
 spacing = np.sqrt(np.square(cKDTree(points).query(points, k=4)[0][:, 1:]).mean(axis=1))
 mcmc = args.strategy == "mcmc"
 
