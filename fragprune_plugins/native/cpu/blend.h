@@ -200,7 +200,7 @@ struct ExtraPixels {
   Lanes most;       // weight
   IntLanes winner;  // place in the list
 
-  void clear() {
+  void reset() {
     for (Lanes& v : features) v = broadcast<Lanes>(0.f);
     most = broadcast<Lanes>(0.f);
     winner = broadcast_int(-1);
@@ -229,7 +229,7 @@ struct ExtraTile {
 
   ExtraTile(const Extras& e, const Tile& tile, int width, int height)
       : extras(e), samples(tile, width, height, e.offsets) {
-    for (ExtraPixels& block : blocks) block.clear();
+    for (ExtraPixels& block : blocks) block.reset();
   }
   void grow(int length) {
     if (extras.counts) each.fragments.resize(length);
