@@ -203,7 +203,6 @@ class GaussianSplatting(GraphdecoAdapter):
                 str(repo.root),
                 "a folder",
                 f"the installed package {PACKAGE}, as python -m {PACKAGE}.train runs it",
-                "Use the adapter of that host.",
             )
         ]
 

@@ -201,7 +201,6 @@ class Gsplat(HostAdapter):
                 str(repo.root),
                 "a folder",
                 "the installed package gsplat, or a script that imports it",
-                "Use the adapter of that host.",
             )
         ]
 

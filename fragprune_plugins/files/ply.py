@@ -4,14 +4,17 @@ One ``vertex`` element of float32 columns, values before activation: x y z, nx n
 f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
 (logit), scale_0..2 (log), rot_0..3 (w x y z, any length). A model with thresholds has one column
 more, ``trunc_threshold``: the threshold itself, in falloff, in (0, 1). A model's stop is a comment
-of the header, ``fragprune stop 0.01``. Unknown columns are ignored,
-except Mip-Splatting's ``filter_3D``: such a model is refused unless the caller draws by the rules
-of Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaussians are flat.
+of the header, ``fragprune stop 0.01``. Other columns are ignored, and named in the log. A model
+with a column that changes its picture is refused (``columns``); with Mip-Splatting's ``filter_3D``,
+unless the caller draws by the rules of Mip-Splatting. So is one without scale_2: 2D Gaussian
+Splatting's, whose Gaussians are flat.
 """
 
 from __future__ import annotations
 
+import logging
 import math
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import ModelFileError
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.columns import change_of, is_plain
 from fragprune_plugins.files.model import REST_COUNTS, Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
 from fragprune_plugins.files.reading import Door, Reading
@@ -51,6 +55,10 @@ LOG_SCALE_MAX = 30.0
 focal length and squares it, and float32 ends at 1e38."""
 
 _QUATERNION_MIN = 1e-12  # torch's normalize divides by no less
+
+log = logging.getLogger("fragprune")
+
+_SHOWN_COLUMNS = 12
 
 _SHOWN_ROWS = 5  # of those that a message is about
 
@@ -132,6 +140,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
             "a splat that is drawn as it is stored",
             "Fuse the filter first (create_fused_ply.py there), or fine-tune with fragprune run.",
         )
+    _expect_no_other(path, [name for name in names if not is_plain(name) and name != _FILTER])
     rest = sorted(
         (name for name in names if name.startswith("f_rest_") and name[7:].isdecimal()),
         key=lambda name: (len(name), name),
@@ -170,6 +179,28 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
     )
     expect_drawable(path, splat)
     return splat
+
+
+def _expect_no_other(path: Path, others: list[str]) -> None:
+    """Refuse columns that change the picture; name those that are ignored in the log."""
+    for name in others:
+        if says := change_of(name):
+            raise ModelFileError(
+                str(path),
+                f"a column {name}: {says}, which a plain drawing ignores",
+                "a splat that is drawn as it is stored",
+                "Fine-tune and draw it through its host, or save it there as plain 3DGS.",
+            )
+    if others:
+        shown = ", ".join(others[:_SHOWN_COLUMNS])
+        more = f" and {len(others) - _SHOWN_COLUMNS} more" if len(others) > _SHOWN_COLUMNS else ""
+        _warn(f"{path}: ignored its columns {shown}{more}")
+
+
+@cache
+def _warn(message: str) -> None:
+    """Say something once: commands read a file several times."""
+    log.warning(message)
 
 
 def write_ply(path: Path, model: Model) -> None:

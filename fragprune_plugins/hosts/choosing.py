@@ -41,11 +41,12 @@ class Tried:
         return sum(state.status != "at import" for state in self.seams)
 
     @property
-    def order(self) -> tuple[int, float, int]:
-        """Sort key: kinds of errors, share of seams that hold, size of the errors."""
+    def order(self) -> tuple[bool, float, int, int]:
+        """Sort key: fits, share of seams that hold, kinds of errors, size of the errors."""
         kinds = {finding.code for finding in self.errors}
         complaint = sum(len(finding.found) for finding in self.errors)
-        return len(kinds), -self.held / max(1, self.looked_up), complaint
+        share = self.held / max(1, self.looked_up)
+        return not self.match.fits, -share, len(kinds), complaint
 
     @property
     def errors(self) -> list[Finding]:

@@ -21,7 +21,7 @@ _NOT_THEIRS = {"third_party", "build", "dist", "site-packages", "node_modules", 
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
 _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
-_FILTER = re.compile(r"\bcov(?:\[0\]\[0\]|\.x)\s*\+=\s*([^;]+);")
+_FILTER = re.compile(r"\bcov(?:\[0\]\[0\]|\.x)\s*\+=?\s*([\w.]+)")
 _EWA = re.compile(
     r"\((\w+)/(\w+)\.z,0\.?0?,-\(?\1\*\2\.x\)?/\(\2\.z\*\2\.z\),"
     r"0\.?0?,(\w+)/\2\.z,-\(?\3\*\2\.y\)?/\(\2\.z\*\2\.z\),0\.?0?,0\.?0?,0\.?0?\)"

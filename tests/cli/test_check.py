@@ -75,7 +75,7 @@ def test_nothing_is_imported(host, python):
 
 def test_a_host_that_fits_needs_no_line_of_any_other_adapter(host):
     text = run("check", host).stdout
-    assert text.splitlines()[1].startswith("vanilla-3dgs fits: ")
+    assert text.splitlines()[4].startswith("vanilla-3dgs fits: ")
     assert "does not fit" not in text
     assert "others do not fit (--verbose says why)" in text
 
@@ -200,3 +200,25 @@ def test_unknown_folders_and_adapters_are_stated_failures(host, tmp_path):
         result = run("check", *words, "--json")
         assert result.exit_code == 1
         assert found in json.loads(result.stdout)["error"]["found"]
+
+
+def test_a_folder_of_checkouts_is_a_table(tmp_path):
+    skeleton(tmp_path / "a")
+    skeleton(tmp_path / "b", groups=("xyz", "color"))
+    (tmp_path / "empty").mkdir()
+    result = run("check", tmp_path, "--all")
+    rows = [line.split(" | ") for line in result.stdout.splitlines() if line.startswith("| ")][1:]
+    assert [(row[0], row[1]) for row in rows] == [
+        ("| a", "fits"),
+        ("| b", "never"),
+        ("| empty", "never"),
+    ]
+    assert "groups beyond: color" in rows[1][-1]
+    counts = json.loads(run("check", tmp_path, "--all", "--json").stdout)["counts"]
+    assert (counts["fits"], counts["never"]) == (1, 2)
+
+
+def test_the_verdict_is_data(host):
+    found = json.loads(run("check", host, "--json").stdout)
+    assert (found["verdict"], found["nearest"], found["differs"]) == ("fits", "vanilla-3dgs", [])
+    assert found["sentence"].startswith("It fits vanilla-3dgs.")

@@ -77,6 +77,42 @@ def test_ascii_doubles_and_unknown_columns(tmp_path):
     assert same(model, read_ply(tmp_path / "foreign.ply"))
 
 
+def with_column(model: Model, path: Path, name: str) -> Path:
+    write_ply(path, model)
+    rows = PlyData.read(path)["vertex"].data
+    wide = np.zeros(len(rows), dtype=[*rows.dtype.descr, (name, "f4")])
+    for each in rows.dtype.names:
+        wide[each] = rows[each]
+    PlyData([PlyElement.describe(wide, "vertex")]).write(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("binding_0", "triangles of a mesh"),
+        ("refl_strength", "reflections"),
+        ("text_dc_0", "textures"),
+        ("masks_0", "masks"),
+        ("f_offset_3", "anchors"),
+        ("trbf_scale", "motion"),
+    ],
+)
+def test_a_column_that_changes_the_picture_is_refused(tmp_path, name, says):
+    path = with_column(tiny.random_model(4, degree=1), tmp_path / "m.ply", name)
+    with pytest.raises(ModelFileError, match=says) as caught:
+        read_ply(path)
+    assert name in caught.value.found
+
+
+@pytest.mark.parametrize("name", ["obj_dc_0", "roughness", "confidence"])
+def test_a_column_that_is_ignored_is_named_once(tmp_path, name, caplog):
+    path = with_column(tiny.random_model(4, degree=1), tmp_path / "m.ply", name)
+    for _ in range(2):
+        read_ply(path)
+    assert [name in record.message for record in caplog.records] == [True]
+
+
 def test_a_model_of_surfels_is_read_only_by_who_asks_for_it_and_written_as_it_was(tmp_path):
     round_ones = tiny.random_model(4, degree=1)
     model = replace(round_ones, scaling=round_ones.scaling[:, :2])

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 CAMERAS = "utils.camera_utils"
-OTHER = "Use the adapter of that host."
 
 
 def optimizers(call: SeamCall) -> list[Any]:
@@ -216,7 +215,7 @@ class GraphdecoAdapter(ScriptAdapter):
         if found in ((), known):
             return []
         at, expected = f"{MODEL}:{setup} ({repo.place(MODEL, setup)})", ", ".join(known)
-        return [Finding("error", "param-groups", at, ", ".join(found), expected, OTHER)]
+        return [Finding("error", "param-groups", at, ", ".join(found), expected)]
 
     def _calls(self, repo: HostRepo) -> list[Finding]:
         """An error for each call of the rasterizer that is not in ``calls``."""
@@ -231,11 +230,10 @@ class GraphdecoAdapter(ScriptAdapter):
                 own = each.call.package == self.package
                 call = replace(each.call, package="") if own else each.call
                 if not any(known.answers(call) for known in accepted):
-                    found.append((name, repo.at(renderer, each.line), str(call), expected, OTHER))
+                    found.append((name, repo.at(renderer, each.line), str(call), expected))
             if not calls:
-                nothing = "no call of GaussianRasterizationSettings with keywords"
-                remedy = "Check that this is the folder of the training script."
-                found.append((name, repo.place(renderer, name), nothing, expected, remedy))
+                nothing = "no settings passed by keyword, or they are made elsewhere"
+                found.append((name, repo.place(renderer, name), nothing, expected))
         return [
             Finding(
                 "error",
@@ -243,9 +241,8 @@ class GraphdecoAdapter(ScriptAdapter):
                 f"{renderer}:{name} ({at})",
                 what,
                 " or ".join(expected) or f"a rasterizer in {', '.join(functions)} alone",
-                remedy,
             )
-            for name, at, what, expected, remedy in found
+            for name, at, what, expected in found
         ]
 
     def _accepted(self) -> tuple[str, list[RasterizerCall]]:
@@ -268,7 +265,6 @@ class GraphdecoAdapter(ScriptAdapter):
                 str(repo.root),
                 ", ".join(found),
                 f"a {self.info.title} checkout",
-                OTHER,
             )
         ]
 

@@ -131,10 +131,11 @@ def _package(repo: HostRepo, module: str, body: Function) -> str:
     """The package of the function's rasterizer, by the function's imports, then the module's."""
     for scope in (body, repo.tree(module)):
         for node in ast.walk(scope) if scope else ():
-            if isinstance(node, ast.ImportFrom) and RASTERIZER in (a.name for a in node.names):
+            if isinstance(node, ast.ImportFrom) and any(RASTERIZER in a.name for a in node.names):
                 return repo.absolute(module, node)
     return "an unknown package"
 
 
 def _calls(node: ast.AST, name: str) -> bool:
-    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == name
+    """Whether a node calls a class of this name, or of one that a fork made of it."""
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and name in node.func.id

@@ -21,24 +21,31 @@ if TYPE_CHECKING:
 @click.argument("host", type=FILE)
 @click.option("--adapter", help="Check only this adapter, and show every seam.")
 @click.option("--verbose", is_flag=True, help="Show where every seam is and what is wrong.")
-def command(host: Path, adapter: str | None, verbose: bool) -> Report:
-    """Read HOST, a training repository, and say which adapter fits it.
+@click.option("--all", "every", is_flag=True, help="HOST is a folder of checkouts: a row for each.")
+def command(host: Path, adapter: str | None, verbose: bool, every: bool) -> Report:
+    """Read HOST, a training repository, and say what fragprune can do with it.
+
+    The first sentence is one of three: an adapter fits; none does, but the PLY that it saves is
+    plain 3DGS, with the command that prunes it; or it is not possible, and why. Then come the
+    differences from the nearest host.
 
     Nothing is imported or run, and no GPU is needed. The output lists packages that the host
     imports and that are not installed. --verbose shows for every seam the file and line where it
-    was found, changed or expected, and lists what does not work. The exit code is 0 if exactly one
-    adapter fits.
+    was found, changed or expected, and lists what does not work. --all prints a table of all
+    checkouts in a folder. The exit code is 0 if exactly one adapter fits.
 
     \b
     Examples:
       fragprune check ~/code/gaussian-splatting
       fragprune check ~/code/my-fork --adapter vanilla-3dgs     (why does it not fit?)
       fragprune check gsplat                                    (an installed package)
+      fragprune check ~/forks --all                             (a table)
     """
     from fragprune_plugins.errors import UnknownHostError
     from fragprune_plugins.hosts.choosing import attempt, closest
     from fragprune_plugins.hosts.preflight import install
     from fragprune_plugins.hosts.source import HostRepo
+    from fragprune_plugins.hosts.verdict import judge
     from fragprune_plugins.plugins.loading import load_plugins
 
     if not host.is_dir() and HostRepo.installed(str(host)) is None:
@@ -55,13 +62,20 @@ def command(host: Path, adapter: str | None, verbose: bool) -> Report:
             raise UnknownHostError(
                 "--adapter", repr(adapter), "an installed adapter", "Run fragprune adapters."
             )
+    if every:
+        return _table(host, adapters)
     repo = _repository(host, adapters, adapter)
     tried = attempt(repo, adapters)
     closer = closest([each.adapter for each in tried if each.match.fits], adapters)
     fitting = [each for each in tried if each.adapter in closer]
     verdict = fitting[0] if len(fitting) == 1 else None
+    judged = judge(repo, tried, adapters)
     missing = _missing(repo, verdict.adapter) if verdict else []
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
+    lines += ["", judged.sentence]
+    if judged.differs:
+        lines += ["", f"It differs from {judged.adapter}:", *(f"  {d}" for d in judged.differs)]
+    lines += [""]
     lines += _in_full(tried, fitting) if verbose or adapter else _in_short(tried, fitting)
     if missing:
         lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
@@ -70,6 +84,7 @@ def command(host: Path, adapter: str | None, verbose: bool) -> Report:
     data = {
         "host": str(host),
         "commit": repo.commit,
+        **judged.as_dict(),
         "fits": verdict.adapter.name if verdict else None,
         "missing": [
             {"module": each.module, "distribution": each.distribution, "at": each.at}
@@ -78,6 +93,31 @@ def command(host: Path, adapter: str | None, verbose: bool) -> Report:
         "adapters": [_as_dict(each) for each in tried],
     }
     return Report(data, "\n".join(lines), exit_code=0 if verdict else 1)
+
+
+def _table(folder: Path, adapters: list[HostAdapter]) -> Report:
+    """A row for each checkout in a folder; the exit code is 0 if there are any."""
+    from fragprune_plugins.hosts.choosing import attempt
+    from fragprune_plugins.hosts.verdict import judge
+
+    rows = []
+    for each in sorted(path for path in folder.iterdir() if path.is_dir()):
+        repo = _repository(each, adapters, None)
+        judged = judge(repo, attempt(repo, adapters), adapters)
+        rows.append({"host": each.name, "commit": repo.commit, **judged.as_dict()})
+    titles = ("checkout", "verdict", "nearest", "reason", "differs")
+    lines = [f"| {' | '.join(titles)} |", "|---|---|---|---|---|"]
+    for row in rows:
+        inside = [f"{name}/ fits {fits}" for name, fits in row["inside"].items()]
+        cells = [row["host"], row["verdict"], row["nearest"], row["reason"]]
+        cells.append("; ".join([*inside, *row["differs"]]))
+        lines.append(f"| {' | '.join(cell.replace('|', '/') or '-' for cell in cells)} |")
+    counts = {kind: sum(row["verdict"] == kind for row in rows) for kind in _KINDS}
+    lines += ["", ", ".join(f"{kind}: {number}" for kind, number in counts.items())]
+    return Report({"hosts": rows, "counts": counts}, "\n".join(lines), exit_code=0 if rows else 1)
+
+
+_KINDS = ("fits", "several", "inside", "finetune", "never")
 
 
 def _in_short(tried: list[Tried], fitting: list[Tried]) -> list[str]:

@@ -1,0 +1,322 @@
+"""Is the PLY that a codebase saves a plain 3DGS model? Read from its source, without an import.
+
+It is if it has the columns of 3DGS and no others that change the picture, if the values are saved
+before activation, and if ``render`` draws from the model's getters alone.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from fragprune_plugins.files.columns import change_of
+from fragprune_plugins.hosts.graphdeco.call import RASTERIZER
+from fragprune_plugins.hosts.kernels import SPLAT, read_kernels
+from fragprune_plugins.hosts.source import Function, HostRepo
+
+_COLUMNS = ("f_dc", "f_rest", "opacity", "scale", "rot")
+_OF_MODEL = re.compile(
+    r"get_(xyz|opacity|scaling|rotation|features\w*|covariance)|_(xyz|opacity|scaling|rotation|"
+    r"features_dc|features_rest)|\w+_activation|\w*sh_degree|screenspace_points"
+)
+"""Attributes of the model that a plain drawing reads."""
+_OF_CALL = re.compile(
+    r"view\w*|cam\w*|\w*pose\w*|pipe\w*|scal\w*|override_color|\w*mask\w*|bg\w*|xyz|means3D|"
+    r"opacity|opacities|features|shs|rotations?|\w*sh\w*"
+)
+"""Parameters of a drawing function that move or select Gaussians, or are their values."""
+_ACTIVATIONS = {
+    "scaling_activation": ("torch.exp",),
+    "opacity_activation": ("torch.sigmoid",),
+    "rotation_activation": ("torch.nn.functional.normalize", "F.normalize"),
+}
+
+
+@dataclass(frozen=True)
+class Plain:
+    """Whether a codebase's PLY is a plain 3DGS model.
+
+    Attributes:
+        reasons: what speaks against it, the weightiest first.
+        model: "module:class" of the model; "" if there is none that saves a PLY.
+    """
+
+    reasons: tuple[str, ...]
+    model: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.model) and not self.reasons
+
+
+def read_plain(repo: HostRepo) -> Plain:
+    """Read a checkout's model, its save function, its drawing function and its kernel."""
+    found = find_model(repo)
+    if found is None:
+        return Plain(("no model of this family that saves a PLY was found",))
+    module, name = found
+    flat = list(_flat(repo, module, name))
+    drawn = list(_of_drawing(repo))
+    made = [each for each in drawn if "3D_filter" not in each]
+    reasons = [
+        *flat,
+        *made,
+        *(() if flat else _of_kernel(repo)),
+        *drawn,
+        *_of_columns(repo, module, name),
+        *_of_saving(repo, module, name),
+        *_of_others(repo, module),
+    ]
+    return Plain(tuple(dict.fromkeys(reasons)), f"{module}:{name}")
+
+
+def find_model(repo: HostRepo) -> tuple[str, str] | None:
+    """Module and class of the model that saves a PLY, ``scene.gaussian_model`` first."""
+    return next(_models(repo), None)
+
+
+def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
+    """Module and class of each model in ``scene`` that saves a PLY."""
+    try:
+        files = sorted(each.stem for each in (repo.root / "scene").glob("*.py"))
+    except OSError:
+        files = []
+    files.sort(key=lambda stem: (stem != "gaussian_model", "gaussian" not in stem, len(stem)))
+    for stem in files:
+        tree = repo.tree(f"scene.{stem}") if stem.isidentifier() else None
+        classes = [each for each in (tree.body if tree else ()) if isinstance(each, ast.ClassDef)]
+        classes.sort(key=lambda each: each.name != "GaussianModel")
+        for each in classes:
+            if any(getattr(node, "name", "") == "save_ply" for node in each.body):
+                yield f"scene.{stem}", each.name
+
+
+def _of_others(repo: HostRepo, module: str) -> Iterator[str]:
+    """Other models that a training script makes, with columns that change the picture."""
+    scripts = [each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier()]
+    for other, name in _models(repo):
+        if other != module and repo.mentions(scripts, [name]):
+            for reason in _of_columns(repo, other, name):
+                if "also holds" in reason:
+                    yield f"{name}, which a script here trains: {reason}"
+
+
+def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+    """Columns that are missing, or that plain 3DGS does not have."""
+    listed = repo.function(module, f"{name}.construct_list_of_attributes")
+    listed = listed or repo.function(module, f"{name}.save_ply")
+    names = dict.fromkeys(
+        re.sub(r"_?(\{\})?\d*$", "", node.value)
+        for node in (ast.walk(listed) if listed else ())
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
+    names = {each: None for each in names if each.isidentifier()}
+    at = repo.place(module, f"{name}.construct_list_of_attributes")
+    if missing := [each for each in _COLUMNS if not any(n.startswith(each) for n in names)]:
+        yield f"its PLY lacks the columns {', '.join(missing)} ({at})"
+    if listed is not None and listed.name != "save_ply":
+        for each in names:
+            if says := change_of(each):
+                yield f"its PLY also holds {each}, {says} ({at})"
+
+
+def _flat(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+    """Gaussians with two scales."""
+    setup = repo.function(module, f"{name}.create_from_pcd")
+    for node in ast.walk(setup) if setup else ():
+        if isinstance(node, ast.Call) and ast.unparse(node).endswith(".repeat(1, 2)"):
+            yield f"its Gaussians are flat, with two scales ({repo.at(module, node.lineno)})"
+            break
+
+
+def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+    """Values that are not saved as they are before activation."""
+    raw = {"scaling": True, "opacity": True}
+    function = repo.function(module, f"{name}.save_ply")
+    for node in ast.walk(function) if function else ():
+        if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Name):
+            continue
+        target, value = node.targets[0].id, ast.unparse(node.value)
+        at = repo.at(module, node.lineno)
+        for kind in raw:
+            if f"self.get_{kind}" in value:
+                raw[kind] = False
+                if not re.search(r"inverse|log", value):
+                    yield f"save_ply stores activated values, {target} = {value[:60]} ({at})"
+        if target in ("f_dc", "f_rest", "opacities", "scale", "rotation") and re.match(
+            r"np\.(zeros|ones)", value
+        ):
+            yield f"save_ply stores no {target}: {value[:60]} ({at})"
+    setup = repo.function(module, f"{name}.setup_functions")
+    for node in ast.walk(setup) if setup else ():
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
+            attribute, value = node.targets[0].attr, ast.unparse(node.value)
+            expected = _ACTIVATIONS.get(attribute, (value,))
+            if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
+                yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
+    for getter, stored in (("get_opacity", "_opacity"), ("get_scaling", "_scaling")):
+        body = repo.function(module, f"{name}.{getter}")
+        if body is not None and f"self.{stored}" not in ast.unparse(body):
+            yield f"{getter} is computed ({repo.place(module, f'{name}.{getter}')})"
+
+
+def _of_kernel(repo: HostRepo) -> Iterator[str]:
+    """Differences of vendored rasterizers that the drawing functions import."""
+    for module in _renderers(repo):
+        tree = repo.tree(module)
+        for node in ast.walk(tree) if tree else ():
+            if isinstance(node, ast.ImportFrom) and any(RASTERIZER in a.name for a in node.names):
+                for finding in read_kernels(repo, repo.absolute(module, node), SPLAT):
+                    if finding.level == "error":
+                        yield f"its rasterizer draws otherwise: {finding.found}, {finding.where}"
+
+
+def _renderers(repo: HostRepo) -> list[str]:
+    """Modules of the drawing functions."""
+    names = ["gaussian_renderer"]
+    try:
+        files = sorted(os.listdir(repo.root / "gaussian_renderer"))
+    except OSError:
+        files = []
+    names += [f"gaussian_renderer.{each[:-3]}" for each in files if each.endswith(".py")]
+    return [each for each in names if not each.endswith(".__init__")]
+
+
+def _of_drawing(repo: HostRepo) -> Iterator[str]:
+    """Inputs of the rasterizer that are not the model's own."""
+    for module in _renderers(repo):
+        functions = [
+            node
+            for node in getattr(repo.tree(module), "body", ())
+            if isinstance(node, ast.FunctionDef) and _call(node)
+        ]
+        functions.sort(key=lambda each: each.name != "render")
+        if functions:
+            yield from _Drawing(repo, module, functions[0]).reasons()
+            return
+
+
+def _call(function: Function) -> ast.Call | None:
+    """The first call that draws."""
+    calls = [
+        node
+        for node in ast.walk(function)
+        if isinstance(node, ast.Call) and any(each.arg == "means3D" for each in node.keywords)
+    ]
+    return min(calls, key=lambda each: each.lineno, default=None)
+
+
+class _Drawing:
+    """A drawing function: where the inputs of its rasterizer come from."""
+
+    def __init__(self, repo: HostRepo, module: str, function: Function) -> None:
+        self.repo, self.module, self.function = repo, module, function
+        arguments = function.args
+        every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
+        self.parameters = {each.arg for each in every}
+        plain = [*arguments.posonlyargs, *arguments.args]
+        defaults = dict(
+            zip(reversed([each.arg for each in plain]), reversed(arguments.defaults), strict=False)
+        ) | {
+            each.arg: value
+            for each, value in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
+            if value
+        }
+        self.off = {
+            name
+            for name, value in defaults.items()
+            if isinstance(value, ast.Constant) and value.value in (None, False)
+        }
+        self.values: dict[str, list[ast.expr]] = {}
+        self._collect(function.body)
+        models = [
+            node.value.id
+            for node in ast.walk(function)
+            if isinstance(node, ast.Attribute)
+            and node.attr.startswith("get_xyz")
+            and isinstance(node.value, ast.Name)
+        ]
+        self.model = models[0] if models else "pc"
+
+    def _collect(self, body: list[ast.stmt]) -> None:
+        """Note every assignment, except where an argument is needed that is off by default."""
+        for node in body:
+            if isinstance(node, ast.If):
+                test = ast.unparse(node.test)
+                on = any(re.fullmatch(rf"{each}( is not None)?", test) for each in self.off)
+                none = any(re.fullmatch(rf"{each} is None|not {each}", test) for each in self.off)
+                self._collect([] if on else node.body)
+                self._collect([] if none else node.orelse)
+            elif isinstance(node, ast.Assign):
+                for target in node.targets:
+                    self._assign(target, node.value)
+            elif isinstance(node, ast.AnnAssign | ast.AugAssign):
+                if node.value:
+                    self._assign(node.target, node.value)
+            else:
+                for field in ("body", "orelse", "finalbody"):
+                    self._collect(getattr(node, field, []))
+
+    def _assign(self, target: ast.expr, value: ast.expr) -> None:
+        if isinstance(target, ast.Tuple):
+            several = isinstance(value, ast.Tuple) and len(value.elts) == len(target.elts)
+            for index, each in enumerate(target.elts):
+                self._assign(each, value.elts[index] if several else value)  # type: ignore[attr-defined]
+        elif isinstance(target, ast.Subscript):
+            self._assign(target.value, value)
+        elif isinstance(target, ast.Name):
+            self.values.setdefault(target.id, []).append(value)
+
+    def _roots(self, node: ast.expr, seen: frozenset[str] = frozenset()) -> Iterator[str]:
+        """What an expression is made of: "model.x", parameters, and "model" itself."""
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            if node.value.id == self.model and not self.values.get(self.model):
+                yield f"{self.model}.{node.attr}"
+                return
+            yield from self._roots(node.value, seen)
+        elif isinstance(node, ast.Name):
+            if node.id in seen:
+                return
+            if node.id in self.values:
+                for each in self.values[node.id]:
+                    yield from self._roots(each, seen | {node.id})
+            elif node.id in self.parameters:
+                yield node.id
+        elif isinstance(node, ast.Subscript):
+            yield from self._roots(node.value, seen)
+        elif isinstance(node, ast.Lambda | ast.ListComp | ast.GeneratorExp | ast.Dict):
+            return
+        else:
+            for child in ast.iter_child_nodes(node):
+                part = child.value if isinstance(child, ast.keyword) else child
+                if isinstance(part, ast.expr):
+                    yield from self._roots(part, seen)
+
+    def reasons(self) -> Iterator[str]:
+        """Inputs of the first call that a plain drawing does not have."""
+        call = _call(self.function)
+        given = {each.arg: each.value for each in call.keywords if each.arg} if call else {}
+        at = self.repo.at(self.module, self.function.lineno)
+        for argument in ("means3D", "opacities", "scales", "rotations"):
+            roots = list(self._roots(given[argument])) if argument in given else []
+            others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
+            if others:
+                shown = ", ".join(others[:4])
+                what = f"makes {argument} from {shown}, not from its PLY alone"
+                yield f"{self.function.name} {what} ({at})"
+        if "shs" in given and "dc" not in given:
+            roots = [*self._roots(given["shs"])]
+            if not roots and "colors_precomp" in given:
+                made = dict.fromkeys(self._roots(given["colors_precomp"]))
+                yield f"{self.function.name} makes colours from {', '.join(made)} ({at})"
+            others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
+            if others:
+                yield f"{self.function.name} makes colours from {', '.join(others[:4])} ({at})"
+
+    def _plain(self, root: str) -> bool:
+        _, dot, attribute = root.partition(".")
+        if dot:
+            return bool(_OF_MODEL.fullmatch(attribute))
+        return root != self.model and bool(_OF_CALL.fullmatch(root))

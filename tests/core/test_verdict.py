@@ -1,0 +1,183 @@
+"""One sentence for each checkout: it fits, its PLY does, or never, and why."""
+
+from __future__ import annotations
+
+import pytest
+from miniatures.skeletons import GROUPS, skeleton
+
+from fragprune_plugins.hosts.choosing import attempt
+from fragprune_plugins.hosts.plain import read_plain
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.hosts.verdict import judge
+from fragprune_plugins.plugins.loading import load_plugins
+
+MODEL = """
+    def setup_functions(self):
+        self.scaling_activation = torch.exp
+        self.opacity_activation = torch.sigmoid
+
+    @property
+    def get_scaling(self):
+        return self.scaling_activation(self._scaling)
+
+    def create_from_pcd(self, pcd):
+        scales = torch.log(distances)[..., None].repeat(1, 3)
+
+    def construct_list_of_attributes(self):
+        names = ["x", "y", "z", "nx", "ny", "nz", "opacity"]
+        for i in range(3):
+            names.append("f_dc_{}".format(i))
+            names.append("f_rest_{}".format(i))
+            names.append(f"scale_{i}")
+            names.append("rot_" + str(i))
+        return names
+
+    def save_ply(self, path):
+        opacities = self._opacity.detach().cpu().numpy()
+        scale = self._scaling.detach().cpu().numpy()
+"""
+RENDER = """
+from diff_gaussian_rasterization import GaussianRasterizer
+
+
+def render(viewpoint_camera, pc, pipe, bg_color, training=False, override_color=None):
+    rasterizer = GaussianRasterizer(raster_settings=settings)
+    means3D = pc.get_xyz
+    opacity = pc.get_opacity
+    if training:
+        opacity = opacity * pc.dropout
+    shs = None
+    if override_color is None:
+        shs = pc.get_features
+    if pipe.compute_cov3D_python:
+        cov3D = pc.get_covariance(1.0)
+    else:
+        scales, rotations = pc.get_scaling, pc.get_rotation
+    image, radii, depth, used = rasterizer(
+        means3D=means3D, opacities=opacity, shs=shs, scales=scales, rotations=rotations
+    )
+"""
+
+
+@pytest.fixture
+def fork(tmp_path):
+    """A fork whose PLY is plain 3DGS and that no adapter fits; replaces text in its files."""
+
+    def make(*changes: tuple[str, str], root=tmp_path) -> HostRepo:
+        skeleton(root, groups=(*GROUPS, "exposure"))
+        model = root / "scene/gaussian_model.py"
+        texts = {
+            model: model.read_text().replace("    def save_ply(self, path): ...\n", "") + MODEL,
+            root / "gaussian_renderer/__init__.py": RENDER,
+        }
+        for old, new in changes:
+            assert any(old in text for text in texts.values()), old
+            texts = {path: text.replace(old, new) for path, text in texts.items()}
+        for path, text in texts.items():
+            path.write_text(text)
+        return HostRepo(root)
+
+    return make
+
+
+def judged(repo):
+    adapters = load_plugins().adapters
+    return judge(repo, attempt(repo, adapters), adapters)
+
+
+def test_a_host_fits_and_what_reading_cannot_show_is_named(tmp_path):
+    verdict = judged(skeleton(tmp_path))
+    assert (verdict.kind, verdict.adapter) == ("fits", "vanilla-3dgs")
+    assert "sources of diff_gaussian_rasterization are not in the checkout" in verdict.sentence
+
+
+def test_a_fork_with_a_plain_ply_is_told_the_command(fork):
+    verdict = judged(fork())
+    assert verdict.kind == "finetune"
+    assert "fragprune finetune" in verdict.sentence
+    assert "--data SCENE" in verdict.sentence
+    assert "groups beyond: exposure" in verdict.differs
+    assert verdict.adapter == "vanilla-3dgs"
+
+
+def test_the_nearest_host_is_of_this_family(fork):
+    adapters = load_plugins().adapters
+    tried = attempt(fork(), adapters)
+    assert tried[0].adapter.name == "vanilla-3dgs"
+    assert not any(each.held for each in tried[-2:])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("means3D = pc.get_xyz", "means3D = pc.get_xyz + pc.net(t)", "means3D from pc.net"),
+        (
+            "    means3D = pc.get_xyz\n",
+            "    means3D, opacity = made_for(viewpoint_camera, pc)\n    pc.get_xyz\n",
+            "means3D from pc, not from its PLY",
+        ),
+        ("shs = pc.get_features", "shs = pc.network(view)", "colours from pc.network"),
+        ('"opacity"]', '"opacity", "binding_0"]', "binding, positions relative to the triangles"),
+        ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
+        (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
+        ("= self._opacity.detach()", "= self.get_opacity.detach()", "stores activated values"),
+        ("scaling_activation = torch.exp", "scaling_activation = softplus", "is softplus"),
+        (
+            "self.scaling_activation(self._scaling)",
+            "self.net(self._xyz)",
+            "get_scaling is computed",
+        ),
+    ],
+)
+def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
+    verdict = judged(fork((old, new)))
+    assert verdict.kind == "never"
+    assert reason in verdict.reason
+    assert reason in verdict.sentence
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("means3D = pc.get_xyz", "means3D = moved(camera_pose, pc.get_xyz)"),
+        ('"opacity"]', '"opacity", "obj_dc_0"]'),
+        ("= self._opacity.detach()", "= self.inverse_activation(self.get_opacity)"),
+        ("opacity = pc.get_opacity\n", "opacity = pc.opacity_activation(pc._opacity)\n"),
+    ],
+)
+def test_what_leaves_the_picture_alone_is_plain(fork, old, new):
+    assert read_plain(fork((old, new)))
+
+
+def test_a_model_in_another_module_is_named(fork, tmp_path):
+    fork()
+    scene = tmp_path / "scene"
+    (scene / "gaussian_model.py").rename(scene / "gaussian_model_other.py")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "finetune"
+    assert "GaussianModel is in scene.gaussian_model_other" in verdict.differs
+
+
+def test_a_folder_that_fits_is_named_at_the_root(tmp_path):
+    skeleton(tmp_path / "inner")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "inside"
+    assert f"fragprune check {tmp_path / 'inner'}" in verdict.sentence
+
+
+def test_a_folder_that_does_not_fit_gives_its_reason_at_the_root(fork, tmp_path):
+    fork(("means3D = pc.get_xyz", "means3D = pc.net(t)"), root=tmp_path / "inner")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "never"
+    assert verdict.reason.startswith("inner/: render makes means3D from pc.net")
+
+
+def test_another_kernel_makes_another_picture_of_the_same_ply(fork, tmp_path):
+    fork()
+    project = tmp_path / "submodules/a"
+    (project / "diff_gaussian_rasterization").mkdir(parents=True)
+    (project / "diff_gaussian_rasterization/__init__.py").write_text("")
+    (project / "forward.cu").write_text("float alpha = min(0.99f, o * area(d));")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "never"
+    assert "no exp()" in verdict.reason
