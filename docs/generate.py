@@ -29,9 +29,12 @@ the first answer counts, `None` leaves the answer to the next plugin. Our own an
     for name, hook in _functions(hookspecs):
         if not name.startswith("fragprune_"):
             continue
-        options = getattr(hook, f"{hookspecs.PROJECT}_spec", {})
         text = _parameters(inspect.getdoc(hook) or "")
-        first = "\n\nThe first answer counts." if options.get("firstresult") else ""
+        first = (
+            "\n\nThe first answer counts."
+            if inspect.signature(hook).return_annotation != "None"
+            else ""
+        )
         names = ", ".join(inspect.signature(hook).parameters)
         parts.append(f"## `{name}({names})`\n\n{text}{first}")
     return _page("Hooks", intro, *parts)
@@ -131,7 +134,7 @@ def support() -> str:
     methods = " and ".join(f"`{a.name}`" for a in adapters if a.info.usage)
     intro = f"""Scripts that do not train (render, evaluate) also run under `fragprune run`, with
 the thresholds beside their models. Every adapter draws with every engine: {
-        ", ".join(f"`{name}`" for name in ENGINES)
+        ", ".join(f"`{name}`" for name in ENGINES if name != "auto")
     }. `fragprune check DIR` says which adapter fits a checkout, and why others do not. Our adapters
 pass the [conformance kit](conformance.md): {installed} on the installed packages, the others on
 miniatures of their hosts. {methods} is a method of its host, with

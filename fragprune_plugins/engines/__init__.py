@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     )
 
 log = logging.getLogger("fragprune")
-
-ENGINES = ("reference", "cpu", "cuda")
 
 
 class Engine(Protocol):
@@ -99,23 +98,41 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     Raises:
         EngineError: the name is unknown, or the engine cannot run here.
     """
-    if name == "auto":
-        name, why_not = _fastest(str(device))
-        if why_not is not None:
-            return _fallback(*why_not)
-    if name == "cpu":
-        from fragprune_plugins.engines.cpu.engine import CpuEngine
+    if name not in ENGINES:
+        raise EngineError("engine", repr(name), f"one of {', '.join(ENGINES)}", "Choose one.")
+    return ENGINES[name](device)
 
-        return CpuEngine()
-    if name == "cuda":
-        from fragprune_plugins.engines.cuda.engine import CudaEngine
 
-        return CudaEngine()
-    if name == "reference":
-        from fragprune_plugins.engines.reference import ReferenceEngine
+def _auto(device: torch.device | str) -> Engine:
+    name, why_not = _fastest(str(device))
+    return create_engine(name) if why_not is None else _fallback(*why_not)
 
-        return ReferenceEngine()
-    raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
+
+def _reference(device: torch.device | str) -> Engine:
+    from fragprune_plugins.engines.reference import ReferenceEngine
+
+    return ReferenceEngine()
+
+
+def _cpu(device: torch.device | str) -> Engine:
+    from fragprune_plugins.engines.cpu.engine import CpuEngine
+
+    return CpuEngine()
+
+
+def _cuda(device: torch.device | str) -> Engine:
+    from fragprune_plugins.engines.cuda.engine import CudaEngine
+
+    return CudaEngine()
+
+
+ENGINES: dict[str, Callable[[torch.device | str], Engine]] = {
+    "auto": _auto,
+    "reference": _reference,
+    "cpu": _cpu,
+    "cuda": _cuda,
+}
+"""Our engines by name; ``plugins.ours`` offers them."""
 
 
 def _fastest(device: str) -> tuple[str, tuple[str, str] | None]:

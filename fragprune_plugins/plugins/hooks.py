@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 import torch
 from torch import Tensor
 
-from fragprune_plugins.engines import ENGINES, Engine, create_engine
+from fragprune_plugins.engines import ENGINES, Engine
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -45,10 +45,8 @@ def engine_for(
     if engine is None:
         hook = hookspecs.fragprune_create_engine
         engine = plugins.ask(hook, _no_engine, name=name, device=device)
-        if engine is None and name not in ("auto", *ENGINES):
-            raise _unknown_engine(name, plugins.answering(hook))
         if engine is None:
-            engine = create_engine(name, device)
+            raise _unknown_engine(name, plugins.answering(hook))
         plugins.engines[name, device] = engine
     return engine
 
@@ -175,8 +173,8 @@ def _unknown_engine(name: str, asked: Sequence[str]) -> EngineError:
     return EngineError(
         "engine",
         repr(name),
-        f"one of auto, {', '.join(ENGINES)}, or the name of a plugin's engine "
-        f"(plugins asked: {', '.join(asked) or 'none'})",
+        f"one of {', '.join(ENGINES)}, or the name of a plugin's engine "
+        f"(plugins asked: {', '.join(asked)})",
         "Choose one; fragprune doctor lists plugins that failed to load.",
     )
 

@@ -34,7 +34,7 @@ def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None
     """
 
 
-@hookspec(firstresult=True)
+@hookspec
 def fragprune_select_adapter(repo: HostRepo, matches: Sequence[Match]) -> str | None:
     """Break a tie when several adapters fit a folder.
 
@@ -43,7 +43,7 @@ def fragprune_select_adapter(repo: HostRepo, matches: Sequence[Match]) -> str | 
     """
 
 
-@hookspec(firstresult=True)
+@hookspec
 def fragprune_truncate(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
     """Give the thresholds (N,) in falloff to apply to one rasterization: learned, fixed, your own.
 
@@ -56,7 +56,7 @@ def fragprune_truncate(inputs: RasterInputs, store: ThresholdStore) -> Tensor | 
     """
 
 
-@hookspec(firstresult=True)
+@hookspec
 def fragprune_create_engine(name: str, device: torch.device) -> Engine | None:
     """Supply a rasterizer that honours thresholds.
 
@@ -67,7 +67,7 @@ def fragprune_create_engine(name: str, device: torch.device) -> Engine | None:
     """
 
 
-@hookspec(firstresult=True)
+@hookspec
 def fragprune_create_schedule(settings: Settings) -> Schedule | None:
     """Decide when thresholds start, move and stop in stage 2.
 

@@ -1,8 +1,11 @@
 """Finds, blocks, loads and asks the plugins of this process, one by one.
 
 A plugin that fails never stops the others. A failure at import becomes a finding; a failure in a
-hook is an error that names the plugin. Environment: ``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take
-comma-separated entry-point names.
+hook is an error that names the plugin. For that, pluggy collects and checks the hooks, and we call
+each implementation ourselves: pluggy's own call would not say whose it was. So wrappers are
+refused, and ``ask`` takes the first answer while ``tell`` calls all.
+
+Environment: ``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take comma-separated entry-point names.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ import pluggy
 from fragprune_plugins.errors import PluginError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins import hookspecs, ours
 
 if TYPE_CHECKING:
     import torch
@@ -68,6 +71,9 @@ class Plugins:
     engines: dict[tuple[str, torch.device], Engine] = field(default_factory=dict)
     _manager: pluggy.PluginManager = field(default_factory=_manager, init=False, repr=False)
     _off: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.register(ours, ours.NAME)
 
     def register(self, plugin: object, name: str) -> None:
         """Register a plugin and its adapters; if it fails, register nothing of it.
@@ -244,6 +250,8 @@ def _call(implementation: pluggy.HookImpl, hook: Hook, given: dict[str, Any]) ->
     try:
         return implementation.function(*arguments)
     except _FAULTS as error:
+        if implementation.plugin_name == ours.NAME:
+            raise
         frames = traceback.extract_tb(error.__traceback__)[1:2]  # the hook's own; the first is ours
         line = "".join(f" ({Path(each.filename).name}:{each.lineno})" for each in frames)
         plugin, found = implementation.plugin_name, _said(error) + line

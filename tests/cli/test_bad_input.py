@@ -134,7 +134,7 @@ def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypat
 @pytest.mark.parametrize("command", ["finetune", "export"])
 def test_the_model_itself_is_no_output(scene, command):
     data, path, _ = scene
-    write_ply(path, tiny.random_model(8), torch.full((8,), 0.3))
+    write_ply(path, tiny.cut(tiny.random_model(8), 0.3))
     before = path.read_bytes()
     more = ("--data", data) if command == "finetune" else ()
     for out in (path, path.with_suffix(".PLY")):  # one sidecar for both
@@ -162,7 +162,7 @@ def test_a_file_is_not_written_under_the_name_of_another_kind(words, wrong, kind
 
 def test_upper_case_is_the_same_kind(scene, tmp_path):
     _, path, _ = scene
-    write_ply(path, tiny.random_model(8), torch.full((8,), 0.3))
+    write_ply(path, tiny.cut(tiny.random_model(8), 0.3))
     assert run("export", path, "--out", tmp_path / "OUT.PLY").exit_code == 0
     assert read_ply(tmp_path / "OUT.PLY").thresholds is not None
 

@@ -313,9 +313,9 @@ def test_commands_convert(suffix, tmp_path):
     write_ply(path, tiny.cut(model, torch.linspace(0.1, 0.9, len(model))))
     form = formats.named(tmp_path / f"out{suffix}")
     out, back = tmp_path / f"out{suffix}", tmp_path / "back.ply"
-    flag = () if form.carries else ("--no-truncation",)
+    flag = () if form.thresholds else ("--no-truncation",)
     report = run_json("export", path, "--out", out, *flag)
-    assert (report["format"], report["thresholds"]) == (form.name, form.carries)
+    assert (report["format"], report["thresholds"]) == (form.name, bool(form.thresholds))
     assert report["keeps"] == (form.keeps or None)
     text = run("export", path, "--out", out, *flag).stdout
     assert form.keeps in text

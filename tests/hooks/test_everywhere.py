@@ -83,9 +83,7 @@ COMMANDS = {
     "render": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
     "profile": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
     "compare": lambda data, path, cameras, out: (path, path, "--data", data, "--out", out),
-    "bench": lambda data, path, cameras, out: (
-        *("--model", path, "--cameras", cameras, "--size", "32x32", "--repeats", 2),
-    ),
+    "bench": lambda data, path, cameras, out: (path, "--cameras", cameras, "--size", "32x32"),
 }
 
 

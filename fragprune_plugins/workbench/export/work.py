@@ -38,7 +38,9 @@ def export(
     column = THRESHOLD_COLUMN if form.paired and truncated else None
     held = column or ("thresholds" if truncated else "no thresholds")
     held += "" if splat.stop is None else f" and a stop at {splat.stop:g}"
-    lines.append(describe_written(out, f": {len(splat)} Gaussians with {held}"))
+    lines.append(
+        describe_written(out, f": {len(splat)} Gaussians with {held}", pruned=splat.pruned)
+    )
     return Report(
         {
             "model": str(model),

@@ -38,15 +38,17 @@ def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
         )
 
 
-def describe_written(out: Path, held: str = "") -> str:
+def describe_written(out: Path, held: str = "", *, pruned: bool = True) -> str:
     """What a model was written into, and what its format does not keep.
 
     Args:
         out: the file.
         held: how it holds thresholds, as words; "" where there are none.
+        pruned: whether the model has thresholds.
     """
     form = formats.named(out)
-    kept = f" A {form.suffix} file keeps {form.keeps}." if form.keeps else ""
+    cut = f", and thresholds {form.thresholds}" if pruned and form.thresholds else ""
+    kept = f" A {form.suffix} file keeps {form.keeps}{cut}." if form.keeps else ""
     return f"Wrote {out}{held}.{kept}"
 
 

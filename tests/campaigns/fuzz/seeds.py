@@ -96,7 +96,7 @@ def model(degree: int = 0, count: int = GAUSSIANS) -> bytes:
 def _formats(folder: Path) -> dict[str, dict[str, bytes]]:
     """Small models in each other format, with and without SH and thresholds."""
     made: dict[str, dict[str, bytes]] = {}
-    for form in formats.FORMATS:
+    for form in map(formats.of_suffix, formats.SUFFIXES):
         if form is formats.PLY:
             continue
         files = made.setdefault(form.suffix[1:], {})

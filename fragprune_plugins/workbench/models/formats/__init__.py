@@ -1,21 +1,28 @@
-"""The file formats of models: one registry, from which every command reads and writes.
+"""The file formats of models, from which every command reads and writes.
 
-A file is read by the suffix of its name; a name without a suffix of ours counts as a PLY. A format
-is a module with ``read`` and ``write``. To add one, write the module and a line in ``FORMATS``.
+A file is read by the suffix of its name; a name without a suffix of a format counts as a PLY. PLY
+is what hosts write. Every other format is an entry point, ours too: its name is the suffix without
+the first dot, and its object a ``Format``.
 """
 
 from __future__ import annotations
 
-import importlib
+import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, BinaryIO
 
-from fragprune_plugins.errors import ModelFileError, OutputError
-from fragprune_plugins.files.reading import Door
+from fragprune_plugins.errors import ModelFileError, OutputError, PluginError
+from fragprune_plugins.files.reading import Door, Reading
+from fragprune_plugins.plugins.points import load, offered
 
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
+
+GROUP = "fragprune.formats"
+"""The entry-point group of formats."""
 
 
 @dataclass(frozen=True)
@@ -25,68 +32,39 @@ class Format:
     Attributes:
         name: for messages.
         suffix: the end of a file's name.
-        module: of this package, with ``read(reading) -> Model`` and ``write(file, model)``; "" for
-            PLY.
-        carries: whether a file can hold thresholds.
-        keeps: what of a model the format keeps, as words for the user; "" if it keeps every bit.
+        read: gives the model of an open file.
+        write: writes a model on the CPU into an open file; ValueError says what the format cannot
+            hold.
+        thresholds: how a file holds thresholds, such as "to 8 bits"; "" if it cannot hold any.
+        keeps: what else of a model the format keeps, as words for the user; "" if it keeps every
+            bit.
+        claims: whether a file with a suffix of PLY is of this format.
     """
 
     name: str
     suffix: str
-    module: str
-    carries: bool
+    read: Callable[[Reading], Model]
+    write: Callable[[BinaryIO, Model], None]
+    thresholds: str = ""
     keeps: str = ""
+    claims: Callable[[Path], bool] = lambda path: False
 
     @property
     def paired(self) -> bool:
-        """Whether a sidecar holds the thresholds of this format's files."""
-        return not self.module
+        """Whether a sidecar may hold the thresholds of this format's files."""
+        return self is PLY
 
 
-PLY = Format("PLY", ".ply", "", carries=True)
-COMPRESSED_PLY = Format(
-    "compressed PLY",
-    ".compressed.ply",
-    "compressed_ply",
-    carries=False,
-    keeps="positions and scales to 10 or 11 bits of the range of each 256 Gaussians, rotations to "
-    "10 bits, opacities, colours and SH to 8 bits, and no thresholds",
-)
-SOG = Format(
-    "SOG",
-    ".sog",
-    "sog",
-    carries=True,
-    keeps="positions to 16 bits of their logarithm, rotations and opacities to 8 bits, scales "
-    "and colours to 256 values each, SH to a palette of up to 65,536, and thresholds to 8 bits",
-)
-FORMATS = (
-    COMPRESSED_PLY,  # before PLY, whose suffix it shares
-    PLY,
-    Format(
-        "SPZ",
-        ".spz",
-        "spz",
-        carries=True,
-        keeps="positions to 1/4096 of a unit, scales, opacities and colours to 8 bits, rotations "
-        "to 9 bits and sign, SH to 5 bits (degree 1) and 4 bits, and thresholds to 8 bits",
-    ),
-    SOG,
-    Format(
-        "splat",
-        ".splat",
-        "splat",
-        carries=False,
-        keeps="positions and scales as they are, opacities, colours and rotations to 8 bits, no SH "
-        "but the base colour, and no thresholds",
-    ),
-    Format("GLB", ".glb", "glb", carries=True, keeps="all values and thresholds as float32"),
-)
+def _of_its_own(*_: object) -> Model:
+    raise NotImplementedError("read_ply and write_ply take paths")
 
-SUFFIXES = (".ply", *(each.suffix for each in FORMATS if each is not PLY))
+
+PLY = Format("PLY", ".ply", _of_its_own, _of_its_own, thresholds="as a column")  # type: ignore[arg-type]
+
+SUFFIXES = (".ply", *(f".{name}" for name in offered(GROUP)))
 """The end of the name of every file that is read and written."""
 
-ENDINGS = tuple(each for each in SUFFIXES if each != COMPRESSED_PLY.suffix)
+ENDINGS = tuple(dict.fromkeys(Path(f"model{each}").suffix for each in SUFFIXES))
 """The last suffixes of such names; that of a compressed PLY is .ply."""
 
 _DOOR = Door(
@@ -98,30 +76,43 @@ _DOOR = Door(
 )
 
 
+@cache
+def of_suffix(suffix: str) -> Format:
+    """The format with one of ``SUFFIXES``.
+
+    Raises:
+        PluginError: its package cannot be loaded.
+    """
+    if suffix == PLY.suffix:
+        return PLY
+    form: Format = load(offered(GROUP)[suffix.removeprefix(".")], Format)
+    return form
+
+
 def named(path: Path) -> Format:
     """The format that a file to write gets by its name.
 
     Raises:
         OutputError: no format has this suffix.
+        PluginError: the format's package cannot be loaded.
     """
-    for each in FORMATS:
-        if path.name.lower().endswith(each.suffix):
-            return each
-    raise OutputError(
-        str(path), "not the name of a model", "a name in " + ", ".join(SUFFIXES), "Rename it."
-    )
+    fitting = [suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)]
+    if not fitting:
+        raise OutputError(
+            str(path), "not the name of a model", "a name in " + ", ".join(SUFFIXES), "Rename it."
+        )
+    return of_suffix(max(fitting, key=len))
 
 
 def found(path: Path) -> Format:
     """The format of a file to read: by its name, and for a PLY by its header."""
-    from fragprune_plugins.workbench.models.formats import compressed_ply
-
-    if compressed_ply.lies_at(path):
-        return COMPRESSED_PLY
     if path.name == "meta.json":  # of a SOG that is not bundled
-        return SOG
-    others = (each for each in FORMATS if not each.suffix.endswith(".ply"))
-    return next((each for each in others if path.name.lower().endswith(each.suffix)), PLY)
+        return of_suffix(".sog")
+    for suffix in SUFFIXES:
+        if path.name.lower().endswith(suffix) and not suffix.endswith(".ply"):
+            return of_suffix(suffix)
+    headed = (of_suffix(suffix) for suffix in SUFFIXES if suffix.endswith(".ply"))
+    return next((form for form in headed if form.claims(path)), PLY)
 
 
 def read(path: Path, *, filtered: bool = False) -> Model:
@@ -140,7 +131,7 @@ def read(path: Path, *, filtered: bool = False) -> Model:
     if form.paired:
         return read_ply(path, filtered=filtered)
     with _DOOR.reading(path) as reading:
-        model: Model = _module(form).read(reading)
+        model = form.read(reading)
         expect_drawable(path, model)
         return model
 
@@ -172,7 +163,7 @@ def write(form: Format, new: Path, model: Model) -> None:
         )
     with open(new, "wb") as file:
         try:
-            _module(form).write(file, model.to("cpu"))
+            form.write(file, model.to("cpu"))
         except ValueError as error:
             found = f"a {form.name} file, which cannot hold {error}"
             raise OutputError(
@@ -182,16 +173,22 @@ def write(form: Format, new: Path, model: Model) -> None:
 
 def expect_carrier(form: Format, path: Path) -> None:
     """Raise OutputError if files of a format cannot hold thresholds and a stop."""
-    if not form.carries:
+    if not form.thresholds:
         raise OutputError(
             str(path),
             f"a {form.name} file, which cannot hold thresholds: its picture would be worse and "
             "heavier than that of the pruned model",
-            "a file that holds them: " + ", ".join(e.suffix for e in FORMATS if e.carries),
+            "a file that holds them: " + ", ".join(_carriers()),
             "Choose another suffix. fragprune export --no-truncation writes the model without its "
             "thresholds; fragprune finetune --portable learns a model that needs none.",
         )
 
 
-def _module(form: Format) -> Any:
-    return importlib.import_module(f"fragprune_plugins.workbench.models.formats.{form.module}")
+def _carriers() -> list[str]:
+    """Suffixes of the formats that hold thresholds, of those that load."""
+    found = []
+    for suffix in SUFFIXES:
+        with contextlib.suppress(PluginError):
+            if of_suffix(suffix).thresholds:
+                found.append(suffix)
+    return found

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, header_lines, read_elements
 from fragprune_plugins.files.reading import Reading
+from fragprune_plugins.workbench.models.formats import Format
 from fragprune_plugins.workbench.models.formats.values import (
     SH_C0,
     array,
@@ -158,3 +159,14 @@ def _packed_rotations(quaternions: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
     packed = _packed(three * _HALF_SQRT2 + 0.5, (10, 10, 10))
     result: npt.NDArray[np.uint32] = packed | (largest.astype(np.uint32) << np.uint32(30))
     return result
+
+
+FORMAT = Format(
+    "compressed PLY",
+    ".compressed.ply",
+    read,
+    write,
+    keeps="positions and scales to 10 or 11 bits of the range of each 256 Gaussians, rotations to "
+    "10 bits, opacities, colours and SH to 8 bits, and no thresholds",
+    claims=lies_at,
+)

@@ -17,6 +17,7 @@ import torch
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Reading, parse_json
+from fragprune_plugins.workbench.models.formats import Format
 from fragprune_plugins.workbench.models.formats.values import (
     SH_C0,
     array,
@@ -210,3 +211,6 @@ def write(file: BinaryIO, splat: Model) -> None:
     file.write(struct.pack("<II", at, _BIN))
     for values in columns.values():
         file.write(np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes())
+
+
+FORMAT = Format("GLB", ".glb", read, write, thresholds="as float32", keeps="all values as float32")

@@ -22,6 +22,7 @@ from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import ModelFileError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Door, Reading, parse_json
+from fragprune_plugins.workbench.models.formats import Format
 from fragprune_plugins.workbench.models.formats.palette import codebook, nearest, palette
 from fragprune_plugins.workbench.models.formats.values import (
     Bytes,
@@ -262,3 +263,14 @@ def _webp(pixels: Bytes) -> bytes:
     # exact: also the colours of texels whose opacity is 0
     Image.fromarray(pixels).save(out, "WEBP", lossless=True, exact=True)
     return out.getvalue()
+
+
+FORMAT = Format(
+    "SOG",
+    ".sog",
+    read,
+    write,
+    thresholds="to 8 bits",
+    keeps="positions to 16 bits of their logarithm, rotations and opacities to 8 bits, scales "
+    "and colours to 256 values each, SH to a palette of up to 65,536",
+)

@@ -12,6 +12,7 @@ import numpy as np
 
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import Reading
+from fragprune_plugins.workbench.models.formats import Format
 from fragprune_plugins.workbench.models.formats.values import (
     SH_C0,
     array,
@@ -52,3 +53,13 @@ def write(file: BinaryIO, splat: Model) -> None:
     data["rgba"][:, 3] = byte(255 * opacities_of(splat))
     data["rot"] = byte(128 + 128 * quaternions_of(splat))
     file.write(data.tobytes())
+
+
+FORMAT = Format(
+    "splat",
+    ".splat",
+    read,
+    write,
+    keeps="positions and scales as they are, opacities, colours and rotations to 8 bits, no SH "
+    "but the base colour, and no thresholds",
+)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import Reading
+from fragprune_plugins.workbench.models.formats import Format
 from fragprune_plugins.workbench.models.formats.values import (
     Bytes,
     array,
@@ -250,3 +251,14 @@ def _packed_rotations(quaternions: npt.NDArray[Any]) -> Any:
     for size, sign in zip(sizes.T, signs.T, strict=True):
         packed = packed << 10 | sign << 9 | size
     return packed.astype("<u4")
+
+
+FORMAT = Format(
+    "SPZ",
+    ".spz",
+    read,
+    write,
+    thresholds="to 8 bits",
+    keeps="positions to 1/4096 of a unit, scales, opacities and colours to 8 bits, rotations "
+    "to 9 bits and sign, SH to 5 bits (degree 1) and 4 bits",
+)
