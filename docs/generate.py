@@ -134,7 +134,7 @@ def support() -> str:
     methods = " and ".join(f"`{a.name}`" for a in adapters if a.info.usage)
     intro = f"""Scripts that do not train (render, evaluate) also run under `fragprune run`, with
 the thresholds beside their models. Every adapter draws with every engine: {
-        ", ".join(f"`{name}`" for name in ENGINES if name != "auto")
+        ", ".join(f"`{name}`" for name in ENGINES)
     }. `fragprune check DIR` says which adapter fits a checkout, and why others do not. Our adapters
 pass the [conformance kit](conformance.md): {installed} on the installed packages, the others on
 miniatures of their hosts. {methods} is a method of its host, with

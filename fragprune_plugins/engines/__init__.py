@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from fragprune_plugins.errors import EngineError, UsageError
@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     )
 
 log = logging.getLogger("fragprune")
+
+ENGINES = {
+    "reference": "reference:ReferenceEngine",
+    "cpu": "cpu.engine:CpuEngine",
+    "cuda": "cuda.engine:CudaEngine",
+}
+"""Our engines: where each is, imported on use."""
 
 
 class Engine(Protocol):
@@ -98,41 +105,15 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     Raises:
         EngineError: the name is unknown, or the engine cannot run here.
     """
+    if name == "auto":
+        name, why_not = _fastest(str(device))
+        if why_not is not None:
+            return _fallback(*why_not)
     if name not in ENGINES:
-        raise EngineError("engine", repr(name), f"one of {', '.join(ENGINES)}", "Choose one.")
-    return ENGINES[name](device)
-
-
-def _auto(device: torch.device | str) -> Engine:
-    name, why_not = _fastest(str(device))
-    return create_engine(name) if why_not is None else _fallback(*why_not)
-
-
-def _reference(device: torch.device | str) -> Engine:
-    from fragprune_plugins.engines.reference import ReferenceEngine
-
-    return ReferenceEngine()
-
-
-def _cpu(device: torch.device | str) -> Engine:
-    from fragprune_plugins.engines.cpu.engine import CpuEngine
-
-    return CpuEngine()
-
-
-def _cuda(device: torch.device | str) -> Engine:
-    from fragprune_plugins.engines.cuda.engine import CudaEngine
-
-    return CudaEngine()
-
-
-ENGINES: dict[str, Callable[[torch.device | str], Engine]] = {
-    "auto": _auto,
-    "reference": _reference,
-    "cpu": _cpu,
-    "cuda": _cuda,
-}
-"""Our engines by name; ``plugins.ours`` offers them."""
+        raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
+    module, _, kind = ENGINES[name].partition(":")
+    engine: Engine = getattr(import_module(f"{__name__}.{module}"), kind)()
+    return engine
 
 
 def _fastest(device: str) -> tuple[str, tuple[str, str] | None]:

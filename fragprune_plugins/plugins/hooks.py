@@ -173,7 +173,7 @@ def _unknown_engine(name: str, asked: Sequence[str]) -> EngineError:
     return EngineError(
         "engine",
         repr(name),
-        f"one of {', '.join(ENGINES)}, or the name of a plugin's engine "
+        f"one of auto, {', '.join(ENGINES)}, or the name of a plugin's engine "
         f"(plugins asked: {', '.join(asked)})",
         "Choose one; fragprune doctor lists plugins that failed to load.",
     )

@@ -17,4 +17,4 @@ NAME = "fragprune"
 @hookimpl
 def fragprune_create_engine(name: str, device: torch.device) -> Engine | None:
     """Ours, for our own names; None for others."""
-    return create_engine(name, device) if name in ENGINES else None
+    return create_engine(name, device) if name in ("auto", *ENGINES) else None

@@ -16,7 +16,10 @@ ROOT = Path(__file__).parents[2]
 PRODUCT = ROOT / "fragprune_plugins"
 HOST = PRODUCT / "workbench" / "demo" / "host"  # a program of its own
 ENTRIES = ("injection.launch", "injection.api", "injection.workers", "adapting")
-LAZY = ("files.ply", "engines", "hosts.graphdeco.stand_ins")  # by name, in adapting.__getattr__
+LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
+    *("files.ply", "engines", "hosts.graphdeco.stand_ins"),
+    *("engines.reference", "engines.cpu.engine", "engines.cuda.engine"),
+)
 
 # figure: (bound, goal)
 BOUNDS = {
