@@ -24,7 +24,7 @@ def main() -> None:
         fragprune("demo", "--out", demo)
         trained = next((demo / "model").rglob("iteration_1000/point_cloud.ply"))
         fragprune("audit", trained, "--data", demo / "scene", "--out", audit)
-        for view in ("view_000", "view_024"):
+        for view in ("view_032", "view_024"):
             shown = [demo / "pictures" / f"{view}_{what}.png" for what in ("original", "pruned")]
             maps = [path.with_stem(f"{path.stem}_fragments") for path in shown]
             errors = [path.with_stem(f"{path.stem}_error") for path in shown]

@@ -52,6 +52,23 @@ def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
     assert "://" not in page
 
 
+def test_a_fine_tuning_without_photographs_shows_the_original_s_own_views(tmp_path):
+    _, model, _ = tiny.scene(tmp_path)
+    out = tmp_path / "pruned.ply"
+    words = ("--iters", 2, "--train", "opacity", "--resolution", 16)
+    run_json("finetune", model, "--self", "--out", out, *words)
+    report = run_json("report", tmp_path)
+    assert len(report["views"]) == 3
+    page = (tmp_path / "report.html").read_text()
+    assert "The original&#39;s own picture" in page
+    assert "PSNR of the picture against the original" in page
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for file in tmp_path.glob("pruned*"):
+        shutil.copy(file, elsewhere)
+    assert run_json("report", elsewhere)["views"] == []  # the original lies outside the folder
+
+
 def test_as_text_the_result_comes_first(folder):
     out, _, _ = folder
     result = run("report", out, "--out", out / "page.html")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,12 @@ import torch
 
 from fragprune_plugins.engines import Engine, device_for
 from fragprune_plugins.errors import UsageError, printable
+from fragprune_plugins.files import records
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.figures.wording import ITSELF
 from fragprune_plugins.workbench.ranks import launched, local_rank
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
@@ -124,3 +126,40 @@ def pictures_of(
         background = torch.full((3,), float(scene.white_background))
         views = around(model, background=background, seed=seed)
     return own_pictures(model, divided(views, scene.resolution), held_out, engine=engine, seed=seed)
+
+
+@dataclass(frozen=True)
+class OwnCameras:
+    """The cameras of a model's own pictures, and the seed of what is generated."""
+
+    scene: SceneOptions
+    cameras: Path | None
+    seed: int = 0
+
+
+def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> OwnCameras | None:
+    """The cameras of a fine-tuning with --self; None for another record.
+
+    Args:
+        record: of the fine-tuning.
+        scene: options that were given, which override what the record says.
+
+    Raises:
+        RecordError: the record is malformed.
+    """
+    if record.data.get("target") != ITSELF:
+        return None
+    scene = scene or SceneOptions()
+    with records.DOOR.stated(record.path) as reading:
+        reading.place = "data.cameras"
+        values = record.data.get("cameras") or {}
+        folder = record.path.parent
+        data, cameras = (
+            records.located(values[name], folder) if values.get(name) else None
+            for name in ("data", "file")
+        )
+        if "resolution" not in scene.given:
+            scene = replace(scene, resolution=int(values.get("resolution", 1)))
+        white = scene.white_background or bool(values.get("white_background"))
+        scene = replace(scene, data=data, white_background=white)
+        return OwnCameras(scene, cameras, int(record.data["seed"]))

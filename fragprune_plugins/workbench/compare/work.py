@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,11 @@ from fragprune_plugins.files.atomic import writable_folder
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
+    OwnCameras,
     chosen,
     open_engine,
     overridden,
+    own_cameras,
     pictures_of,
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
@@ -22,7 +23,6 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.panels import draw_panels
 from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
 from fragprune_plugins.workbench.figures.wording import (
-    ITSELF,
     describe,
     gain,
     nothing_drawn,
@@ -31,15 +31,6 @@ from fragprune_plugins.workbench.figures.wording import (
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.output import trained_on
-
-
-@dataclass(frozen=True)
-class _OwnPictures:
-    """The cameras of a comparison with A's own pictures, and the seed of what is generated."""
-
-    scene: SceneOptions
-    cameras: Path | None
-    seed: int = 0
 
 
 def compare(
@@ -60,9 +51,9 @@ def compare(
     if out is not None:
         writable_folder(out)
     known = _records(a, b)
-    own = _OwnPictures(scene, cameras) if itself else None
+    own = OwnCameras(scene, cameras) if itself else None
     if own is None and scene.data is None:
-        own = _own_pictures(scene, a, b)
+        own = _recorded_cameras(scene, a, b)
     photographs = None if own else _photographs(scene, known, a, b)
     models, candidates = [], []
     for path in (a, b):
@@ -123,29 +114,10 @@ def _records(*models: Path) -> dict[Path, Recorded]:
     return known
 
 
-def _own_pictures(scene: SceneOptions, *models: Path) -> _OwnPictures | None:
-    """The cameras of the fine-tuning with --self that wrote one of the models; None without one.
-
-    Raises:
-        RecordError: its record is malformed.
-    """
-    for record in filter(None, map(records.beside, models)):
-        if record.data.get("target") != ITSELF:
-            continue
-        with records.DOOR.stated(record.path) as reading:
-            reading.place = "data.cameras"
-            values = record.data.get("cameras") or {}
-            folder = record.path.parent
-            data, cameras = (
-                records.located(values[name], folder) if values.get(name) else None
-                for name in ("data", "file")
-            )
-            if "resolution" not in scene.given:
-                scene = replace(scene, resolution=int(values.get("resolution", 1)))
-            white = scene.white_background or bool(values.get("white_background"))
-            scene = replace(scene, data=data, white_background=white)
-            return _OwnPictures(scene, cameras, int(record.data["seed"]))
-    return None
+def _recorded_cameras(scene: SceneOptions, *models: Path) -> OwnCameras | None:
+    """The cameras of the fine-tuning with --self that wrote one of the models; None without one."""
+    written = filter(None, map(records.beside, models))
+    return next(filter(None, (own_cameras(record, scene) for record in written)), None)
 
 
 def _photographs(scene: SceneOptions, known: dict[Path, Recorded], *models: Path) -> Photographs:

@@ -16,13 +16,14 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
-from fragprune_plugins.files.records import DOOR, Record, control_of, find, portable
+from fragprune_plugins.files.records import DOOR, Record, control_of, find, located, portable
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import open_engine
+from fragprune_plugins.workbench.commands.opening import open_engine, own_cameras, pictures_of
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.page import Table, embedded
-from fragprune_plugins.workbench.figures.recorded import recorded
+from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
 from fragprune_plugins.workbench.figures.wording import (
     IS_CONTROL,
     fewer,
@@ -216,8 +217,14 @@ def _draw(
         The views, if any were drawn, (heading, file) of further pictures, and a sentence that
         tells why views are missing ("" if none are).
     """
-    drawn, curves = recorded(record), record.data.get("curves")
-    if drawn is None:
+    drawn, curves, own = recorded(record), record.data.get("curves"), own_cameras(record)
+    if own is not None:
+        paths = tuple(located(record.data[name], record.path.parent) for name in ("model", "out"))
+        needed = list(filter(None, [own.scene.data, own.cameras]))
+        drawn = Recorded(Photographs(inside), paths, False, {})
+    elif drawn is not None:
+        needed = [drawn.photographs.folder]
+    else:
         return None, [], ""
     scene = drawn.photographs if data is None else replace(drawn.photographs, folder=data)
     allowed = [each for each in drawn.models if data is not None or lies_in(each, inside)]
@@ -233,13 +240,19 @@ def _draw(
             learning = [("How it learned", report_page.LEARNING)]
         if len(drawn.models) == 1:  # of joint learning, which leaves no model of before
             return None, learning, ""
-        if data is None and not (len(allowed) == 2 and lies_in(scene.folder, inside)):
+        if data is None and not (
+            len(allowed) == 2 and all(lies_in(each, inside) for each in needed)
+        ):
             return (
                 None,
                 learning,
                 f"No views are shown: they need files outside of the folder. {_HOW}",
             )
-        dataset = load_photographs(scene)
+        dataset = (
+            load_photographs(scene)
+            if own is None
+            else pictures_of(loaded[0], own.scene, own.cameras, engine, seed=own.seed)
+        )
     except (DatasetError, ModelFileError, SidecarError) as error:
         if data is not None:  # the user asked for the views
             raise
