@@ -19,6 +19,7 @@ from fragprune_plugins.workbench.finetune.loop import photometric_loss
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.memory import Pictures, Slot
+from fragprune_plugins.workbench.scenes.pinhole import Posed, split
 
 NAMES = [f"view{i:02d}" for i in range(9)]
 
@@ -271,3 +272,15 @@ def test_a_photograph_that_would_be_cut_to_8_bits_is_refused(tmp_path, images, k
     Image.fromarray(pixels).save(tmp_path / "images" / "view03.png", format=form)
     with pytest.raises(DatasetError, match=r"view03\.png: pixels of mode .*8 bits a channel"):
         load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("names", "warned"),
+    [(["a.jpg", "b.jpg"], False), (["a.jpg", "a-1.jpg"], True), (["x/b.jpg", "y/a.jpg"], True)],
+)
+def test_hosts_that_hold_out_other_views_are_warned_of(names, warned, caplog):
+    """By stems a comes before a-1, and by whole names after it."""
+    rows = [Posed(name, tiny.cameras()[0], Path(name)) for name in names]
+    _, (held,) = split(rows)
+    assert held.name == min(names, key=lambda name: Path(name).stem)
+    assert ("holds out other views" in caplog.text) == warned

@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.reference import fragments
@@ -230,7 +231,6 @@ def audit(
     Returns:
         Figures as plain values, and the views that pictures show.
     """
-    from tqdm import tqdm
 
     splats = model.splats()
     candidates = _candidates(model, splats)

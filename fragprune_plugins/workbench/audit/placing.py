@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
@@ -113,7 +114,6 @@ def _small(view: View) -> View:
 
 def _clear(splat: Model, radius: float) -> list[Tensor]:
     """Places of a grid far from all but faint Gaussians and from each other, farthest first."""
-    from scipy.spatial import cKDTree
 
     means = splat.xyz.detach().cpu()
     means = means[:: max(1, len(means) // _SAMPLED)]

@@ -9,6 +9,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import writable_folder
 from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.types import View
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
     OwnCameras,
@@ -70,29 +71,9 @@ def compare(
         shown = "of A itself"
     shots = chosen(dataset, views)
     before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)
-    drawn = [each["fragments_per_pixel"] for each in (before, after)]
-    report: dict[str, Any] = {
-        "a": {"model": str(a)} | before,
-        "b": {"model": str(b)} | after,
-        "target": after["target"],
-        "speedup": drawn[0] / max(drawn[1], 1e-9),
-        "psnr_change": after["psnr"] - before["psnr"],
-        "ssim_change": after["ssim"] - before["ssim"],
-        "engine": rasterizer.name,
-        "device": before["device"],
-        "enlarge": enlarge,
-        "scene": photographs.as_dict() if photographs else None,
-        "warnings": nothing_drawn(drawn) + strangers(before, after),
-    }
-    width, height = shots[0].view.width, shots[0].view.height
-    pictures = "Photographs" if photographs else "Pictures"
-    lines = [
-        f"A: {a}\nB: {b}\n{pictures}: {shown}, the first of {width}x{height} pixels\n",
-        describe({"A": before, "B": after}),
-        *([f"Frames of {enlarge * width}x{enlarge * height} pixels."] if enlarge > 1 else []),
-        f"\nB against A: {gain(before, after)}.",
-        *(f"Warning: {each}" for each in report["warnings"]),
-    ]
+    measured = [(str(a), before), (str(b), after)]
+    report = _figures(measured, enlarge, photographs)
+    lines = _lines(measured, report, shown, shots[0].view)
     if out is not None:
         columns = dict(zip("AB", candidates, strict=True))
         files = draw_panels(out, columns, shots, rasterizer)
@@ -100,6 +81,43 @@ def compare(
         records.leave(out / "compare", "compare", report)
         lines.append(f"Wrote {len(files)} pictures to {out}.")
     return Report(report, "\n".join(lines))
+
+
+def _figures(
+    measured: list[tuple[str, dict[str, Any]]], enlarge: int, photographs: Photographs | None
+) -> dict[str, Any]:
+    """What --json prints, of the measurements of A and B by their paths."""
+    (a, before), (b, after) = measured
+    drawn = [each["fragments_per_pixel"] for each in (before, after)]
+    return {
+        "a": {"model": a} | before,
+        "b": {"model": b} | after,
+        "target": after["target"],
+        "speedup": drawn[0] / max(drawn[1], 1e-9),
+        "psnr_change": after["psnr"] - before["psnr"],
+        "ssim_change": after["ssim"] - before["ssim"],
+        "engine": after["engine"],
+        "device": before["device"],
+        "enlarge": enlarge,
+        "scene": photographs.as_dict() if photographs else None,
+        "warnings": nothing_drawn(drawn) + strangers(before, after),
+    }
+
+
+def _lines(
+    measured: list[tuple[str, dict[str, Any]]], report: dict[str, Any], shown: str, view: View
+) -> list[str]:
+    """What a person reads."""
+    (a, before), (b, after) = measured
+    width, height, enlarge = view.width, view.height, report["enlarge"]
+    pictures = "Photographs" if report["scene"] else "Pictures"
+    return [
+        f"A: {a}\nB: {b}\n{pictures}: {shown}, the first of {width}x{height} pixels\n",
+        describe({"A": before, "B": after}),
+        *([f"Frames of {enlarge * width}x{enlarge * height} pixels."] if enlarge > 1 else []),
+        f"\nB against A: {gain(before, after)}.",
+        *(f"Warning: {each}" for each in report["warnings"]),
+    ]
 
 
 def _records(*models: Path) -> dict[Path, Recorded]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
+from typing import Any
 
 import click
 
 from fragprune_plugins.workbench.commands.command import Command, Report
-from fragprune_plugins.workbench.commands.options import FILE, EngineOptions, engine_options
+from fragprune_plugins.workbench.commands.options import FILE, engine_options
 
 
 @click.command("demo", cls=Command)
@@ -29,7 +28,7 @@ from fragprune_plugins.workbench.commands.options import FILE, EngineOptions, en
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the training.")
 @engine_options(device="Device; the scene is small enough for any CPU.", default="cpu")
-def command(out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
+def command(**options: Any) -> Report:
     """Train a model of a small room, prune its fragments, and show original and pruned.
 
     It takes a few minutes on a laptop and downloads nothing: 48 photographs come with fragprune.
@@ -38,22 +37,6 @@ def command(out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     Example:
       fragprune demo --out fragprune-demo
     """
-    # torch reads this when it loads. Idle threads sleep, and leave the CPU to other programs.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from fragprune_plugins.workbench.commands.opening import open_engine
-    from fragprune_plugins.workbench.demo.demo import DemoSettings, run_demo
-    from fragprune_plugins.workbench.figures.wording import describe, frames, outcome
+    from fragprune_plugins.workbench.demo.work import demo
 
-    _, where = open_engine(engine)
-    settings = DemoSettings(
-        iterations=iters, finetune=iters // 2, seed=seed, engine=engine.name, device=str(where)
-    )
-    report = run_demo(out, settings, lambda line: click.echo(line, err=True))
-    larger = report["larger"]
-    table = describe({"before": report["before"], "after": report["after"]})
-    text = (
-        f"\n{table}\n\n{outcome('run', report, report['control'])}\n"
-        f"Of larger pictures, {larger['size']}: {frames(larger['before'], larger['after'])}.\n"
-        f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures."
-    )
-    return Report(report, text)
+    return demo(**options)

@@ -11,9 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.demo.folder import claiming, clear
+from fragprune_plugins.workbench.demo.page import write_page
 from fragprune_plugins.workbench.demo.scene import POINTS, VIEWS, WIDTH, make_scene
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
@@ -103,8 +112,6 @@ def run_demo(
     Raises:
         OutputError: the folder cannot be written, or holds files that no demo wrote.
     """
-    from fragprune_plugins.injection.launch import run
-    from fragprune_plugins.workbench.demo.page import write_page
 
     settings = settings or DemoSettings()
     clear(out)
@@ -143,8 +150,6 @@ def run_demo(
 
 
 def _run_options(settings: DemoSettings) -> RunOptions:
-    from fragprune_plugins.injection.launch import RunOptions
-    from fragprune_plugins.learning.schedule import Settings
 
     learning = Settings(
         iterations=settings.finetune, pressure=settings.pressure, seed=settings.seed
@@ -153,10 +158,6 @@ def _run_options(settings: DemoSettings) -> RunOptions:
 
 
 def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> Model:
-    from fragprune_plugins.learning.schedule import Settings
-    from fragprune_plugins.workbench.finetune.loop import finetune
-    from fragprune_plugins.workbench.models import model as models
-    from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
     assert summary.model_before is not None  # the host saves at its last iteration
     model = models.load(summary.model_before, device=settings.device)
@@ -168,9 +169,6 @@ def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> Model:
 def _measure(
     scene: Path, summary: RunSummary, control: Model, settings: DemoSettings
 ) -> dict[str, Any]:
-    from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-    from fragprune_plugins.workbench.models import model as models
-    from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
     assert summary.model_before is not None
     assert summary.model_after is not None
@@ -207,8 +205,6 @@ def _measure(
 
 def _record(report: dict[str, Any], scene: Path, summary: RunSummary) -> None:
     """Leave what ``fragprune run`` leaves beside its model, for ``fragprune report``."""
-    from fragprune_plugins.files import records
-    from fragprune_plugins.hosts.photographs import Photographs
 
     models = [str(path.resolve()) for path in (summary.model_before, summary.model_after) if path]
     photographs = {"models": models, "filtered": True, "drawing": summary.drawing}

@@ -7,6 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
+from fragprune_plugins.workbench.figures.wording import headlines, outcome
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.report import page as report_page
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 LARGER = 2
@@ -43,11 +48,6 @@ def write_page(
     Returns:
         The files as paths relative to ``out``.
     """
-    from fragprune_plugins.plugins.hooks import engine_for
-    from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
-    from fragprune_plugins.workbench.figures.wording import headlines, outcome
-    from fragprune_plugins.workbench.models import model as models
-    from fragprune_plugins.workbench.report import page as report_page
 
     pictures = out / "pictures"
     paths = (Path(report["model_before"]), Path(report["model_after"]))

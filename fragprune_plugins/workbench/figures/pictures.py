@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import PIL.Image
+from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from mpl_toolkits.axes_grid1 import ImageGrid  # type: ignore[import-untyped]
 from torch import Tensor
 
 from fragprune_plugins.files.atomic import replacing
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from PIL.Image import Image
-
 
 COLOURS = "inferno"
 LABEL = "drawn fragments per pixel"
@@ -70,11 +71,9 @@ def save_image(path: Path, image: Tensor) -> None:
         picture(image).save(temporary, format="PNG")
 
 
-def picture(image: Tensor) -> Image:
+def picture(image: Tensor) -> PIL.Image.Image:
     """An image (3, H, W), clamped to [0, 1], with 8 bits a channel."""
-    from PIL import Image
-
-    return Image.fromarray(_bytes(image))
+    return PIL.Image.fromarray(_bytes(image))
 
 
 def save_heatmap(path: Path, fragments: Tensor, limit: float) -> None:
@@ -96,11 +95,9 @@ def save_map(path: Path, values: Tensor, limit: float) -> None:
         values: 0 or more.
         limit: the value at the top of the scale; what is larger looks like it.
     """
-    from matplotlib import colormaps
-    from PIL import Image
 
     levels = (255 * values.detach().float().cpu() / max(limit, 1e-9)).clamp(0, 255).round()
-    shown = Image.fromarray(levels.byte().numpy(), mode="P")
+    shown = PIL.Image.fromarray(levels.byte().numpy(), mode="P")
     shown.putpalette(colormaps[COLOURS](range(256), bytes=True)[:, :3].tobytes())
     with replacing(path) as temporary:
         shown.save(temporary, format="PNG")
@@ -108,8 +105,6 @@ def save_map(path: Path, values: Tensor, limit: float) -> None:
 
 def colour_stops(count: int = 9) -> list[str]:
     """Colours of maps from 0 to their limit, evenly spaced, as ``#rrggbb``."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
 
     return [to_hex(colormaps[COLOURS](at / (count - 1))) for at in range(count)]
 
@@ -122,8 +117,6 @@ def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float)
         pictures: (title, picture), where a picture is (3, H, W) RGB or (H, W) counts, of one size.
         limit: the count at the top of the colour scale, which all (H, W) share.
     """
-    from matplotlib.figure import Figure
-    from mpl_toolkits.axes_grid1 import ImageGrid  # type: ignore[import-untyped]
 
     height, width = pictures[0][1].shape[-2:]
     tall = min(4.5, max(2.2, 3.6 * height / width))
@@ -162,7 +155,6 @@ def _bytes(image: Tensor) -> np.ndarray[Any, Any]:
 
 
 def _save(path: Path, figure: Figure) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:

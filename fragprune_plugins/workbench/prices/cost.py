@@ -14,6 +14,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from scipy.optimize import nnls
+
 from fragprune_plugins.errors import CostError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import MEBIBYTE, Door
@@ -117,8 +120,6 @@ def fit(works: Sequence[Mapping[str, float]], ms: Sequence[float]) -> dict[str, 
         works: counts of frames.
         ms: their times, milliseconds above 0.
     """
-    import numpy as np
-    from scipy.optimize import nnls
 
     times = 1e6 * np.asarray(ms)
     counts = np.array([[work[unit] for unit in UNITS] for work in works]) / times[:, None]

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.reference import fragments
@@ -257,7 +258,6 @@ def _drawer(engine: str | Engine, model: Model) -> Engine:
 
 def _bar(views: Sequence[View], progress: bool) -> Iterable[View]:
     """The views, with a bar that shows how far they have been scored."""
-    from tqdm import tqdm
 
     bar: Iterable[View] = tqdm(
         views, "scoring Gaussians", unit="view", leave=None, disable=not progress

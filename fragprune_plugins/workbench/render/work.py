@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -90,24 +91,32 @@ def render(
         everybody = ranks.gather(drawing.fragments)
     if not ranks.first:
         return None
-    fragments = [figure for each in everybody for figure in each.values()]
+    drawn = [figure for each in everybody for figure in each.values()]
+    figures = {
+        "model": str(model),
+        "files": [str(file) for file in files],
+        "gaussians": len(whole),
+        "truncated": whole.falloff is not None,
+        "engine": rasterizer.name,
+        "device": str(device),
+    }
+    wrote = f"{out}, {len(drawn)} frames" if film else f"{len(files)} pictures to {out}"
+    return _report(figures, wrote, drawn)
+
+
+def _report(figures: dict[str, Any], wrote: str, fragments: list[float]) -> Report:
+    """The report, with fragments per pixel of each view."""
     mean = sum(fragments) / len(fragments)
     warnings = nothing_drawn(fragments)
-    truncated = whole.falloff is not None
-    wrote = f"{out}, {len(fragments)} frames" if film else f"{len(files)} pictures to {out}"
-    figures = f"({mean:.1f} fragments per pixel, {'' if truncated else 'not '}truncated)"
+    cut = "truncated" if figures["truncated"] else "not truncated"
     return Report(
-        {
-            "model": str(model),
-            "files": [str(file) for file in files],
-            "fragments_per_pixel": mean,
-            "gaussians": len(whole),
-            "truncated": truncated,
-            "engine": rasterizer.name,
-            "device": str(device),
-            "warnings": warnings,
-        },
-        "\n".join([f"Wrote {wrote} {figures}.", *(f"Warning: {each}" for each in warnings)]),
+        figures | {"fragments_per_pixel": mean, "warnings": warnings},
+        "\n".join(
+            [
+                f"Wrote {wrote} ({mean:.1f} fragments per pixel, {cut}).",
+                *(f"Warning: {each}" for each in warnings),
+            ]
+        ),
     )
 
 

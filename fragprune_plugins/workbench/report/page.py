@@ -7,8 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.workbench.figures import page
+from fragprune_plugins.workbench.figures.pictures import save_image, save_map, stems
+from fragprune_plugins.workbench.figures.wording import measured_with, tabulate
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -117,10 +126,6 @@ def draw_views(
         engine: draws the views.
         enlarge: how many times as wide and high as the photograph both models are drawn.
     """
-    import torch
-
-    from fragprune_plugins.learning.stage2 import evenly
-    from fragprune_plugins.workbench.figures.pictures import save_image, save_map, stems
 
     models = [(original, original.model.splats()), (pruned, pruned.model.splats())]
     chosen = [shot.to(original.model.xyz.device) for shot in evenly(shots, SHOWN)]
@@ -160,7 +165,6 @@ def save_banner(path: Path, folder: Path, drawn: Drawn) -> None:
         folder: of the pictures that ``draw_views`` drew.
         drawn: what it gave; the first view is taken.
     """
-    from PIL import Image, ImageDraw, ImageFont
 
     view = drawn.views[0]
     halves = []
@@ -191,7 +195,6 @@ def _per_pixel(view: Shown) -> tuple[str, str]:
 
 def shared_limit(maps: Sequence[Tensor]) -> float:
     """The value that one pixel in 200 of all maps exceeds: the top of their colour scale."""
-    import torch
 
     values = torch.cat([each.flatten() for each in maps]).float()
     at = min(len(values), int(0.995 * len(values)) + 1)
@@ -200,7 +203,6 @@ def shared_limit(maps: Sequence[Tensor]) -> float:
 
 def figures(columns: Mapping[str, dict[str, Any]]) -> page.Table:
     """A table of measurements by name of the model, with the change between the last two."""
-    from fragprune_plugins.workbench.figures.wording import measured_with, tabulate
 
     head, *rows = tabulate(columns)
     return page.Table(head, rows, measured_with(columns))
@@ -218,9 +220,6 @@ def save_learning(
         curves: one dict a step, from a run's summary; None, in records, is what is not known.
         thresholds: (N,) learned, falloff; None, of a control, leaves out what shows them.
     """
-    import numpy as np
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
     rows = 1 if thresholds is None else 2
     figure = Figure(figsize=(8, 2.8 * rows), layout="constrained", facecolor="none")

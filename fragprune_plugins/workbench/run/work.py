@@ -46,28 +46,7 @@ def run(
     again: bool,
 ) -> Report:
     """Do what ``fragprune run`` promises; its options are the arguments."""
-    if from_iter is not None and stage not in ("finetune", "joint"):
-        raise UsageError(
-            "--from-iter",
-            f"--stage {stage}",
-            "--stage finetune or joint, which learn inside one run",
-            "Add one of them, or remove --from-iter.",
-        )
-    if settings.target_time is not None:
-        raise UsageError(
-            "--target-time",
-            "fragprune run: a host keeps no model as it came in to time frames against",
-            "--target-speedup, a ratio of fragments",
-            "Use --target-speedup, or --target-time with fragprune finetune on the trained PLY.",
-        )
-    if max_drop is not None:
-        raise UsageError(
-            "--max-drop",
-            "fragprune run: it would repeat the host's stage 2 many times",
-            "a bound for fragprune finetune",
-            "Use fragprune finetune with --max-drop on the trained PLY.",
-        )
-
+    _expect_possible(stage, from_iter, settings, max_drop)
     bound_threads(engine.threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     options = launch.RunOptions(
@@ -99,6 +78,33 @@ def run(
         more = {"curves": summary.curves, "photographs": photographs}
         records.leave(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data, not_compared))
+
+
+def _expect_possible(
+    stage: str, from_iter: int | None, settings: Settings, max_drop: float | None
+) -> None:
+    """Refuse options that a host's run cannot follow."""
+    if from_iter is not None and stage not in ("finetune", "joint"):
+        raise UsageError(
+            "--from-iter",
+            f"--stage {stage}",
+            "--stage finetune or joint, which learn inside one run",
+            "Add one of them, or remove --from-iter.",
+        )
+    if settings.target_time is not None:
+        raise UsageError(
+            "--target-time",
+            "fragprune run: a host keeps no model as it came in to time frames against",
+            "--target-speedup, a ratio of fragments",
+            "Use --target-speedup, or --target-time with fragprune finetune on the trained PLY.",
+        )
+    if max_drop is not None:
+        raise UsageError(
+            "--max-drop",
+            "fragprune run: it would repeat the host's stage 2 many times",
+            "a bound for fragprune finetune",
+            "Use fragprune finetune with --max-drop on the trained PLY.",
+        )
 
 
 def _figures(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -86,6 +87,8 @@ class Camera:
         )
 
 
+log = logging.getLogger(__name__)
+
 HOLD_OUT = 8
 """Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""
 
@@ -109,6 +112,18 @@ class Posed(NamedTuple):
 
 
 def split(rows: list[Posed]) -> tuple[list[Posed], list[Posed]]:
-    """The training views and the held-out views of a scene that does not say which they are."""
+    """The training views and the held-out views of a scene that does not say which they are.
+
+    Hosts sort by names without their suffix and folder, 3DGS since October 2024 by whole names. It
+    is warned of where that holds out other views.
+    """
     ordered = sorted(rows, key=lambda row: Path(row.name).stem)
-    return [row for index, row in enumerate(ordered) if index % HOLD_OUT], ordered[::HOLD_OUT]
+    train, test = [row for i, row in enumerate(ordered) if i % HOLD_OUT], ordered[::HOLD_OUT]
+    whole = sorted(row.name for row in rows)[::HOLD_OUT]
+    if set(whole) != {row.name for row in test}:
+        log.warning(
+            "3DGS since October 2024 holds out other views of this scene: it sorts whole names. "
+            "For a model of it, rename the images so that both orders agree, and train again; "
+            "until then figures on held-out views include views that it was trained on"
+        )
+    return train, test

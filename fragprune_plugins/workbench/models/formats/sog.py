@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import ModelFileError
@@ -125,7 +126,6 @@ def _read(meta: dict[str, Any], load: Load) -> Model:
 
 def _pixels(data: bytes, count: int) -> Bytes:
     """The pixels of a WebP (height, width, 4), which has to have a texel for each Gaussian."""
-    from PIL import Image
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the count decides
@@ -257,7 +257,6 @@ def _packed_rotations(quaternions: npt.NDArray[Any]) -> Bytes:
 
 
 def _webp(pixels: Bytes) -> bytes:
-    from PIL import Image
 
     out = io.BytesIO()
     # exact: also the colours of texels whose opacity is 0

@@ -1,0 +1,185 @@
+"""Reads a host's source, and says what fragprune can do with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from fragprune_plugins.errors import UnknownHostError
+from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
+from fragprune_plugins.hosts.choosing import Tried, attempt, closest, locate, usage
+from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.hosts.verdict import judge
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.workbench.commands.command import Report
+
+
+def check(*, host: Path, adapter: str | None, verbose: bool, every: bool) -> Report:
+    """Do what ``fragprune check`` promises; its options are the arguments."""
+
+    if not host.is_dir() and HostRepo.installed(str(host)) is None:
+        raise UnknownHostError(
+            str(host),
+            "neither a folder nor an installed package",
+            "a host's checkout, or the import name of an installed host",
+            "Name the folder of train.py.",
+        )
+    adapters = load_plugins().adapters
+    if adapter is not None:
+        adapters = [a for a in adapters if a.name == adapter.replace("_", "-")]
+        if not adapters:
+            raise UnknownHostError(
+                "--adapter", repr(adapter), "an installed adapter", "Run fragprune adapters."
+            )
+    if every:
+        return _table(host, adapters)
+    repo = _repository(host, adapters, adapter)
+    tried = attempt(repo, adapters)
+    closer = closest([each.adapter for each in tried if each.match.fits], adapters)
+    fitting = [each for each in tried if each.adapter in closer]
+    verdict = fitting[0] if len(fitting) == 1 else None
+    judged = judge(repo, tried, adapters)
+    missing = _missing(repo, verdict.adapter) if verdict else []
+    lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
+    lines += ["", judged.sentence]
+    if judged.differs:
+        lines += ["", f"It differs from {judged.adapter}:", *(f"  {d}" for d in judged.differs)]
+    lines += [""]
+    lines += _in_full(tried, fitting) if verbose or adapter else _in_short(tried, fitting)
+    if missing:
+        lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
+        lines += [f"  {install(missing)}"]
+    lines += ["", _conclusion(repo, fitting)]
+    data = {
+        "host": str(host),
+        "commit": repo.commit,
+        **judged.as_dict(),
+        "fits": verdict.adapter.name if verdict else None,
+        "missing": [
+            {"module": each.module, "distribution": each.distribution, "at": each.at}
+            for each in missing
+        ],
+        "adapters": [_as_dict(each) for each in tried],
+    }
+    return Report(data, "\n".join(lines), exit_code=0 if verdict else 1)
+
+
+def _table(folder: Path, adapters: list[HostAdapter]) -> Report:
+    """A row for each checkout in a folder; the exit code is 0 if there are any."""
+
+    rows = []
+    for each in sorted(path for path in folder.iterdir() if path.is_dir()):
+        repo = _repository(each, adapters, None)
+        judged = judge(repo, attempt(repo, adapters), adapters)
+        rows.append({"host": each.name, "commit": repo.commit, **judged.as_dict()})
+    titles = ("checkout", "verdict", "nearest", "reason", "differs")
+    lines = [f"| {' | '.join(titles)} |", "|---|---|---|---|---|"]
+    for row in rows:
+        inside = [f"{name}/ fits {fits}" for name, fits in row["inside"].items()]
+        cells = [row["host"], row["verdict"], row["nearest"], row["reason"]]
+        cells.append("; ".join([*inside, *row["differs"]]))
+        lines.append(f"| {' | '.join(cell.replace('|', '/') or '-' for cell in cells)} |")
+    counts = {kind: sum(row["verdict"] == kind for row in rows) for kind in _KINDS}
+    lines += ["", ", ".join(f"{kind}: {number}" for kind, number in counts.items())]
+    return Report({"hosts": rows, "counts": counts}, "\n".join(lines), exit_code=0 if rows else 1)
+
+
+_KINDS = ("fits", "several", "inside", "finetune", "never")
+
+
+def _in_short(tried: list[Tried], fitting: list[Tried]) -> list[str]:
+    """A line for each adapter that fits. If none fits, for each that finds a seam of its host."""
+    shown = fitting or [each for each in tried if each.held]
+    if not shown:
+        return [f"None of {len(tried)} adapters finds anything of its host."]
+    ancestors = [each for each in tried if each.match.fits and each not in shown]
+    others = len(tried) - len(shown) - len(ancestors)
+    why = "do not fit (--verbose says why)" if fitting else "find nothing of their hosts"
+    return [
+        *(each.brief() for each in shown),
+        *(f"{each.verdict()}; {_aside(each, fitting)}" for each in ancestors),
+        *([f"{others} others {why}."] if others else []),
+    ]
+
+
+def _aside(tried: Tried, fitting: list[Tried]) -> str:
+    """The reason why an adapter is not among the best fits."""
+    nearer = ", ".join(each.adapter.name for each in fitting)
+    return str(tried.errors[0]) if tried.errors else f"{nearer} descends from it"
+
+
+_SIGNS = {"missing": "MISSING in", "changed": "CHANGED at", "at import": "(checked at import)"}
+
+
+def _in_full(tried: list[Tried], fitting: list[Tried]) -> list[str]:
+    """All seams of the adapters that fit, or of the nearest; the first error of each other one."""
+    shown = fitting or tried[:1]
+    lines = []
+    for each in shown:
+        info, of_seams = each.adapter.info, [state.finding for state in each.seams]
+        lines += ["", f"{each.verdict()} ({info.title}, {info.repo})"]
+        lines += [f"  {finding}" for finding in each.match.findings if finding not in of_seams]
+        for state in each.seams:
+            at = state.at if state.status == "found" else f"{_SIGNS[state.status]} {state.at}"
+            if state.finding and state.status == "changed":
+                at += f": {state.finding.found}; expected {state.finding.expected}"
+            lines.append(f"  {state.seam.role.name.lower():<10} {state.seam!s:<62} {at.strip()}")
+        if each.match.fits and info.limits:
+            lines += ["  What does not work:", *(f"  - {limit}" for limit in info.limits)]
+    others = [each for each in tried if each not in shown]
+    lines += ["", "Others:"] if others else []
+    return [*lines, *(f"  {each.verdict()}; {_aside(each, fitting)}" for each in others)]
+
+
+def _as_dict(tried: Tried) -> dict[str, Any]:
+    """All findings and seams of one adapter, for --json."""
+    return {
+        "adapter": tried.adapter.name,
+        "confidence": tried.match.confidence,
+        "seams_held": tried.held,
+        "seams_looked_up": tried.looked_up,
+        "findings": [finding.as_dict() for finding in tried.match.findings],
+        "limits": list(tried.adapter.info.limits),
+        "seams": [
+            {
+                "role": state.seam.role.name,
+                "seam": str(state.seam),
+                "status": state.status,
+                "at": state.at,
+            }
+            for state in tried.seams
+        ],
+    }
+
+
+def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
+    """Packages that the training scripts import and that are not installed; [] for a library."""
+
+    if not isinstance(adapter, ScriptAdapter):
+        return []
+    scripts, dialect = adapter.command_line(repo).scripts, adapter.dialect(repo)
+    answered = {*dialect.names(), *dialect.spares()}
+    return missing_imports(repo, [repo.root / name for name in scripts], answered)
+
+
+def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:
+    """The installed package, if that is meant or used; else the folder, and nothing outside it."""
+
+    package = None if host.is_dir() else HostRepo.installed(str(host))
+    if package is not None:
+        return package
+    try:
+        return locate(host, adapters, name, above=False)[0]
+    except UnknownHostError:
+        return HostRepo(host)
+
+
+def _conclusion(repo: HostRepo, fitting: list[Tried]) -> str:
+
+    if len(fitting) == 1:
+        return f"Use: {usage(fitting[0].adapter, repo)}"
+    if fitting:
+        names = ", ".join(each.adapter.name for each in fitting)
+        return f"Several adapters fit: {names}. Name one with fragprune run --adapter."
+    return "No adapter fits. docs/how-to/write-an-adapter.md tells how to write an adapter."
