@@ -321,7 +321,7 @@ def test_commands_convert(suffix, tmp_path):
     assert form.keeps in text
     run_json("export", out, "--out", back, *flag)
     assert len(read_ply(back)) == len(model)
-    assert (read_ply(back).thresholds is None) == (not form.carries)
+    assert (read_ply(back).thresholds is None) == (not form.thresholds)
 
 
 def test_export_says_why_it_refuses(tmp_path):

@@ -103,7 +103,7 @@ def _formats(folder: Path) -> dict[str, dict[str, bytes]]:
         for degree in (0, 1):
             path = folder / f"degree{degree}{form.suffix}"
             splat = tiny.random_model(GAUSSIANS, degree)
-            formats.write(form, path, tiny.cut(splat, 0.2) if form.carries else splat)
+            formats.write(form, path, tiny.cut(splat, 0.2) if form.thresholds else splat)
             files[path.name] = path.read_bytes()
     header, parts = spz_parts(made["spz"]["degree1.spz"])
     made["spz"]["version3.spz"] = gzip.compress(
