@@ -6,7 +6,7 @@ from __future__ import annotations
 def printable(text: str) -> str:
     """A text with escapes for what would control a terminal, or cannot be encoded.
 
-    Names in files of strangers are part of messages.
+    Messages quote names from untrusted files.
     """
     if text.isprintable():
         return text

@@ -115,7 +115,7 @@ def check_pose(rotation: Tensor, translation: Tensor) -> None:
     """Check that tensors are a camera's pose: arguments of ``View.pinhole``. Waits for a GPU.
 
     Raises:
-        InputError: the rotation is none, or the camera is not within ``DISTANCE_MAX``.
+        InputError: not a rotation matrix, or the camera is not within ``DISTANCE_MAX``.
     """
     import torch
 
@@ -238,7 +238,7 @@ class View:
             background: (3,) RGB; black when None.
 
         Raises:
-            InputError: these are no numbers of a lens, see ``check_lens``.
+            InputError: invalid intrinsics, see ``check_lens``.
         """
         import torch
 
@@ -292,7 +292,8 @@ class View:
             background: (3,) RGB; black when None.
 
         Raises:
-            InputError: it looks nowhere, or straight up or down, or its field of view is none.
+            InputError: eye equals target, it looks straight up or down, or fov_y is not in
+                (0, 180).
         """
         import torch
 

@@ -120,7 +120,7 @@ class MovingGaussians(GraphdecoAdapter):
         limits=(
             "Its PLY alone is no model: fragprune finetune, render and compare refuse it; its own "
             "render.py draws it with thresholds.",
-            "merge_many_4dgs.py and export_perframe_3DGS.py know no thresholds.",
+            "merge_many_4dgs.py and export_perframe_3DGS.py ignore thresholds.",
             "No path of an output folder may contain 'coarse', which the host takes for a phase.",
         ),
     )

@@ -69,7 +69,7 @@ class Settings:
         opacity_lr: initial learning rate of opacity logits in stage 2.
         itself: True where the model's own pictures are the target. The default pressure is
             ``OWN_PRESSURE`` then, and no warm-up comes first, for it would have nothing to learn.
-        portable: True for viewers that know no thresholds: none are learned. The pressure is on the
+        portable: True for viewers that ignore thresholds: none are learned. The pressure is on the
             area of the Gaussians' ellipses instead (``area.area_per_pixel``), from the first step
             on, and shapes must move.
         truncate: False trains without thresholds or pressure: the control to compare with.
@@ -134,7 +134,7 @@ class Settings:
             raise UsageError(
                 "options",
                 "--portable with --stop",
-                "one of the two: viewers that know no thresholds know no stop",
+                "one of the two: viewers that ignore thresholds know no stop",
                 "Drop one of the two.",
             )
         if self.portable and self.train != "all":

@@ -39,7 +39,14 @@ def test_writes_a_pair_and_a_table(scene, tmp_path):
     words = ("--data", data, "--out", out, "--train", "opacity")
     result = run("finetune", path, *words, "--iters", 40, "--pressure", 1e-3)
     assert result.exit_code == 0, result.stderr
-    for words in ("PSNR, dB", "fragments/pixel", "before", "after", "x fewer fragments", str(out)):
+    for words in (
+        "PSNR, dB",
+        "fragments/pixel",
+        "original",
+        "pruned",
+        "x fewer fragments",
+        str(out),
+    ):
         assert words in result.stdout
     assert "fine-tuning" in result.stderr
     assert path.read_bytes() == before
@@ -277,7 +284,7 @@ def test_curves_of_a_control_are_drawn_without_thresholds(scene, tmp_path):
         whole = both.size
     run_json("finetune", path, *words, "--control")
     with Image.open(curves) as half:
-        assert half.size == (whole[0] // 2, whole[1])
+        assert half.size == (whole[0], whole[1] // 2)
 
 
 def test_goes_on_from_the_thresholds_of_the_model(scene, tmp_path):

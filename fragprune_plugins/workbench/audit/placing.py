@@ -1,7 +1,7 @@
 """Where to look at a splat from, of which nothing is known but the splat.
 
-A splat does not say where its photographs were taken. From outside of something convex, or in front
-of a wall, at most half of all directions end on a surface; from inside a room more do. So cameras
+A file does not record where its photographs were taken. Outside something convex, or in front of a
+wall, at most half of all directions end on a surface; from inside a room more do. So cameras
 go inside where, from the best place, more than half of all directions end on something opaque that
 is not close by. A place in the haze of large near Gaussians is no such place. A hollow object that
 is closed all round looks like a room: then choose.
@@ -77,35 +77,39 @@ def place(
     """
     pixels = 800 // divide
     if side == "orbit":
-        return Placed(
-            around(splat, count, width=pixels, height=pixels), side, "As asked for.", math.nan
-        )
+        return Placed(_orbit(splat, count, pixels), side, "As asked for.", math.nan)
     splats, near = splat.splats(), _NEAR * bounds(splat)[1]
     places = _clear(splat, near / _NEAR)
     shares = [enclosed(engine, splats, at, near) for at in places]
     best = max(shares)
     if side == "auto" and best <= ENCLOSED:
         why = (
-            f"From the most open place inside, {best:.0%} of all directions end on a surface that "
-            f"is not close by, and more than {ENCLOSED:.0%} would in a room. --inside looks from "
-            "there all the same."
+            f"This looks like an object: from the most open place inside, {best:.0%} of all "
+            f"directions end on a distant surface, and in a room more than {ENCLOSED:.0%} do. "
+            "If it is a room, pass --inside."
         )
-        return Placed(around(splat, count, width=pixels, height=pixels), "orbit", why, best)
+        return Placed(_orbit(splat, count, pixels), "orbit", why, best)
     good = [at for at, share in zip(places, shares, strict=True) if share >= _AS_GOOD * best]
     eyes = good[:_PLACES]  # the most open ones
     if side == "inside":
         why = "As asked for."
     else:
         why = (
-            f"From the best place inside, {best:.0%} of all directions end on a surface that is "
-            f"not close by; outside of an object it would be {ENCLOSED:.0%} at most. A closed "
-            "hollow object looks the same: --orbit looks from outside."
+            f"This looks like a room: from the best place inside, {best:.0%} of all directions end "
+            f"on a distant surface, and outside an object at most {ENCLOSED:.0%} do. If it is a "
+            "hollow object, pass --orbit."
         )
     views = within(eyes, 2 * count, width=pixels, height=pixels)
     seen = [float(_met(engine, splats, _small(view), near).mean()) for _, view in views]
     half = sorted(seen, reverse=True)[count - 1]  # doors and open sides show nothing
     chosen = [view for view, share in zip(views, seen, strict=True) if share >= half]
     return Placed(chosen[:count], "inside", why, best)
+
+
+def _orbit(splat: Model, count: int, pixels: int) -> Named:
+    """Cameras all around, from above first: worlds of COLMAP, which most are, have y down."""
+    views = around(splat, count, width=pixels, height=pixels)
+    return sorted(views, key=lambda named: float(named[1].campos[1]))
 
 
 def _small(view: View) -> View:

@@ -23,7 +23,7 @@ GROUP = "fragprune.bridges"
 @click.argument("viewer", required=False)
 @click.option("--out", type=FILE, help="Folder to copy the module into.")
 def command(viewer: str | None, out: Path | None) -> Report:
-    """Give the JavaScript module with which VIEWER honours cutoffs.
+    """Write the JavaScript module that makes VIEWER honour cutoffs.
 
     A bridge is one module without a build step, and its folder is an npm package. Without --out
     the folder is printed. Without VIEWER all bridges are listed.

@@ -63,14 +63,14 @@ _OPTIONS = (
         "--max-drop",
         type=Number(0, 10),
         metavar="DB",
-        help="Find the strongest truncation that loses at most so much PSNR, in dB, against the "
+        help="Find the strongest truncation that loses at most DB dB of PSNR against the "
         "control. Trains the control and up to 7 times more, and chooses the pressure on the "
         "held-out views. finetune only.",
     ),
     click.option(
         "--portable",
         is_flag=True,
-        help="For viewers that know no thresholds: learn none, and press on the area that the "
+        help="For viewers that ignore thresholds: learn none, and press on the area that the "
         "Gaussians cover instead of on drawn fragments. --pressure is its weight then; default: "
         f"{PORTABLE_ELASTICITY:g} of the loss per pixel of area.",
     ),

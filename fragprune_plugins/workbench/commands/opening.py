@@ -136,6 +136,10 @@ class OwnCameras:
     cameras: Path | None
     seed: int = 0
 
+    def pictures(self, model: Model, engine: Engine) -> Dataset:
+        """A model's own pictures from these cameras; see ``pictures_of``."""
+        return pictures_of(model, self.scene, self.cameras, engine, seed=self.seed)
+
 
 def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> OwnCameras | None:
     """The cameras of a fine-tuning with --self; None for another record.

@@ -17,7 +17,6 @@ from fragprune_plugins.workbench.commands.opening import (
     open_engine,
     overridden,
     own_cameras,
-    pictures_of,
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
@@ -67,7 +66,7 @@ def compare(
         dataset, shown = load_photographs(photographs).to(device), f"{photographs.folder}"
     else:
         assert own is not None
-        dataset = pictures_of(models[0], own.scene, own.cameras, rasterizer, seed=own.seed)
+        dataset = own.pictures(models[0], rasterizer)
         shown = "of A itself"
     shots = chosen(dataset, views)
     before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)

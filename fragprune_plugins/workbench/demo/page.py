@@ -8,6 +8,7 @@ from typing import Any
 
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
 from fragprune_plugins.workbench.figures.wording import headlines, outcome
 from fragprune_plugins.workbench.models import model as models
@@ -48,22 +49,16 @@ def write_page(
     Returns:
         The files as paths relative to ``out``.
     """
-
     pictures = out / "pictures"
     paths = (Path(report["model_before"]), Path(report["model_after"]))
     one, other = (models.load(path, device=device) for path in paths)
     original, pruned = Candidate(one.untruncated()), Candidate(other)
     shots = sorted(load_dataset(scene).test, key=lambda shot: shot.name != _FIRST)
     rasterizer = engine_for(engine, device)
-    views = [
-        replace(shot.view, width=LARGER * shot.view.width, height=LARGER * shot.view.height)
-        for shot in shots
-    ]
-    larger = frame_times(
-        [original, pruned], [view.to(device) for view in views], rasterizer, repeats=_REPEATS
-    )
+    views = [_larger(shot.view).to(device) for shot in shots]
+    times = frame_times([original, pruned], views, rasterizer, repeats=_REPEATS)
     size = f"{views[0].width}x{views[0].height}"
-    report["larger"] = {"size": size} | dict(zip(("before", "after"), larger, strict=True))
+    report["larger"] = {"size": size, "before": times[0], "after": times[1]}
     drawn = report_page.draw_views(pictures, original, pruned, shots, rasterizer, LARGER)
     report_page.save_banner(pictures / BANNER, pictures, drawn)
     files = [*drawn.files, BANNER]
@@ -90,3 +85,7 @@ def write_page(
     with replacing(out / "index.html") as path:
         path.write_text(text, encoding="utf-8")
     return [*(f"pictures/{file}" for file in files), "index.html"]
+
+
+def _larger(view: View) -> View:
+    return replace(view, width=LARGER * view.width, height=LARGER * view.height)

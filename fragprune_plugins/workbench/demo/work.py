@@ -21,7 +21,7 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     )
     report = run_demo(out, settings, lambda line: click.echo(line, err=True))
     larger = report["larger"]
-    table = describe({"before": report["before"], "after": report["after"]})
+    table = describe({"original": report["before"], "pruned": report["after"]})
     text = (
         f"\n{table}\n\n{outcome('run', report, report['control'])}\n"
         f"Of larger pictures, {larger['size']}: {frames(larger['before'], larger['after'])}.\n"

@@ -174,7 +174,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 def covered_per_pixel(engine: Engine, inputs: RasterInputs) -> float:
     """Pixels in the Gaussians' ellipses of sqrt(8) standard deviations, per pixel of the picture.
 
-    It is what viewers pay that know no thresholds and do not ask how faint a Gaussian is. They
+    It is what viewers pay that ignore thresholds and do not ask how faint a Gaussian is. They
     draw quads, whose area is 4 / pi times as large. The pixels are counted, not estimated.
 
     Args:

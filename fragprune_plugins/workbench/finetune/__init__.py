@@ -72,8 +72,8 @@ def _share(
     "itself",
     is_flag=True,
     help="Learn from MODEL's own pictures instead of photographs. Cameras: those of --data or "
-    "--cameras; else all around MODEL, which suits an object. A scene seen from within (a room, a "
-    "street) needs its own cameras: those around it see its walls from behind.",
+    "--cameras; else all around MODEL, which suits an object. Indoor scenes "
+    "and streets need --cameras: generated ones stay outside.",
 )
 @click.option(
     "--cameras",

@@ -150,7 +150,7 @@ class Finetuned:
         result, settings, before = self.result, self.result.settings, data["before"]
         pressure = f" at pressure {data['pressure']:.2g}" if settings.truncate else ""
         lines = [
-            describe({"before": before, "after": data["after"]}),
+            describe({"original": before, "pruned": data["after"]}),
             "",
             outcome("finetune", data, data["control"]),
             f"{result.engine} engine, {data['iterations']} iterations{pressure} in "

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,15 +15,15 @@ import torch
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
 from fragprune_plugins.files.records import DOOR, Record, control_of, find, located, portable
-from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import open_engine, own_cameras, pictures_of
+from fragprune_plugins.workbench.commands.opening import open_engine, own_cameras
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.page import Table, embedded
-from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
+from fragprune_plugins.workbench.figures.recorded import recorded
 from fragprune_plugins.workbench.figures.wording import (
     IS_CONTROL,
     fewer,
@@ -35,7 +35,7 @@ from fragprune_plugins.workbench.figures.wording import (
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page
 from fragprune_plugins.workbench.report.page import Drawn
-from fragprune_plugins.workbench.scenes.dataset import load_photographs
+from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 
 PAGE = "report.html"
 
@@ -197,6 +197,46 @@ def _settings(record: Record) -> list[list[str]]:
     ]
 
 
+@dataclass(frozen=True)
+class _Source:
+    """What the views of a record are drawn from.
+
+    Attributes:
+        models: the original and the pruned model; joint learning leaves the latter alone.
+        filtered: whether only their host's rules may draw them.
+        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
+        needs: files and folders besides the models.
+        dataset: opens the views, with the original and an engine.
+    """
+
+    models: Sequence[Path]
+    filtered: bool
+    drawing: Mapping[str, Any]
+    needs: Sequence[Path]
+    dataset: Callable[[Model, Engine], Dataset]
+
+
+def _source(record: Record, data: Path | None) -> _Source | None:
+    """The source of a record's views; ``data`` is the scene that the user named.
+
+    Raises:
+        RecordError: the record is malformed.
+    """
+    own = own_cameras(record)
+    if own is not None:
+        with DOOR.stated(record.path):
+            models = [located(record.data[name], record.path.parent) for name in ("model", "out")]
+        needs = list(filter(None, [own.scene.data, own.cameras]))
+        return _Source(models, False, {}, needs, own.pictures)
+    read = recorded(record)
+    if read is None:
+        return None
+    scene = read.photographs if data is None else replace(read.photographs, folder=data)
+    return _Source(
+        read.models, read.filtered, read.drawing, [scene.folder], lambda *_: load_photographs(scene)
+    )
+
+
 def _draw(
     record: Record,
     inside: Path,
@@ -217,49 +257,33 @@ def _draw(
         The views, if any were drawn, (heading, file) of further pictures, and a sentence that
         tells why views are missing ("" if none are).
     """
-    drawn, curves, own = recorded(record), record.data.get("curves"), own_cameras(record)
-    if own is not None:
-        paths = tuple(located(record.data[name], record.path.parent) for name in ("model", "out"))
-        needed = list(filter(None, [own.scene.data, own.cameras]))
-        drawn = Recorded(Photographs(inside), paths, False, {})
-    elif drawn is not None:
-        needed = [drawn.photographs.folder]
-    else:
+    source, curves = _source(record, data), record.data.get("curves")
+    if source is None:
         return None, [], ""
-    scene = drawn.photographs if data is None else replace(drawn.photographs, folder=data)
-    allowed = [each for each in drawn.models if data is not None or lies_in(each, inside)]
+    allowed = [each for each in source.models if data is not None or lies_in(each, inside)]
     learning: list[tuple[str, str]] = []
     try:
         engine, device = opened()
-        loaded = [load(path, filtered=drawn.filtered, device=device) for path in allowed]
+        loaded = [load(path, filtered=source.filtered, device=device) for path in allowed]
         if curves:
-            values = loaded[-1].falloff if drawn.models[-1] in allowed else None
+            values = loaded[-1].falloff if source.models[-1] in allowed else None
             with DOOR.stated(record.path) as reading:
                 reading.place = "data.curves"
                 report_page.save_learning(folder / report_page.LEARNING, curves, values)
             learning = [("How it learned", report_page.LEARNING)]
-        if len(drawn.models) == 1:  # of joint learning, which leaves no model of before
+        if len(source.models) == 1:  # of joint learning, which leaves no model of before
             return None, learning, ""
-        if data is None and not (
-            len(allowed) == 2 and all(lies_in(each, inside) for each in needed)
-        ):
-            return (
-                None,
-                learning,
-                f"No views are shown: they need files outside of the folder. {_HOW}",
-            )
-        dataset = (
-            load_photographs(scene)
-            if own is None
-            else pictures_of(loaded[0], own.scene, own.cameras, engine, seed=own.seed)
-        )
+        here = len(allowed) == 2 and all(lies_in(each, inside) for each in source.needs)
+        if data is None and not here:
+            missing = f"No views are shown: they need files outside of the folder. {_HOW}"
+            return None, learning, missing
+        dataset = source.dataset(loaded[0], engine)
     except (DatasetError, ModelFileError, SidecarError) as error:
         if data is not None:  # the user asked for the views
             raise
         return None, learning, f"No views are shown: {error}"
-    before, after = (Candidate(each, drawn.drawing) for each in loaded)
-    views = report_page.draw_views(folder, before, after, dataset.test, engine)
-    return views, learning, ""
+    before, after = (Candidate(each, source.drawing) for each in loaded)
+    return report_page.draw_views(folder, before, after, dataset.test, engine), learning, ""
 
 
 def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:

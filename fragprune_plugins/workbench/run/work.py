@@ -200,7 +200,7 @@ def _describe(
         return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
     lines = []
     if data["before"]:
-        columns = {"before": data["before"], "after": data["after"]}
+        columns = {"original": data["before"], "pruned": data["after"]}
         lines += [describe(columns), "", outcome("run", data, data["control"])]
     else:
         if data["after"]:

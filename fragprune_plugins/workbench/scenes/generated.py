@@ -1,7 +1,7 @@
 """Cameras that nobody took a photograph with: around a splat, inside of it, and between given ones.
 
-They are the same for the same seed. Cameras around a splat suit an object. Inside of one they need
-to be told where its air is, which a splat does not say: ``measure.placing`` estimates it.
+They are the same for the same seed. Cameras around a splat suit an object. Inside one they need
+free space, which the file does not record: ``audit.placing`` estimates it.
 """
 
 from __future__ import annotations
