@@ -11,10 +11,10 @@ from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.errors import DatasetError, ModelFileError
 from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
-from fragprune_plugins.workbench.scenes.output import trained_on
+from fragprune_plugins.workbench.scenes.output import newest_model, trained_on
 
 
 def write_output(folder, data, model, **arguments):
@@ -53,6 +53,15 @@ def test_profile_takes_the_newest_model_and_the_trainings_photographs(output, tm
     assert "iteration_10000" in result.stderr
     assert f"Photographs: {tmp_path / 'data'}" in result.stderr
     assert run_json("profile", output)["views"] == 2
+
+
+def test_a_folder_with_one_output_folder_is_that(output, tmp_path):
+    """As a demo's: the model lies in model/."""
+    assert newest_model(tmp_path) == newest_model(output)
+    assert newest_model(output).parent.name == "iteration_10000"
+    (tmp_path / "second" / "point_cloud").mkdir(parents=True)
+    with pytest.raises(ModelFileError, match="a folder without point_cloud"):
+        newest_model(tmp_path)
 
 
 def test_options_override_the_training(output):

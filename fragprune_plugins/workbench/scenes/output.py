@@ -33,14 +33,18 @@ log = logging.getLogger(__name__)
 
 
 def newest_model(folder: Path) -> Path:
-    """The PLY of the highest iteration in an output folder.
+    """The PLY of the highest iteration in an output folder, or in the only one of a folder's.
 
     Raises:
-        ModelFileError: there is none.
+        ModelFileError: there is none, or several output folders lie in the folder.
     """
+    outputs = {each.parent for each in folder.glob("*/point_cloud")}
+    inside = (
+        outputs.pop() if len(outputs) == 1 and not (folder / "point_cloud").exists() else folder
+    )
     found = [
         (int(number[1]), path)
-        for path in folder.glob("point_cloud/iteration_*/point_cloud.ply")
+        for path in inside.glob("point_cloud/iteration_*/point_cloud.ply")
         if (number := re.fullmatch(r"iteration_(\d{1,9})", path.parent.name))
     ]
     if not found:
