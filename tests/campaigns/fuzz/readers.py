@@ -23,11 +23,12 @@ from fragprune_plugins.hosts.preflight import missing_imports
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import resumed_at
 from fragprune_plugins.types import RasterInputs, View
-from fragprune_plugins.workbench import finetune, report
+from fragprune_plugins.workbench import finetune
 from fragprune_plugins.workbench.figures.recorded import recorded
 from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.prices.cost import UNITS, Cost
+from fragprune_plugins.workbench.report import work as report
 from fragprune_plugins.workbench.scenes import colmap
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Photograph
@@ -154,7 +155,9 @@ def _mask(file: Path) -> None:
 
 
 def _settings(file: Path) -> None:
-    words = ["m.ply", "--out", "o.ply", "--config", str(file)]
+    model = file.with_name("m.ply")
+    model.touch()
+    words = [str(model), "--out", "o.ply", "--config", str(file)]
     try:
         finetune.command.make_context("finetune", words)
     except click.UsageError as error:  # the command prints it, and ends with 2
