@@ -139,7 +139,11 @@ def test_without_photographs(scene, tmp_path):
 @pytest.mark.parametrize(
     "command", [("run", "--", "train.py"), ("finetune", "m.ply", "--data", "s", "--out", "o.ply")]
 )
-def test_what_needs_thresholds_or_still_shapes_is_refused(command, option, value):
+def test_what_needs_thresholds_or_still_shapes_is_refused(
+    tmp_path, monkeypatch, command, option, value
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "m.ply").touch()
     name, *words = command
     result = run(name, "--portable", option, value, *words)
     assert result.exit_code == 2
@@ -147,7 +151,8 @@ def test_what_needs_thresholds_or_still_shapes_is_refused(command, option, value
 
 
 def test_a_control_is_not_portable(tmp_path):
-    words = ("finetune", "m.ply", "--data", "s", "--out", tmp_path / "o.ply")
+    (tmp_path / "m.ply").touch()
+    words = ("finetune", tmp_path / "m.ply", "--data", "s", "--out", tmp_path / "o.ply")
     result = run(*words, "--control", "--portable")
     assert result.exit_code == 2
     assert "--control with --portable" in result.stderr
