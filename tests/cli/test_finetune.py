@@ -20,10 +20,11 @@ from PIL import Image
 
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
-from fragprune_plugins.workbench.finetune import loop, timing
+from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.finished import describe_untruncated
-from fragprune_plugins.workbench.prices import calibration
+from fragprune_plugins.workbench.prices import calibration, target
 from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 
 
@@ -227,9 +228,9 @@ def test_a_target_time_measures_prices_once_and_says_what_was_reached(scene, tmp
         outputs = work()
         return outputs, cost.ms(work_of(outputs))
 
-    for module in (calibration, timing):
+    for module in (calibration, target):
         monkeypatch.setattr(module, "timed", timed)
-    monkeypatch.setattr(timing, "_SECONDS", 0.0)
+    monkeypatch.setattr(target, "_SECONDS", 0.0)
     monkeypatch.setattr(calibration, "frames", lambda device: few_frames())
     monkeypatch.setenv("FRAGPRUNE_CACHE", str(tmp_path / "cache"))
     data, path, _ = scene
@@ -240,7 +241,7 @@ def test_a_target_time_measures_prices_once_and_says_what_was_reached(scene, tmp
     report = json.loads(first.stdout)
     assert report["target_reached"]
     assert report["faster"] == pytest.approx(1.2, rel=0.02)
-    assert report["settings"]["target_time"] == 1.2
+    assert report["settings"]["goal"] == "faster=1.2"
     (kept,) = (tmp_path / "cache").glob("prices-cpu-*.json")
     kept.write_text("{}")
     again = run(*arguments, "--target-time", 1.2, "--again")
@@ -261,7 +262,8 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(scene, tmp_p
     assert found["loss"] == pytest.approx(
         report["control"]["psnr"] - report["after"]["psnr"], abs=1e-3
     )
-    assert report["settings"]["pressure"] in (None, pytest.approx(found["pressure"]))
+    goal = parse_goal(report["settings"]["goal"])
+    assert goal.weight in (None, pytest.approx(found["pressure"]))
     assert read_ply(out).falloff is not None
     text = run("finetune", path, *words).stdout
     assert "Loss against the control" in text
