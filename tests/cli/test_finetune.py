@@ -209,6 +209,15 @@ def test_a_control_of_all_gaussians_is_none_for_fewer(scene, tmp_path):
     assert fewer["control"]["gaussians"] == 30
 
 
+def test_a_control_of_one_view_a_step_is_none_for_two(scene, tmp_path):
+    data, path, _ = scene
+    arguments = ("finetune", path, "--data", data, "--iters", 3)
+    run_json(*arguments, "--out", tmp_path / "control.ply", "--control")
+    two = run_json(*arguments, "--out", tmp_path / "two.ply", "--views-per-step", 2)
+    assert two["control"] is None
+    assert run_json(*arguments, "--out", tmp_path / "one.ply")["control"]
+
+
 def test_target_control_and_curves(scene, tmp_path):
     data, path, _ = scene
     out, curves = tmp_path / "out.ply", tmp_path / "curves.png"
