@@ -20,6 +20,14 @@ if TYPE_CHECKING:
     from fragprune_plugins.engines import slice_at
     from fragprune_plugins.files.model import Model
     from fragprune_plugins.injection.api import activate, deactivate, paused
+    from fragprune_plugins.learning.goals import (
+        AtMost,
+        Control,
+        Faster,
+        Fewer,
+        Portable,
+        Pressure,
+    )
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.plugins.hooks import engine_for, rasterize
@@ -37,7 +45,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
     from fragprune_plugins.workbench.figures.evaluate import measure
     from fragprune_plugins.workbench.figures.viewing import overview, render_view
-    from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
+    from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
     from fragprune_plugins.workbench.models.model import load, save
     from fragprune_plugins.workbench.prices.calibration import prices_of
     from fragprune_plugins.workbench.prices.cost import Cost
@@ -50,11 +58,17 @@ if TYPE_CHECKING:
 __version__ = VERSION
 
 _HOME = {
+    "AtMost": "learning.goals",
+    "Control": "learning.goals",
     "Cost": "workbench.prices.cost",
-    "FinetuneResult": "workbench.finetune.loop",
+    "Faster": "learning.goals",
+    "Fewer": "learning.goals",
+    "FinetuneResult": "workbench.finetune.api",
     "Footprints": "types",
     "Model": "files.model",
     "Moment": "types",
+    "Portable": "learning.goals",
+    "Pressure": "learning.goals",
     "RasterInputs": "types",
     "RasterOutputs": "types",
     "Schedule": "learning.schedule",
@@ -69,7 +83,7 @@ _HOME = {
     "activate": "injection.api",
     "deactivate": "injection.api",
     "engine_for": "plugins.hooks",
-    "finetune": "workbench.finetune.loop",
+    "finetune": "workbench.finetune.api",
     "joined": "workbench.ranks",
     "keep_best": "workbench.pruning.scores",
     "keep_needed": "workbench.pruning.scores",
@@ -80,8 +94,8 @@ _HOME = {
     "overview": "workbench.figures.viewing",
     "own_pictures": "workbench.scenes.itself",
     "part_of": "workbench.distributed.processes",
-    "prices_of": "workbench.prices.calibration",
     "paused": "injection.api",
+    "prices_of": "workbench.prices.calibration",
     "rasterize": "plugins.hooks",
     "render_view": "workbench.figures.viewing",
     "save": "workbench.models.model",
@@ -90,11 +104,17 @@ _HOME = {
 }
 
 __all__ = [
+    "AtMost",
+    "Control",
     "Cost",
+    "Faster",
+    "Fewer",
     "FinetuneResult",
     "Footprints",
     "Model",
     "Moment",
+    "Portable",
+    "Pressure",
     "RasterInputs",
     "RasterOutputs",
     "Schedule",

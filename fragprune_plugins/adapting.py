@@ -8,6 +8,7 @@ its script  CommandLine, ConfigFile, Photographs
 of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
             share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages
 files       Door, for those that a host reads; Model, read_ply
+settings    parse_goal
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
@@ -49,6 +50,7 @@ from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall, revised
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.types import (
     Footprints,
@@ -116,6 +118,7 @@ __all__ = [
     "View",
     "graphdeco",
     "hookimpl",
+    "parse_goal",
     "read_ply",
     "revised",
     "slice_at",

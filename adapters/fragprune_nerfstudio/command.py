@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
+from fragprune_nerfstudio.learning import flags_of
 from fragprune_plugins import Settings
 from fragprune_plugins.adapting import UsageError
 
@@ -84,11 +85,7 @@ def rewritten(
             f"{LOADS[0]} with a run's nerfstudio_models",
             f"Add {LOADS[0]} to the command, or --from-iter.",
         )
-    default = Settings()
-    for name in (field.name for field in fields(Settings)):
-        if getattr(settings, name) != getattr(default, name):
-            flag = f"{MODEL}.fragprune.{name.replace('_', '-')}"
-            ours[flag] = getattr(settings, name)
+    ours |= {f"{MODEL}.fragprune.{name}": value for name, value in flags_of(settings).items()}
     if engine != "auto":
         ours[f"{MODEL}.fragprune-engine"] = engine
     ours |= {LENGTH: total, "--machine.device-type": device.split(":")[0]}

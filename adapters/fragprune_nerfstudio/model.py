@@ -24,7 +24,7 @@ from torch.overrides import TorchFunctionMode
 
 import fragprune_plugins
 from fragprune_nerfstudio import METHOD
-from fragprune_plugins import Settings
+from fragprune_nerfstudio.learning import Learning
 from fragprune_plugins.adapting import (
     AlignmentError,
     Interrupted,
@@ -53,7 +53,7 @@ class FragpruneSplatfactoConfig(SplatfactoModelConfig):  # type: ignore[misc]
     """splatfacto's, and stage 2."""
 
     _target: type = field(default_factory=lambda: FragpruneSplatfacto)
-    fragprune: Settings = field(default_factory=Settings)
+    fragprune: Learning = field(default_factory=Learning)
     """Stage 2, the last iterations of the training, in which thresholds learn."""
     fragprune_from: int | None = None
     """Iteration at which stage 2 begins, instead of fragprune.iterations before the last one."""
@@ -184,7 +184,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
         Raises:
             UsageError: nothing would be learned, or from nothing, or not as this host trains.
         """
-        settings, start = self.config.fragprune, trainer._start_step
+        settings, start = self.config.fragprune.settings(), trainer._start_step
         end = start + trainer.config.max_num_iterations
         if trainer.mixed_precision or trainer.use_grad_scaler:
             raise UsageError(
@@ -192,13 +192,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
             )
         if trainer.world_size > 1:
             raise UsageError(METHOD, "several GPUs", "one", "Set --machine.num-devices 1.")
-        if settings.target_time is not None or settings.itself:
-            raise UsageError(
-                METHOD,
-                "a target in frame time, or the model's own pictures as target",
-                "a target in fragments, and photographs",
-                "Use --pipeline.model.fragprune.target-speedup, or fragprune finetune on the PLY.",
-            )
+        settings.goal.target()  # refuses what a training alone cannot meet
         if self.saved is not None:
             return int(self.saved["begin"])
         wanted = self.config.fragprune_from
@@ -231,7 +225,9 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
         if self.begin is not None and step >= self.begin and not learning:
             fragprune_plugins.deactivate()
             session = fragprune_plugins.activate(
-                "nerfstudio", settings=self.config.fragprune, engine=self.config.fragprune_engine
+                "nerfstudio",
+                settings=self.config.fragprune.settings(),
+                engine=self.config.fragprune_engine,
             )
             session.output = self.checkpoints
             if self.saved is not None:

@@ -43,6 +43,7 @@ from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.engines.losses import compiled_loss
 from fragprune_plugins.learning import losses
 from fragprune_plugins.learning.adam import EPSILON
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
@@ -123,8 +124,8 @@ def watched(now: Callable[[], float]) -> Iterator[Clock]:
             stack.enter_context(mock.patch.object(owner, attribute, timed))
         seen = property(clock.timed("photograph", image))
         stack.enter_context(mock.patch.object(Photograph, "image", seen))
-        learn = clock.step(loop._Run._learn_from)
-        stack.enter_context(mock.patch.object(loop._Run, "_learn_from", learn))
+        learn = clock.step(loop.Training._step)
+        stack.enter_context(mock.patch.object(loop.Training, "_step", learn))
         yield clock
 
 
@@ -154,7 +155,7 @@ def profile(
         data = Dataset(shots, shots)
         for kind in ("whole", "cut"):
             cut = kind == "cut"
-            settings = Settings(iterations=steps + SKIPPED, truncate=cut, pressure=1e-4)
+            settings = Settings(iterations=steps + SKIPPED, goal=Pressure() if cut else Control())
             store = ThresholdStore.from_falloff(torch.full((gaussians,), FALLOFF)) if cut else None
             scene = replace(make_scene(gaussians), thresholds=store)
             plan = Schedule(settings, warmup=0)

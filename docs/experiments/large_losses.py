@@ -21,11 +21,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from fragprune_plugins.learning.pressure import ElasticPressure, Pressure
+from fragprune_plugins.learning.goals import Control, Pressure
+from fragprune_plugins.learning.pressure import ElasticPressure, PressureRule
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_dataset
 
@@ -58,7 +59,7 @@ def scene(args: Namespace) -> None:
 class Unbounded(Schedule):
     """The default schedule under the default pressure without its upper end."""
 
-    def make_pressure(self) -> Pressure:
+    def make_pressure(self) -> PressureRule:
         """The pressure of a run."""
         default = self.settings.make_pressure()
         assert isinstance(default, ElasticPressure)
@@ -72,11 +73,11 @@ def compare(args: Namespace) -> None:
     dataset: Dataset = load_dataset(args.data, white_background=args.white_background)
     usual = Settings(iterations=1000, seed=args.seed)
     arms: dict[str, tuple[Settings, Schedule | None]] = {
-        "control": (replace(usual, truncate=False), None),
+        "control": (replace(usual, goal=Control()), None),
         "no upper end": (usual, Unbounded(usual)),
         "default": (usual, None),
     }
-    arms |= {f"λ {p:g}": (replace(usual, pressure=p), None) for p in args.pressure}
+    arms |= {f"λ {p:g}": (replace(usual, goal=Pressure(p)), None) for p in args.pressure}
     drawn, ended = [Candidate(splat)], ["as it came | - | -"]
     for label, (settings, schedule) in arms.items():
         result = finetune(splat, dataset, settings, schedule=schedule, progress=True)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import fragprune_plugins
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Settings
 
 parser = ArgumentParser()
@@ -32,7 +33,7 @@ args = parser.parse_args()
 args.steps = 0 if args.start else args.steps
 
 # 1. Above the import of gsplat. Learning and freezing begin once the loop has made --steps steps.
-settings = Settings(iterations=args.stage2, truncate=not args.control)
+settings = Settings(iterations=args.stage2, goal=Pressure() if not args.control else Control())
 session = fragprune_plugins.activate("gsplat", from_iter=args.steps, settings=settings)
 
 import gsplat  # noqa: E402

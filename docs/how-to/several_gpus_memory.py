@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 import fragprune_plugins as fp
+from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 LENGTH, STEPS, VIEWS = 200.0, 4, 4
@@ -65,7 +66,7 @@ with fp.joined(torch.device("cpu")) as ranks:
     torch.set_num_threads(1)
     engine = fp.ShardedEngine(fp.engine_for("cpu"), ranks)
     splat = part(count // ranks.size, ranks.rank, ranks.size)
-    settings = fp.Settings(STEPS, train=train, views_per_step=VIEWS, pressure=1e-4)
+    settings = fp.Settings(STEPS, train=train, views_per_step=VIEWS, goal=Pressure(1e-4))
     started = time.perf_counter()
     fp.finetune(splat, Dataset(shots, shots[:1]), settings, engine=engine, ranks=ranks)
     seconds = (time.perf_counter() - started) / STEPS

@@ -22,6 +22,10 @@ DOOR = Door(
 )
 """``DOOR.stated(record.path)`` is around whatever takes values out of a record."""
 
+CONTROL = "control"
+"""The goal of a control, as settings in records have it."""
+
+_OF_CONTROLS = ("train", "opacity_lr", "stop", "seed", "views_per_step")
 _SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
 
 
@@ -136,8 +140,9 @@ def _spellings(path: str | Path) -> list[str]:
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
     """Find the measurement of a fine-tuning's control; None if no file records it.
 
-    The control started from the same model, with the same iterations and settings, and kept as many
-    Gaussians, but without truncation. Files that are not records are ignored.
+    The control started from the same model, with the same iterations, views in each step, seed and
+    settings, and kept as many Gaussians, but without truncation. Files that are not records are
+    ignored.
 
     Args:
         data: of the fine-tuning, including "before", "iterations" and "settings".
@@ -156,9 +161,9 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
     mine, theirs = data.get("settings", {}), other.get("settings", {})
     begun, before = other.get("before"), data.get("before")
     return bool(
-        mine.get("truncate")
-        and theirs.get("truncate") is False
-        and all(mine[key] == theirs.get(key) for key in ("train", "opacity_lr"))
+        mine.get("goal", CONTROL) != CONTROL
+        and theirs.get("goal") == CONTROL
+        and all(mine[key] == theirs.get(key) for key in _OF_CONTROLS)
         and other["iterations"] == data["iterations"]
         and other.get("keep") == data.get("keep")
         and begun

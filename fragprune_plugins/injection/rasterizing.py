@@ -25,6 +25,7 @@ from fragprune_plugins.injection.stepping import (
     frozen_parameters,
 )
 from fragprune_plugins.learning.area import area_per_pixel
+from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
@@ -64,7 +65,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
         else:
             expect_to_train(session, call, model)
     again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
-    measured = session.settings.target_speedup is not None  # a kept view keeps its model alive
+    measured = isinstance(session.settings.goal, Fewer)  # a kept view keeps its model alive
     if state is not None and learns(state) and torch.is_grad_enabled():
         state.seen[view] = None
         if measured:
@@ -158,7 +159,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
             "Report this with the host's commit.",
         )
     stage = state.stage
-    presses = stage is not None and stage.learning and session.settings.portable
+    presses = stage is not None and stage.learning and session.settings.goal.on_area
     if not state.store.cuts and not presses:
         return by_host()
     with directly():
@@ -217,7 +218,7 @@ def rasterize(
             return outputs
         return engine.rasterize(replace(inputs, stop=None), None)
 
-    area = area_per_pixel(inputs) if state.stage.settings.portable else None
+    area = area_per_pixel(inputs) if state.stage.settings.goal.on_area else None
     pressure = state.stage.drew(view, outputs, untruncated, part, area)
     if pressure is None or not outputs.image.requires_grad:
         return outputs

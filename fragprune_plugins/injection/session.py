@@ -150,7 +150,7 @@ class Session(SessionState):
             SessionError: it drew none.
         """
         stage = self.last_state.stage if self.last_state else None
-        if stage and stage.steps and self.settings.truncate and not stage.viewed:
+        if stage and stage.steps and self.settings.goal.presses and not stage.viewed:
             raise SessionError(
                 self.adapter.name,
                 f"{stage.steps} steps, and no view of the trained model drawn with its thresholds",
@@ -168,7 +168,7 @@ class Session(SessionState):
         if model is None or self.output is None or not isinstance(self.adapter, ScriptAdapter):
             return None
         state = self.models[model]
-        learned = state.store.cuts or (self.settings.portable and state.steps > 0)
+        learned = state.store.cuts or (self.settings.goal.on_area and state.steps > 0)
         if not learned:
             return None
         return self.adapter.save_model(model, self.output, self.start + state.steps)

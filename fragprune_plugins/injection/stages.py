@@ -131,7 +131,9 @@ class Stages:
         last = total + settings.iterations
         log.info("one run of %d iterations; stage 2 begins after %d", last, total)
         arguments = self.adapter.lengthened(self.host.arguments, total, last)
-        if not settings.truncate and self.output is not None:  # keeps a learned result in its place
+        if (
+            not settings.goal.presses and self.output is not None
+        ):  # keeps a learned result in its place
             self.output /= "control"
             arguments += [self.host.line.output[-1], str(self.output)]
         self._execute(arguments, learn=True, from_step=total, settings=settings)
@@ -170,7 +172,7 @@ class Stages:
             total = first + settings.iterations + line.skipped
             extra = {"iterations": total, "resume": str(checkpoint)}
             own = "finetuned" if line.restarts else ""
-            own = own if settings.truncate else "control"  # keeps a learned result in its place
+            own = own if settings.goal.presses else "control"  # keeps a learned result in its place
             if own and self.output is not None:
                 self.around, self.output = self.output, self.output / own
             if self.output is not None and str(self.output) != self.host.flags.output:
@@ -254,7 +256,7 @@ class Stages:
             added = "" if named else f" with --stage finetune and {line.output[-1]} {self.output}"
             remedy = f"Run the command again{added}: stage 2 begins anew from {self.start.path}."
         if saved:
-            portable = self.options.settings.portable
+            portable = self.options.settings.goal.on_area
             learned, where = ("model", "is") if portable else ("thresholds", "are beside")
             found += f"; the {learned} learned so far {where} {saved}"
             if not line.one_run:

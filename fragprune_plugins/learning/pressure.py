@@ -12,14 +12,11 @@ limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from fragprune_plugins.learning.thresholds import ThresholdStore
 
     Figure = float | Tensor
 
@@ -38,12 +35,6 @@ Chosen on photographs that were not used: docs/how-to/without-photographs.md has
 ELASTICITY = 0.1
 """Per cent of the loss that one per cent of the fragments is worth by default."""
 
-TARGET_TOLERANCE = 0.05
-"""A target counts as reached within this relative distance."""
-
-FEWEST = 20
-"""No target makes fragments fewer than this many times."""
-
 TIME_FOLLOWS = 0.4
 """d ln(frame time) / d ln(fragments), roughly: 0.3 in small pictures, 0.5 in large ones."""
 
@@ -53,16 +44,6 @@ PORTABLE_ELASTICITY = 0.3
 OWN_AREA_PRESSURE = 3e-4
 """``OWN_PRESSURE`` on the ellipses' area, for a model that learns from its own pictures."""
 
-CALIBRATE_AT = 0.85
-"""Share of the learning after which one shift of all thresholds meets the target, and they stay."""
-
-CLOCKED_AT = (0.25, 0.45, 0.65)
-"""Shares of the learning at which frames are timed for a target time, to steer by."""
-
-CALIBRATION_VIEWS = 24
-"""Number of training views that a calibration measures at most."""
-
-_NEAR = 0.02  # a share by which frame times are noisy
 _CURVE_SPEEDUP = 1.62  # fragments before / after that LEAST_PRESSURE gives
 _CURVE_SLOPE = 0.22  # d ln(speedup) / d ln(lambda), measured between 1.45x and 2.6x
 
@@ -87,12 +68,7 @@ class Observation:
     ratio: float | None = None
 
 
-def numbers_of(thing: object) -> dict[str, int | float]:
-    """The attributes of an object that are numbers, by name."""
-    return {name: each for name, each in vars(thing).items() if isinstance(each, int | float)}
-
-
-class Pressure(Protocol):
+class PressureRule(Protocol):
     """Gives lambda for the next step, and is told the figures of each step."""
 
     value: float
@@ -276,104 +252,3 @@ class PressureController:
         self.value = math.exp(max(low, min(high, math.log(self.value) + change)))
         self._next = step.progress + self.period
         self._sum, self._count = 0.0, 0
-
-
-def calibrate(
-    store: ThresholdStore,
-    ratio: Callable[[], float],
-    target: float,
-    *,
-    tolerance: float = 0.01,
-    reach: float = 8.0,
-    rounds: int = 16,
-) -> float:
-    """Shift all threshold logits by one number so that ``ratio()`` meets ``target``.
-
-    The ratio grows with the shift, so bisection finds it. Where the target lies out of reach the
-    nearest end is kept. Call it late in the run and let opacities adapt afterwards.
-
-    Args:
-        store: the thresholds; changed in place.
-        ratio: before over after, with the store as it stands.
-        target: of the ratio.
-        tolerance: relative distance at which to stop.
-        reach: largest shift either way, in logits.
-        rounds: most measurements.
-
-    Returns:
-        The ratio measured last.
-    """
-    start = store.logits.detach().clone()
-    low, high = -reach, reach
-    shift, reached = 0.0, ratio()
-    for _ in range(rounds):
-        if abs(reached / target - 1) <= tolerance:
-            break
-        if reached < target:
-            low = shift
-        else:
-            high = shift
-        shift = (low + high) / 2
-        store.place(start + shift)
-        reached = ratio()
-    return reached
-
-
-class Ratios(list[tuple[float, float]]):
-    """Logarithms of ratios that were predicted, and measured.
-
-    Both ratios are 1 without truncation, so that their logarithms are taken as proportional. The
-    slope is fitted to all of them, in which noise cancels; those near the target weigh most.
-    """
-
-    def add(self, predicted: float, measured: float) -> None:
-        """Take a pair of ratios in, unless it is too near 1 to tell a slope from noise."""
-        if 1 + _NEAR < predicted < math.inf and measured > 1 + _NEAR:
-            self.append((math.log(predicted), math.log(measured)))
-
-    def slope(self, target: float) -> float:
-        """ln(measured) / ln(predicted) near a target, 0.5 to 2; 1 before anything was measured."""
-        weights = [1 / (_NEAR**2 + (m - math.log(target)) ** 2) for _, m in self]
-        squares = sum(w * p * p for w, (p, _) in zip(weights, self, strict=True))
-        if squares == 0:
-            return 1.0
-        products = sum(w * p * m for w, (p, m) in zip(weights, self, strict=True))
-        return min(max(products / squares, 0.5), 2.0)
-
-
-def calibrate_measured(
-    store: ThresholdStore,
-    predicted: Callable[[], float],
-    measured: Callable[[], float],
-    target: float,
-    *,
-    seen: Ratios | None = None,
-    tolerance: float = 0.02,
-    rounds: int = 4,
-) -> float:
-    """Like ``calibrate``, for a ratio that is measured with noise and predicted without.
-
-    Bisection would go astray in noise: so it meets a prediction, and measurements correct what to
-    predict (``Ratios``).
-
-    Args:
-        store: the thresholds; changed in place.
-        predicted: before over after, with the store as it stands; need not be unbiased.
-        measured: the same, measured.
-        target: of the measured ratio.
-        seen: what was measured before, to begin with; added to.
-        tolerance: relative distance at which to stop.
-        rounds: most measurements.
-
-    Returns:
-        The ratio measured last.
-    """
-    seen, reached = Ratios() if seen is None else seen, math.nan
-    for _ in range(rounds):
-        aim = target ** (1 / seen.slope(target))
-        foreseen = calibrate(store, predicted, aim, tolerance=tolerance / 4)
-        reached = measured()
-        seen.add(foreseen, reached)
-        if abs(reached / target - 1) <= tolerance:
-            break
-    return reached

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.pressure import (
-    ELASTICITY,
-    OWN_AREA_PRESSURE,
-    OWN_PRESSURE,
-    PORTABLE_ELASTICITY,
-    TIME_FOLLOWS,
-    ElasticPressure,
-    FixedPressure,
-    Pressure,
-    PressureController,
-    numbers_of,
-)
+from fragprune_plugins.learning.goals import Goal, Pressure
+from fragprune_plugins.learning.plain import numbers_of
+from fragprune_plugins.learning.pressure import ELASTICITY, PressureRule
 from fragprune_plugins.types import is_stop
 
 Train = Literal["opacity", "appearance", "all"]
@@ -26,6 +18,7 @@ Train = Literal["opacity", "appearance", "all"]
 FINETUNE_ITERATIONS = 5000
 QUICK_ITERATIONS = 1000
 ITERATIONS_MAX = 10**9
+_DEFAULT_GOAL = Pressure()
 _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
 
 
@@ -53,26 +46,17 @@ _RECIPES: dict[Train, _Recipe] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a fine-tuning; recorded in the sidecar.
+    """Settings of a fine-tuning; recorded with its result.
 
     Attributes:
         iterations: optimizer steps of stage 2.
         train: what moves beside the thresholds: "opacity" (the paper's), "appearance" (opacity and
             SH) or "all", which truncates in the last 2,000 iterations only.
-        pressure: lambda, weight of drawn fragments per pixel in the loss; None for one that
-            follows the loss per fragment, between two ends.
-        target_speedup: fragments of the untruncated model as it came in over fragments drawn now,
-            on the training views that calibration measures, to steer for; overrides pressure.
-        target_time: frame time of the untruncated model as it came in over frame time now, on the
-            same views at their own size, to steer for; overrides pressure and target_speedup.
+        goal: what to truncate for, one of ``goals``; a pressure by default.
         threshold_lr: initial learning rate of threshold logits.
         opacity_lr: initial learning rate of opacity logits in stage 2.
         itself: True where the model's own pictures are the target. The default pressure is
             ``OWN_PRESSURE`` then, and no warm-up comes first, for it would have nothing to learn.
-        portable: True for viewers that ignore thresholds: none are learned. The pressure is on the
-            area of the Gaussians' ellipses instead (``area.area_per_pixel``), from the first step
-            on, and shapes must move.
-        truncate: False trains without thresholds or pressure: the control to compare with.
         stop: the share of a pixel's light at which the model is drawn and trained from the first
             step on that counts, see ``RasterInputs``; None keeps what the model has.
         seed: of the order of views in ``finetune``; hosts have their own.
@@ -80,119 +64,78 @@ class Settings:
             their own.
         nonfinite: what to do with a step whose gradients are NaN or infinite: "stop" with an error,
             or "skip" it.
+
+    Raises:
+        UsageError: a value is of another kind, or out of range.
     """
 
     iterations: int = FINETUNE_ITERATIONS
     train: Train = "all"
-    pressure: float | None = None
-    target_speedup: float | None = None
-    target_time: float | None = None
+    goal: Goal = _DEFAULT_GOAL
     threshold_lr: float = 0.05
     opacity_lr: float = 0.01
     itself: bool = False
-    portable: bool = False
-    truncate: bool = True
     stop: float | None = None
     seed: int = 0
     views_per_step: int = 1
     nonfinite: Literal["stop", "skip"] = "stop"
 
     def __post_init__(self) -> None:
-        if not 1 <= self.iterations <= ITERATIONS_MAX:
-            found, most = str(self.iterations)[:20], f"{ITERATIONS_MAX:,}"
-            raise UsageError("iterations", found, f"1 to {most}", "Choose another --iters.")
-        if self.views_per_step < 1:
-            raise UsageError(
-                "views per step", str(self.views_per_step), "1 or more", "Raise --views-per-step."
-            )
-        if self.pressure is not None and not 0 <= self.pressure < 1:
-            raise UsageError(
-                "pressure", f"{self.pressure:g}", "0 <= X < 1 (1e-4 is usual)", "Change --pressure."
-            )
-        if self.target_speedup is not None and not 1 < self.target_speedup <= 20:
-            raise UsageError(
-                "target speed-up",
-                f"{self.target_speedup:g}",
-                "1 < X <= 20, fragments before over after",
-                "Change --target-speedup.",
-            )
-        if self.target_time is not None and not 1 < self.target_time <= 20:
-            raise UsageError(
-                "target time",
-                f"{self.target_time:g}",
-                "1 < X <= 20, frame time before over after",
-                "Change --target-time.",
-            )
-        if not is_stop(self.stop):
-            raise UsageError(
-                "stop",
-                f"{self.stop:g}",
-                "1e-4 to 1, a share of a pixel's light (0.01 is usual)",
-                "Change --stop.",
-            )
-        if self.portable and self.stop is not None:
-            raise UsageError(
-                "options",
-                "--portable with --stop",
-                "one of the two: viewers that ignore thresholds know no stop",
-                "Drop one of the two.",
-            )
-        if self.portable and self.train != "all":
-            raise UsageError(
-                "options",
-                f"--portable with --train {self.train}",
-                "--train all: only shapes that move can cover less area",
-                "Drop one of the two.",
-            )
-        if self.portable and (self.target_speedup, self.target_time) != (None, None):
-            raise UsageError(
-                "options",
-                "--portable with --target-speedup or --target-time",
-                "no target: it is met by shifting thresholds, and there are none",
-                "Steer with --pressure.",
-            )
+        def whole(least: int, most: int) -> Callable[[Any], bool]:
+            return lambda value: type(value) is int and least <= value <= most
 
-    @property
-    def opens(self) -> bool:
-        """Whether thresholds open and learn."""
-        return self.truncate and not self.portable
+        def rate(value: Any) -> bool:
+            return type(value) in (int, float) and 0 <= value < math.inf
+
+        checks: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+            ("iterations", whole(1, ITERATIONS_MAX), f"1 to {ITERATIONS_MAX:,}, a whole number"),
+            ("train", get_args(Train).__contains__, f"one of {', '.join(get_args(Train))}"),
+            ("goal", lambda value: isinstance(value, Goal), "a goal, such as Pressure(1e-4)"),
+            ("threshold_lr", rate, "a number, 0 or more"),
+            ("opacity_lr", rate, "a number, 0 or more"),
+            ("itself", lambda value: isinstance(value, bool), "True or False"),
+            ("stop", _is_stop, "1e-4 to 1, a share of a pixel's light (0.01 is usual), or None"),
+            ("seed", lambda value: type(value) is int, "a whole number"),
+            ("views_per_step", whole(1, ITERATIONS_MAX), "a whole number, 1 or more"),
+            ("nonfinite", ("stop", "skip").__contains__, "stop or skip"),
+        )
+        for name, fits, expected in checks:
+            if not fits(value := getattr(self, name)):
+                where = name.replace("_", " ")
+                raise UsageError(where, repr(value)[:80], expected, "Correct it.")
+        if self.goal.on_area and self.stop is not None:
+            raise UsageError(
+                "options",
+                f"a {self.goal.name} model with a stop",
+                "one of the two: viewers that ignore thresholds ignore a stop",
+                "Drop one of the two.",
+            )
+        if self.goal.on_area and self.train != "all":
+            raise UsageError(
+                "options",
+                f"a {self.goal.name} model with train={self.train!r}",
+                "all: only shapes that move can cover less area",
+                "Drop one of the two.",
+            )
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, for the sidecar and ``--json``."""
-        return asdict(self)
+        """Plain values, for records and ``--json``; the goal as text (``goals.parse_goal``)."""
+        return {**asdict(self), "goal": str(self.goal)}
 
-    @property
-    def target(self) -> float | None:
-        """The ratio to meet, before over after: of frame times or of fragments; None for none."""
-        return self.target_speedup if self.target_time is None else self.target_time
-
-    def make_pressure(self, elasticity: float | None = None) -> Pressure:
+    def make_pressure(self, elasticity: float | None = None) -> PressureRule:
         """The pressure these settings ask for.
 
         Args:
             elasticity: of the default pressure; by what ``train`` names when None.
         """
-        if not self.truncate:
-            return FixedPressure(0.0)
-        if self.target_time is not None:
-            return PressureController(self.target_time, follows=TIME_FOLLOWS)
-        if self.target_speedup is not None:
-            return PressureController(self.target_speedup)
-        if self.pressure is not None:
-            return FixedPressure(self.pressure)
-        if self.itself:
-            return FixedPressure(OWN_AREA_PRESSURE if self.portable else OWN_PRESSURE)
-        if self.portable:
-            return ElasticPressure(value=0.0, elasticity=PORTABLE_ELASTICITY, least=0.0, most=1.0)
-        return ElasticPressure(
-            elasticity=_RECIPES[self.train].elasticity if elasticity is None else elasticity
-        )
+        own = _RECIPES[self.train].elasticity if elasticity is None else elasticity
+        return self.goal.pressure(own, self.itself)
 
     @property
     def warmup(self) -> int:
         """Steps that train without truncation before thresholds open."""
         learning = _RECIPES[self.train].steps
-        if learning is None or self.itself or self.portable:
+        if learning is None or self.itself or self.goal.on_area:
             return 0
         return max(0, self.iterations - steps_of(learning, self.views_per_step))
 
@@ -204,6 +147,10 @@ class Settings:
         them one by one move a parameter by about sqrt(V) rates, and V together by one.
         """
         return math.sqrt(self.views_per_step)
+
+
+def _is_stop(value: Any) -> bool:
+    return value is None or (type(value) in (int, float) and is_stop(value))
 
 
 def steps_of(views: int, views_per_step: int) -> int:
@@ -219,7 +166,7 @@ class StepPlan:
         learn: thresholds move, and drawn fragments press on the loss. When False they stay as they
             are and truncate as they are; before the first step that learns they are neutral, and
             nothing is truncated. Other parameters train on at the rates below. If
-            ``Settings.truncate`` is False this has no effect.
+            ``Goal.presses`` is False this has no effect.
         threshold_lr: learning rate of their logits.
         opacity_lr: learning rate the opacity group gets, None to leave the host's.
         progress: share of the learning that is over, 0 to 1.
@@ -263,7 +210,7 @@ class Schedule:
             decay=decay,
         )
 
-    def make_pressure(self) -> Pressure:
+    def make_pressure(self) -> PressureRule:
         """The pressure of the run, a new one."""
         return self.settings.make_pressure()
 
@@ -301,6 +248,6 @@ class JointSchedule(Schedule):
         rate = self.settings.threshold_lr * _DECAY**progress
         return StepPlan(on, rate, None, progress, counted=on)
 
-    def make_pressure(self) -> Pressure:
+    def make_pressure(self) -> PressureRule:
         """As for opacities, whatever ``train`` names: the host trains, and presses for longer."""
         return self.settings.make_pressure(ELASTICITY)

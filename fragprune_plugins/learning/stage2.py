@@ -10,8 +10,7 @@ optimizer of everything but the thresholds, tells it what happens, in this order
     sound       whether its gradients are finite; the driver's optimizer steps only if they are
     end         the driver's optimizer stepped; the thresholds step too
 
-A target is a ratio of fragments or of frame times. Prices of a driver predict frame times, and its
-clock has the last word.
+A target (``targets``) is a ratio that thresholds are held to.
 
 Fragments "before" are those of a view drawn without thresholds at its first visit, fragments
 "after" those it was last drawn with. A speed-up is the one over the other, summed over views that
@@ -30,23 +29,19 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import DivergedError, ResetError, UsageError
+from fragprune_plugins.errors import DivergedError, ResetError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.finite import are_finite, expect_finite, not_finite
-from fragprune_plugins.learning.pressure import (
+from fragprune_plugins.learning.plain import numbers_of, put
+from fragprune_plugins.learning.pressure import Observation, StepViews
+from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
+from fragprune_plugins.learning.targets import (
     CALIBRATE_AT,
     CALIBRATION_VIEWS,
-    CLOCKED_AT,
     FEWEST,
-    TARGET_TOLERANCE,
-    Observation,
-    Ratios,
-    StepViews,
-    calibrate,
-    calibrate_measured,
-    numbers_of,
+    TOLERANCE,
+    Target,
 )
-from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
@@ -55,16 +50,13 @@ log = logging.getLogger("fragprune")
 RESET, MOSTLY = 0.0101, 0.9
 """Opacity that a host's reset leaves at most, and the share of Gaussians that have no more then."""
 
-LOOK_EVERY = 10
-"""Steps from one look at predicted frame times to the next."""
-
 CURVE_POINTS = 100
 """Thresholds' median, a sort of all rows, is taken this often in a run."""
 
 SKIPS_MOST = 100
 """Steps with gradients that are not finite which a run leaves out at most."""
 
-_COUNTED = ("steps", "taken", "skipped", "_open", "_held", "_met", "_seen", "_timed", "_median")
+_COUNTED = ("steps", "taken", "skipped", "_open", "_held", "_median")
 
 View = TypeVar("View")
 
@@ -75,19 +67,6 @@ _Picture = tuple[Hashable, int]
 """A view, and the part of it."""
 
 
-def _put(thing: object, values: Mapping[str, Any]) -> None:
-    """Set attributes of an object; raises ValueError if one is of another kind than it was."""
-    for name, value in values.items():
-        was = vars(thing).get(name, "none")
-        if isinstance(was, int):  # a count, or a bool
-            fits = type(value) is type(was) and value >= 0
-        else:
-            fits = isinstance(value, list if isinstance(was, list) else int | float | None)
-        if isinstance(was, str) or not fits:
-            raise ValueError(f"{name}: {value!r:.40}")
-        setattr(thing, name, value)
-
-
 def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
     """The store's own, none while it is neutral."""
     return None if store.neutral else store.values
@@ -96,20 +75,6 @@ def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
     """Views at even distances, so many at most, from the first on."""
     return views[:: max(1, -(-len(views) // most))]
-
-
-@dataclass(frozen=True)
-class FrameClock:
-    """What a driver knows about frame times; a target time needs one.
-
-    Attributes:
-        predict: the time of a frame that was drawn, in any unit.
-        measure: draws views as the model came in and as it is now, without gradients, and returns
-            the ratio of their times.
-    """
-
-    predict: Callable[[RasterOutputs], float]
-    measure: Callable[[Sequence[Any]], float]
 
 
 @dataclass(frozen=True)
@@ -150,12 +115,12 @@ class Stage2:
         views: by view, a call that draws it again and ends in ``drew``; a target is met on these.
         watch: called after every step.
         parameters: gives by name the tensors that the driver trains; they are checked to be finite.
-        clock: of frames, for a target time.
+        target: what thresholds are held to; that of the settings' goal when None.
         everywhere: gives, from the rows of these Gaussians, those of the whole population, if this
             is a part of one.
 
     Raises:
-        UsageError: a target time without a clock.
+        UsageError: a training alone cannot meet the goal.
     """
 
     def __init__(
@@ -168,17 +133,10 @@ class Stage2:
         views: Mapping[Any, Callable[[], object]] = MappingProxyType({}),
         watch: Callable[[StepStats], None] | None = None,
         parameters: Callable[[], Mapping[str, Tensor]] = dict,
-        clock: FrameClock | None = None,
+        target: Target | None = None,
         everywhere: Callable[[Tensor], Tensor] = lambda rows: rows,
     ) -> None:
-        if settings.target_time is not None and clock is None:
-            raise UsageError(
-                "target time",
-                "a training that cannot time single frames",
-                "a target in fragments",
-                "Use --target-speedup here; --target-time works with fragprune finetune.",
-            )
-        self._clock = clock if settings.target_time is not None else None
+        self.target = settings.goal.target() if target is None else target
         self.store, self.settings = store, settings
         self.schedule = schedule or Schedule(settings)
         self.pressure = self.schedule.make_pressure()
@@ -192,10 +150,7 @@ class Stage2:
         self.skipped = 0  # steps whose gradients were not finite
         self._open = False  # the warm-up is over
         self._held = False  # thresholds have met their target and stay
-        self._met: float | None = None  # the ratio they met it with
-        self._seen = Ratios()  # by the clock, so far
-        self._timed = 0  # of CLOCKED_AT
-        # by picture: fragments per pixel, and last what a target counts: these, or a predicted time
+        # by picture: fragments per pixel, and last what a target counts: these, or a cost
         self._before: dict[_Picture, Tensor] = {}
         self._after: dict[_Picture, Tensor] = {}
         self._visited = (0, 0)  # how many of these there were before this step
@@ -207,12 +162,12 @@ class Stage2:
     def learning(self) -> bool:
         """Whether the pressure acts in this step, and thresholds move if they are learned."""
         plan = self.plan
-        return plan is not None and plan.learn and self.settings.truncate and not self._held
+        return plan is not None and plan.learn and self.settings.goal.presses and not self._held
 
     @property
     def warming_up(self) -> bool:
         """Whether steps were made, and thresholds that will learn have not opened yet."""
-        return self.settings.opens and self.steps > 0 and not self._open
+        return self.settings.goal.learns and self.steps > 0 and not self._open
 
     @property
     def viewed(self) -> bool:
@@ -240,7 +195,7 @@ class Stage2:
         self._open |= self.plan.learn
         if self.plan.counted and self.settings.stop is not None:
             self.store.stop = self.settings.stop
-        if self.plan.learn and self.settings.opens:
+        if self.plan.learn and self.settings.goal.learns:
             if not self.store.opened:
                 known = opacities()
                 self._expect_no_reset(known)
@@ -274,7 +229,7 @@ class Stage2:
 
         The driver draws it with the store's ``stop``, too.
         """
-        if not self.settings.opens:
+        if not self.settings.goal.learns:
             return None
         values = self._truncate(inputs, self.store)
         if values is None or self.plan is None or self.learning:
@@ -402,7 +357,7 @@ class Stage2:
             DivergedError: the step left NaN or infinity.
         """
         self.taken = self.steps
-        if self.learning and self.settings.opens:
+        if self.learning and self.settings.goal.learns:
             assert self.plan is not None
             self.store.step(self.plan.threshold_lr)
         if not are_finite([*self.parameters().values(), self.store.logits]):
@@ -424,7 +379,8 @@ class Stage2:
             loss=views.loss,
         )
         if self.learning:
-            ratio = self._predicted() if self._clock else None
+            target = self.target
+            ratio = None if target is None else target.steers_by(self.steps, self._ratio_of_step)
             self.pressure.observe(
                 Observation(plan.progress, views.pressed, views.untruncated, views.loss, ratio)
             )
@@ -440,20 +396,19 @@ class Stage2:
     def progress(self) -> Progress:
         """The state so far."""
         before, after = _mean(self._before), _mean(self._after)
-        faster, speedup = (self._met, None) if self._clock else (None, self._met)
-        if speedup is None and before is not None and after:
-            speedup = before / after
-        reached, target = None, self.settings.target
+        figures = {"speedup": before / after if before is not None and after else None}
+        reached, target = None, self.target
         if target is not None:
-            ratio = faster if self._clock else speedup
-            reached = ratio is not None and abs(target / ratio - 1) <= TARGET_TOLERANCE
+            figures |= {} if target.met is None else {target.figure: target.met}
+            ratio = figures.get(target.figure)
+            reached = ratio is not None and abs(target.ratio / ratio - 1) <= TOLERANCE
         return Progress(
             steps=self.taken,
             gaussians=len(self.store),
             fragments_before=before,
             fragments_after=after,
-            speedup=speedup,
-            faster=faster,
+            speedup=figures["speedup"],
+            faster=figures.get("faster"),
             target_reached=reached,
             pressure=self.pressure.value,
             skipped=self.skipped,
@@ -482,6 +437,7 @@ class Stage2:
                 tensors[name] = torch.stack(list(known.values()))
         plain |= {name: getattr(self, name) for name in _COUNTED}
         plain |= {"expected": self._views.expected, "pressure": numbers_of(self.pressure)}
+        plain["target"] = self.target and self.target.state()
         return tensors, plain
 
     def _ordered(self, order: Iterable[Hashable] | None) -> list[Hashable]:
@@ -506,29 +462,26 @@ class Stage2:
         for name, figures in (("before", self._before), ("after", self._after)):
             for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):
                 figures[views[view], part] = figure
-        _put(self, {name: plain[name] for name in _COUNTED})
-        self._seen = Ratios(self._seen)
-        _put(self._views, {"expected": plain["expected"]})
-        _put(self.pressure, plain["pressure"])
+        put(self, {name: plain[name] for name in _COUNTED})
+        if self.target is not None:
+            self.target.load_state(plain["target"])
+        put(self._views, {"expected": plain["expected"]})
+        put(self.pressure, plain["pressure"])
 
     def _count(self, outputs: RasterOutputs) -> Tensor:
         fragments = outputs.fragments_per_pixel.detach().reshape(1)
-        if self._clock is None:
-            return fragments
-        return torch.cat([fragments, fragments.new_tensor([self._clock.predict(outputs)])])
+        cost = None if self.target is None else self.target.cost(outputs)
+        return fragments if cost is None else torch.cat([fragments, fragments.new_tensor([cost])])
 
     @torch.no_grad()
-    def _predicted(self) -> float:
-        """The ratio of the step's frames by prices and what was timed so far; NaN in most steps.
+    def _ratio_of_step(self) -> float:
+        """The ratio of what the step's views cost, drawn once more.
 
-        They are drawn once more: a draw with gradients of thresholds evaluates rims as well.
+        A draw with gradients of thresholds evaluates rims as well.
         """
-        if self.steps % LOOK_EVERY:
-            return math.nan
         for view in dict.fromkeys(view for view, _ in self._pictures):
             self._again[view]()
-        slope = self._seen.slope(self.settings.target_time or 1.0)
-        return math.exp(slope * math.log(max(self._ratio(self._pictures), 1e-9)))
+        return self._ratio(self._pictures)
 
     def _ratio(self, pictures: Iterable[_Picture]) -> float:
         """Before over after of what a target counts, summed over pictures."""
@@ -540,17 +493,14 @@ class Stage2:
         return before / max(after, 1e-9)
 
     def _meet_target(self, progress: float) -> None:
-        """Late in the run, and again before its last step, shift all thresholds onto the target.
-
-        Before that the clock is asked from time to time, to steer by.
-        """
-        target = self.settings.target
+        """Late in the run, and again before its last step, shift all thresholds onto the target."""
+        target = self.target
         visited = dict.fromkeys(view for view, _ in self._before)
         views = [view for view in visited if view in self._again]
         due = progress >= 1.0 or (progress >= CALIBRATE_AT and not self._held)
-        passed = sum(progress >= share for share in CLOCKED_AT)
-        timed = self._clock is not None and not self._held and self._timed < passed
-        if target is None or not (due or timed) or not views:
+        if target is None or not views:
+            return
+        if not due and (self._held or not target.wants_look(progress)):
             return
         views = list(evenly(views, CALIBRATION_VIEWS))
         pictures = [picture for picture in self._before if picture[0] in set(views)]
@@ -565,18 +515,11 @@ class Stage2:
             )
             return self._ratio(pictures) if before < FEWEST * after else math.inf
 
-        if self._clock is not None and not due:
-            self._timed = passed
-            self._seen.add(ratio(), self._clock.measure(views))
-            return
-        if self._clock is None:
-            self._met = calibrate(self.store, ratio, target)
+        if due:
+            target.meet(self.store, ratio, views)
+            self._held = True
         else:
-            measure = self._clock.measure
-            self._met = calibrate_measured(
-                self.store, ratio, lambda: measure(views), target, seen=self._seen
-            )
-        self._held = True
+            target.look(progress, ratio, views)
 
 
 def _mean(figures: Mapping[_Picture, Tensor]) -> float | None:

@@ -2,8 +2,7 @@
 
 A plugin that fails never stops the others. A failure at import becomes a finding; a failure in a
 hook is an error that names the plugin. For that, pluggy collects and checks the hooks, and we call
-each implementation ourselves: pluggy's own call would not say whose it was. So wrappers are
-refused, and ``ask`` takes the first answer while ``tell`` calls all.
+each ourselves: pluggy's own call would not say whose it was. So wrappers are refused.
 
 Environment: ``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take comma-separated entry-point names.
 """

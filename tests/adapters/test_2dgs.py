@@ -20,6 +20,7 @@ from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.goals import Portable
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -190,7 +191,7 @@ def test_portable_is_refused(mini, photographs, trained, tmp_path):
     options = RunOptions(
         device="cpu",
         stage="finetune",
-        settings=Settings(iterations=8, portable=True),
+        settings=Settings(iterations=8, goal=Portable()),
         again=True,
     )
     with pytest.raises(InputError, match="surfels"):

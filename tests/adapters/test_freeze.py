@@ -7,6 +7,7 @@ import torch
 from miniatures.vanilla_3dgs import running, tensors
 
 from fragprune_plugins.injection.stepping import asking_for_no_gradient
+from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.invariants.case import FixedThresholds
 
@@ -103,7 +104,7 @@ def test_thresholds_step_once_a_counted_step_however_often_the_hosts_optimizer_d
 
 
 def test_the_control_trains_the_same_without_thresholds():
-    with running(Settings(iterations=9, truncate=False, train="opacity")) as host:
+    with running(Settings(iterations=9, goal=Control(), train="opacity")) as host:
         model, camera = host.model(20), host.camera()
         before = tensors(model)
         for iteration in (1, 2, 3):

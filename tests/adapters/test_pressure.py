@@ -10,6 +10,7 @@ from miniatures.vanilla_3dgs import joint, running
 
 from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
 from fragprune_plugins.learning.area import area_per_pixel
+from fragprune_plugins.learning.goals import Fewer, Portable, Pressure
 from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE, MOST_PRESSURE
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -27,7 +28,9 @@ class Notes:
 @pytest.mark.parametrize("pressure", [0.0, 1e-4, 0.02])
 def test_gradients_are_those_of_loss_plus_pressure_times_fragments(pressure):
     notes = Notes()
-    with joint(Settings(iterations=9, pressure=pressure, train="opacity"), plugins=[notes]) as host:
+    with joint(
+        Settings(iterations=9, goal=Pressure(pressure), train="opacity"), plugins=[notes]
+    ) as host:
         model, camera = host.model(40), host.camera()
         model.update_learning_rate(1)
         store = host.store(model)
@@ -52,7 +55,7 @@ def test_gradients_are_those_of_loss_plus_pressure_times_fragments(pressure):
 
 def test_portable_gradients_are_those_of_loss_plus_pressure_times_area():
     pressure, seen = 0.02, []
-    with joint(Settings(iterations=9, pressure=pressure, portable=True)) as host:
+    with joint(Settings(iterations=9, goal=Portable(pressure))) as host:
         model, camera = host.model(40), host.camera()
         model.update_learning_rate(1)
         engine = host.engine(torch.device("cpu"))
@@ -83,7 +86,7 @@ def test_portable_gradients_are_those_of_loss_plus_pressure_times_area():
 def test_a_portable_host_covers_less_and_its_thresholds_stay_neutral():
     covered = []
     for pressure in (0.0, 0.02):
-        with running(Settings(iterations=30, pressure=pressure, portable=True)) as host:
+        with running(Settings(iterations=30, goal=Portable(pressure))) as host:
             model, camera = host.model(40), host.camera()
             for iteration in range(1, 31):
                 host.step(model, camera, iteration)
@@ -94,7 +97,7 @@ def test_a_portable_host_covers_less_and_its_thresholds_stay_neutral():
 
 
 def test_evaluation_renders_feel_no_pressure_and_count_for_nothing():
-    with joint(Settings(iterations=9, pressure=0.1, train="opacity")) as host:
+    with joint(Settings(iterations=9, goal=Pressure(0.1), train="opacity")) as host:
         model, camera, other = host.model(), host.camera(), host.camera(side=0.4)
         host.step(model, camera, 1)
         before = host.finish()
@@ -107,7 +110,7 @@ def test_more_pressure_means_fewer_fragments():
     drawn = []
     for pressure in (0.0, 0.01):
         with running(
-            Settings(iterations=30, pressure=pressure, threshold_lr=0.3, train="opacity")
+            Settings(iterations=30, goal=Pressure(pressure), threshold_lr=0.3, train="opacity")
         ) as host:
             model, camera = host.model(40), host.camera()
             for iteration in range(1, 31):
@@ -141,7 +144,7 @@ class EnlargingHost(Vanilla3DGS):
 @pytest.mark.parametrize("adapter", [Vanilla3DGS(), EnlargingHost()], ids=["one", "three"])
 def test_a_target_is_met_over_all_pictures_of_all_views(adapter):
     settings = Settings(
-        iterations=12, target_speedup=1.6, threshold_lr=0.3, opacity_lr=1e-6, train="opacity"
+        iterations=12, goal=Fewer(1.6), threshold_lr=0.3, opacity_lr=1e-6, train="opacity"
     )
     with running(settings, adapter=adapter) as host:
         model, cameras = host.model(40), [host.camera(), host.camera(side=0.5)]
@@ -182,7 +185,7 @@ def gradients(host, model, cameras, iteration):
 
 
 def test_a_step_of_several_views_feels_the_mean_of_their_pressures():
-    with joint(Settings(iterations=9, pressure=0.02, train="opacity")) as host:
+    with joint(Settings(iterations=9, goal=Pressure(0.02), train="opacity")) as host:
         model = host.model(40)
         views = [host.camera(), host.camera(side=0.4), host.camera(side=-0.4)]
         alone = []

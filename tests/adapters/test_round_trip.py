@@ -11,6 +11,7 @@ from miniatures.vanilla_3dgs import joint
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
@@ -46,7 +47,10 @@ def recorded(monkeypatch, host):
 
 @pytest.mark.parametrize("truncate", [True, False], ids=["thresholds", "control"])
 def test_a_stop_is_drawn_with_and_saved_and_drawn_with_again(tmp_path, monkeypatch, truncate):
-    path, settings = tmp_path / "stopped.ply", Settings(iterations=3, stop=0.3, truncate=truncate)
+    path, settings = (
+        tmp_path / "stopped.ply",
+        Settings(iterations=3, stop=0.3, goal=Pressure() if truncate else Control()),
+    )
     with joint(settings) as host:
         seen = recorded(monkeypatch, host)
         model = trained(host)

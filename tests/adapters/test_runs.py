@@ -32,6 +32,7 @@ from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.injection.process import forget_modules, host_process
 from fragprune_plugins.injection.session import Session
+from fragprune_plugins.learning.goals import Portable
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import load_plugins
@@ -237,7 +238,7 @@ def test_train_then_finetune_then_render(photographs, tmp_path):
     assert truncated != [p.read_bytes() for p in sorted(renders.iterdir())]
 
 
-PORTABLE = replace(OPTIONS, stage="finetune", settings=Settings(iterations=8, portable=True))
+PORTABLE = replace(OPTIONS, stage="finetune", settings=Settings(iterations=8, goal=Portable()))
 
 
 def test_a_portable_run_moves_shapes_and_leaves_thresholds_neutral(photographs, trained):
@@ -247,7 +248,7 @@ def test_a_portable_run_moves_shapes_and_leaves_thresholds_neutral(photographs, 
     assert all(c["pressure"] > 0 for c in summary.curves[1:])
     store, info = sidecar.load(summary.model_after)
     assert store.neutral
-    assert info.settings["portable"]
+    assert info.settings["goal"] == "portable"
 
 
 @pytest.mark.usefixtures("ctrl_c")

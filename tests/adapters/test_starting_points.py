@@ -15,12 +15,13 @@ from miniatures.vanilla_3dgs import HOST
 from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.schedule import Settings
 
 SETTINGS = Settings(iterations=6, threshold_lr=0.3, train="opacity")
 OPTIONS = RunOptions(device="cpu", settings=SETTINGS)
 FINETUNE = replace(OPTIONS, stage="finetune")
-CONTROL = replace(FINETUNE, settings=replace(SETTINGS, truncate=False))
+CONTROL = replace(FINETUNE, settings=replace(SETTINGS, goal=Control()))
 
 
 def ply(iteration):

@@ -122,7 +122,7 @@ def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypat
     def never(*args, **kwargs):
         raise AssertionError("learned although nothing can be written")
 
-    monkeypatch.setattr("fragprune_plugins.workbench.finetune.loop.finetune", never)
+    monkeypatch.setattr("fragprune_plugins.workbench.finetune.api.finetune", never)
     inside = out / "below-a-file.ply"
     refused(("finetune", path, "--data", data, "--out", inside), "output", "cannot be written")
     folder = tmp_path / "folder.ply"

@@ -20,10 +20,11 @@ from PIL import Image
 
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
-from fragprune_plugins.workbench.finetune import loop, timing
+from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.finished import describe_untruncated
-from fragprune_plugins.workbench.prices import calibration
+from fragprune_plugins.workbench.prices import calibration, target
 from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 
 
@@ -215,6 +216,15 @@ def test_a_control_of_all_gaussians_is_none_for_fewer(scene, tmp_path):
     assert fewer["control"]["gaussians"] == 30
 
 
+def test_a_control_of_one_view_a_step_is_none_for_two(scene, tmp_path):
+    data, path, _ = scene
+    arguments = ("finetune", path, "--data", data, "--iters", 3)
+    run_json(*arguments, "--out", tmp_path / "control.ply", "--control")
+    two = run_json(*arguments, "--out", tmp_path / "two.ply", "--views-per-step", 2)
+    assert two["control"] is None
+    assert run_json(*arguments, "--out", tmp_path / "one.ply")["control"]
+
+
 def test_target_control_and_curves(scene, tmp_path):
     data, path, _ = scene
     out, curves = tmp_path / "out.ply", tmp_path / "curves.png"
@@ -234,9 +244,9 @@ def test_a_target_time_measures_prices_once_and_says_what_was_reached(scene, tmp
         outputs = work()
         return outputs, cost.ms(work_of(outputs))
 
-    for module in (calibration, timing):
+    for module in (calibration, target):
         monkeypatch.setattr(module, "timed", timed)
-    monkeypatch.setattr(timing, "_SECONDS", 0.0)
+    monkeypatch.setattr(target, "_SECONDS", 0.0)
     monkeypatch.setattr(calibration, "frames", lambda device: few_frames())
     monkeypatch.setenv("FRAGPRUNE_CACHE", str(tmp_path / "cache"))
     data, path, _ = scene
@@ -247,7 +257,7 @@ def test_a_target_time_measures_prices_once_and_says_what_was_reached(scene, tmp
     report = json.loads(first.stdout)
     assert report["target_reached"]
     assert report["faster"] == pytest.approx(1.2, rel=0.02)
-    assert report["settings"]["target_time"] == 1.2
+    assert report["settings"]["goal"] == "faster=1.2"
     (kept,) = (tmp_path / "cache").glob("prices-cpu-*.json")
     kept.write_text("{}")
     again = run(*arguments, "--target-time", 1.2, "--again")
@@ -268,7 +278,8 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(scene, tmp_p
     assert found["loss"] == pytest.approx(
         report["control"]["psnr"] - report["after"]["psnr"], abs=1e-3
     )
-    assert report["settings"]["pressure"] in (None, pytest.approx(found["pressure"]))
+    goal = parse_goal(report["settings"]["goal"])
+    assert goal.weight in (None, pytest.approx(found["pressure"]))
     assert read_ply(out).falloff is not None
     text = run("finetune", path, *words).stdout
     assert "Loss against the control" in text

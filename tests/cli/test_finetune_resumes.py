@@ -87,9 +87,7 @@ def test_a_finished_command_says_so_and_does_nothing(scene, tmp_path, monkeypatc
     out = tmp_path / "out.ply"
     first = run_json(*words(scene, out))
     with monkeypatch.context() as patch:
-        patch.setattr(
-            "fragprune_plugins.workbench.finetune.loop.finetune", None
-        )  # cannot be called
+        patch.setattr("fragprune_plugins.workbench.finetune.api.finetune", None)  # cannot be called
         again = run_json(*words(scene, out))
         assert again == first | {"already_finished": True}
         text = run(*words(scene, out, "--curves", tmp_path / "curves.png"))
@@ -129,7 +127,7 @@ def test_another_command_is_refused_while_one_is_unfinished(scene, tmp_path):
     refused = run(*other)
     assert refused.exit_code == 1
     assert "[checkpoint]" in refused.stderr
-    assert "with other pressure" in refused.stderr
+    assert "with other goal" in refused.stderr
     assert run_json(*other, "--again")["resumed_at"] == 0
 
 

@@ -1,5 +1,7 @@
 """``run`` and ``finetune`` understand the options of learning alike."""
 
+from itertools import combinations
+
 import click
 import pytest
 from cli.commands import run
@@ -11,36 +13,43 @@ HOST = ("--", "train.py")
 COMMANDS = {"run": HOST, "finetune": (__file__, "--data", "scene", "--out", "out.ply")}
 
 
+GOALS = {
+    "--control": (),
+    "--portable": (),
+    "--pressure": (1e-4,),
+    "--target-speedup": (2,),
+    "--target-time": (2,),
+    "--max-drop": (0.1,),
+}
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [p for p in combinations(GOALS, 2) if p != ("--portable", "--pressure")]
+)
+def test_two_goals_are_usage(one, other):
+    words = (other, *GOALS[other], one, *GOALS[one])
+    result = run("finetune", *words, *COMMANDS["finetune"])
+    assert result.exit_code == 2
+    assert f"{one} with {other}; expected one goal" in result.stderr
+
+
 @pytest.mark.parametrize("command", COMMANDS)
+def test_both_take_their_goal_and_length_alike(command):
+    for words in (("--quick", "--iters", 10), ("--control", "--target-speedup", 2)):
+        result = run(command, *words, *COMMANDS[command])
+        assert result.exit_code == 2
+        assert f"{words[0]} with {words[1]}" in result.stderr
+
+
 @pytest.mark.parametrize(
     "options",
     [
-        ("--quick", "--iters", 10),
-        ("--pressure", 1e-4, "--target-speedup", 2),
-        ("--control", "--pressure", 1e-4),
-        ("--control", "--target-speedup", 2),
-        ("--pressure", 1e-4, "--target-time", 2),
-        ("--target-speedup", 2, "--target-time", 2),
-        ("--control", "--target-time", 2),
-        ("--max-drop", 0.1, "--pressure", 1e-4),
-        ("--max-drop", 0.1, "--target-speedup", 2),
-        ("--max-drop", 0.1, "--target-time", 2),
-        ("--max-drop", 0.1, "--control"),
+        *(("--iters", 0), ("--pressure", 5), ("--target-speedup", 1), ("--target-time", 21)),
+        ("--stop", 3),
     ],
 )
-def test_contradictions_are_usage(command, options):
-    result = run(command, *options, *COMMANDS[command])
-    assert result.exit_code == 2
-    assert f"{options[0]} with" in result.stderr
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize(
-    "options",
-    [("--iters", 0), ("--pressure", 5), ("--target-speedup", 1), ("--target-time", 21)],
-)
-def test_values_out_of_range_are_usage(command, options):
-    result = run(command, *options, *COMMANDS[command])
+def test_values_out_of_range_are_usage(options):
+    result = run("finetune", *options, *COMMANDS["finetune"])
     assert result.exit_code == 2
     assert "[usage]" in result.stderr
     assert options[0] in result.stderr
@@ -50,7 +59,6 @@ def test_values_out_of_range_are_usage(command, options):
     ("options", "instead"),
     [
         (("--target-time", 1.5), "--target-speedup"),
-        (("--max-drop", 0.1), "fragprune finetune"),
         (("--from-iter", 5), "--stage finetune or joint"),
         (("--from-iter", 5, "--stage", "off"), "--stage finetune or joint"),
     ],
@@ -82,7 +90,7 @@ def test_a_bound_of_loss_needs_photographs():
 def test_more_views_a_step_see_as_many_views_in_fewer_steps(options, iterations, warmup):
     @click.command()
     @click.option("--views", "views_per_step", default=1)
-    @learning_options
+    @learning_options(every_goal=True)
     def show(settings, **_):
         click.echo(f"{settings.iterations} {settings.warmup} {settings.views_per_step}")
 

@@ -207,7 +207,7 @@ def test_a_folder_of_controls_alone_is_named_as_one(folder, tmp_path):
 def test_a_control_that_was_not_measured_is_named_as_one(tmp_path):
     seen = {"fragments_per_pixel_before": 30.0, "fragments_per_pixel_after": 29.0}
     data = {"adapter": "my-host", "iterations": 5, "training_views": seen, "photographs": None}
-    settings = {"settings": {"truncate": False}}
+    settings = {"settings": {"goal": "control"}}
     records.leave(tmp_path / "point_cloud.ply", "run", data | settings)
     line = run_json("report", tmp_path)["result"]
     assert line.endswith("frame times were not measured: a control, nothing is truncated.")

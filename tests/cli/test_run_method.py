@@ -34,7 +34,7 @@ if "stops" not in rest:
     for step in range(int(iterations)):
         stats = StepStats(step + 1, 9.0, 1e-3, 0.1)
         installed().tell(hookspecs.fragprune_step, stats=stats)
-    settings = {"truncate": "control" not in rest}
+    settings = {"goal": "control" if "control" in rest else "pressure"}
     summary = Summary("studio", "cpu", int(iterations), 7, 9.0, 3.0, None, settings)
     installed().tell(hookspecs.fragprune_finished, summary=summary)
 """
@@ -56,7 +56,7 @@ class Studio(HostAdapter):
     def rewritten(self, arguments, settings, *, stage, from_iter, engine, device):
         if stage == "joint":
             raise UsageError("--stage", stage, "auto", "Drop it.")
-        control = () if settings.truncate else ("control",)
+        control = () if settings.goal.presses else ("control",)
         return [
             f"{arguments[0]}-with-stage-two",
             str(settings.iterations),

@@ -1,10 +1,21 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.goals import (
+    AtMost,
+    Control,
+    Faster,
+    Fewer,
+    Portable,
+    Pressure,
+    parse_goal,
+)
 from fragprune_plugins.learning.pressure import (
     ELASTICITY,
     LEAST_PRESSURE,
@@ -56,29 +67,79 @@ def test_joint_learning_begins_at_its_step_and_leaves_the_opacity_rate_alone(ste
     "wrong",
     [
         {"iterations": 0},
-        {"pressure": -1e-9},
-        {"pressure": 1.0},
-        {"pressure": float("nan")},
-        {"target_speedup": 1.0},
-        {"target_speedup": 21.0},
-        {"target_speedup": float("nan")},
-        {"target_time": 1.0},
-        {"target_time": 21.0},
-        {"target_time": float("nan")},
+        {"iterations": 1.5},
+        {"iterations": True},
+        {"train": "everything"},
+        {"goal": 1e-4},
+        {"threshold_lr": -1},
+        {"opacity_lr": math.nan},
+        {"opacity_lr": "fast"},
+        {"itself": 1},
+        {"stop": 2.0},
+        {"seed": "x"},
+        {"views_per_step": 0},
+        {"nonfinite": "explode"},
+        {"goal": Portable(), "train": "opacity"},
+        {"goal": Portable(), "stop": 0.01},
     ],
 )
-def test_settings_out_of_range_are_usage_errors(wrong):
-    with pytest.raises(UsageError):
+def test_settings_out_of_range_are_usage_errors_that_name_them(wrong):
+    with pytest.raises(UsageError) as caught:
         Settings(**wrong)
+    assert len(wrong) > 1 or next(iter(wrong)).replace("_", " ") == caught.value.where
+
+
+@pytest.mark.parametrize(
+    ("kind", "number"),
+    [
+        *((Pressure, wrong) for wrong in (-1e-9, 1.0, math.nan, "x", True)),
+        *((Portable, wrong) for wrong in (-1e-9, 1.0, math.nan)),
+        *((Fewer, wrong) for wrong in (1.0, 21.0, math.nan, None)),
+        *((Faster, wrong) for wrong in (1.0, 21.0, math.nan)),
+        *((AtMost, wrong) for wrong in (-0.1, 10.1, math.nan)),
+    ],
+)
+def test_goals_out_of_range_are_usage_errors(kind, number):
+    with pytest.raises(UsageError):
+        kind(number)
+
+
+@pytest.mark.parametrize(
+    ("goal", "text"),
+    [
+        (Pressure(), "pressure"),
+        (Pressure(3e-4), "pressure=0.0003"),
+        (Fewer(2), "fewer=2"),
+        (Faster(1.4), "faster=1.4"),
+        (AtMost(0.05), "at-most=0.05"),
+        (Portable(1e-3), "portable=0.001"),
+        (Control(), "control"),
+    ],
+)
+def test_a_goal_is_its_name_and_its_number(goal, text):
+    assert str(goal) == text
+    assert parse_goal(text) == goal
+
+
+@pytest.mark.parametrize("text", ["", "fewer", "fewer=x", "control=2", "faster=0.5", "best"])
+def test_a_text_that_is_no_goal_is_a_usage_error(text):
+    with pytest.raises(UsageError):
+        parse_goal(text)
+
+
+@pytest.mark.parametrize("goal", [Faster(2), AtMost(0.1)])
+def test_what_a_training_alone_cannot_meet_is_refused_there(goal):
+    with pytest.raises(UsageError):
+        goal.target()
 
 
 def test_settings_choose_their_pressure():
     assert Settings(train="opacity").make_pressure() == ElasticPressure()
     assert Settings().make_pressure() == ElasticPressure(elasticity=2 * ELASTICITY)
     assert JointSchedule(Settings(), 1).make_pressure() == ElasticPressure()
-    assert Settings(pressure=3e-4).make_pressure() == FixedPressure(3e-4)
-    assert isinstance(Settings(target_speedup=1.8).make_pressure(), PressureController)
-    assert Settings(truncate=False, target_speedup=1.8).make_pressure() == FixedPressure(0.0)
+    assert Settings(goal=Pressure(3e-4)).make_pressure() == FixedPressure(3e-4)
+    assert isinstance(Settings(goal=Fewer(1.8)).make_pressure(), PressureController)
+    assert Settings(goal=Control()).make_pressure() == FixedPressure(0.0)
 
 
 def test_a_fixed_pressure_stays():

@@ -15,6 +15,7 @@ from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection import session as module
 from fragprune_plugins.injection.rasterizing import on_metric
 from fragprune_plugins.injection.session import active_session
+from fragprune_plugins.learning.goals import Control, Portable, Pressure
 from fragprune_plugins.learning.schedule import Settings
 
 
@@ -162,7 +163,9 @@ def test_every_engine_that_drew_is_named_once():
     ],
 )
 def test_steps_without_a_view_drawn_are_refused(steps, viewed, truncate, refused):
-    with running(Settings(iterations=5, truncate=truncate), learn=False) as host:
+    with running(
+        Settings(iterations=5, goal=Pressure() if truncate else Control()), learn=False
+    ) as host:
         host.session.expect_drawn()  # nothing learned yet
         host.session.last_state = SimpleNamespace(stage=None)
         host.session.expect_drawn()
@@ -209,7 +212,9 @@ def test_what_was_learned_is_saved_at_the_iteration_that_the_host_reached(steppe
 def test_a_model_is_saved_only_if_something_was_learned(
     monkeypatch, neutral, portable, steps, saves
 ):
-    with running(Settings(iterations=5, portable=portable), output=Path("out")) as host:
+    with running(
+        Settings(iterations=5, goal=Portable() if portable else Pressure()), output=Path("out")
+    ) as host:
         model = host.model()
         state = host.session.models[model]
         state.steps = steps

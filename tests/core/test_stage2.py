@@ -11,10 +11,12 @@ import pytest
 import torch
 
 from fragprune_plugins.errors import ResetError, UsageError
+from fragprune_plugins.learning.goals import Control, Faster, Fewer, Pressure
 from fragprune_plugins.learning.pressure import ELASTICITY
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
-from fragprune_plugins.learning.stage2 import FrameClock, Stage2, evenly
+from fragprune_plugins.learning.stage2 import Stage2, evenly
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.prices.target import FrameTarget
 
 OPACITIES = torch.linspace(0.2, 0.9, 5)
 
@@ -33,7 +35,7 @@ class Turns(Schedule):
 
 
 def stage(**options) -> Stage2:
-    settings = options.pop("settings", Settings(iterations=10, pressure=1e-2))
+    settings = options.pop("settings", Settings(iterations=10, goal=Pressure(1e-2)))
     return Stage2(ThresholdStore(5), settings, **options)
 
 
@@ -98,7 +100,7 @@ def test_a_view_drawn_without_gradients_feels_no_pressure_and_is_no_first_visit(
 
 
 def test_a_step_that_does_not_learn_truncates_and_leaves_no_gradient_for_the_next():
-    it = stage(settings=Settings(iterations=10, pressure=1e-2))
+    it = stage(settings=Settings(iterations=10, goal=Pressure(1e-2)))
     it.schedule = Turns(it.settings)
     step(it, "a")
     before = it.store.logits.detach().clone()
@@ -113,7 +115,9 @@ def test_a_step_that_does_not_learn_truncates_and_leaves_no_gradient_for_the_nex
 
 def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
     told = []
-    it = stage(settings=Settings(iterations=2001, train="all", pressure=1e-2), watch=told.append)
+    it = stage(
+        settings=Settings(iterations=2001, train="all", goal=Pressure(1e-2)), watch=told.append
+    )
     it.begin(lambda: OPACITIES)
     assert it.thresholds(None) is None
     assert it.drew("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None  # no pressure
@@ -143,7 +147,7 @@ def test_rates_follow_the_schedule():
 
 def test_a_control_draws_without_thresholds_and_still_counts():
     told = []
-    it = stage(settings=Settings(iterations=10, truncate=False), watch=told.append)
+    it = stage(settings=Settings(iterations=10, goal=Control()), watch=told.append)
     it.begin(lambda: OPACITIES)
     assert it.thresholds(None) is None
     assert it.drew("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None
@@ -165,7 +169,7 @@ def test_a_loss_without_a_view_is_nobodys():
 @pytest.mark.parametrize("target", [1.2, 1.8])
 def test_a_target_is_met_late_and_thresholds_then_stay(target):
     views: dict[str, object] = {}
-    it = stage(settings=Settings(iterations=20, target_speedup=target), views=views)
+    it = stage(settings=Settings(iterations=20, goal=Fewer(target)), views=views)
 
     def draw(view):
         # fragments fall from 20 to 0 per pixel as thresholds rise from 0 to 1
@@ -192,6 +196,13 @@ def fragments_of(outputs) -> float:
     return float(outputs.fragments_per_pixel.detach())
 
 
+def clocked(ratio, predict, measure):
+    """A target in frame times, with a clock of its own."""
+    target = FrameTarget(ratio, None)
+    target.cost, target.measure = predict, measure
+    return target
+
+
 @pytest.mark.parametrize("bias", [0.6, 1.0, 1.5])
 def test_a_target_time_is_met_by_the_clock_however_prices_err(bias):
     views: dict[str, object] = {}
@@ -205,10 +216,10 @@ def test_a_target_time_is_met_by_the_clock_however_prices_err(bias):
         now = 20 * (1 - it.store.values.detach().mean())
         return time_of(20.0) / time_of(float(now))
 
-    clock = FrameClock(
-        lambda outputs: 5 + bias * float(outputs.fragments_per_pixel.detach()), measure
+    clock = clocked(
+        2.0, lambda outputs: 5 + bias * float(outputs.fragments_per_pixel.detach()), measure
     )
-    it = stage(settings=Settings(iterations=20, target_time=2.0), views=views, clock=clock)
+    it = stage(settings=Settings(iterations=20, goal=Faster(2.0)), views=views, target=clock)
 
     def draw(view):
         outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
@@ -230,8 +241,8 @@ def test_a_target_time_is_met_by_the_clock_however_prices_err(bias):
 def test_what_the_clock_said_outlives_a_checkpoint():
     def make():
         views = {}
-        clock = FrameClock(lambda drawn: 5 + fragments_of(drawn), lambda shots: 1.5)
-        it = stage(settings=Settings(iterations=20, target_time=2.0), views=views, clock=clock)
+        clock = clocked(2.0, lambda drawn: 5 + fragments_of(drawn), lambda shots: 1.5)
+        it = stage(settings=Settings(iterations=20, goal=Faster(2.0)), views=views, target=clock)
 
         def draw(view):
             outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
@@ -249,18 +260,18 @@ def test_what_the_clock_said_outlives_a_checkpoint():
     tensors, plain = it.state_dict()
     again, _ = make()
     again.load_state_dict(tensors, json.loads(json.dumps(plain)))
-    assert again._seen.slope(2.0) == it._seen.slope(2.0) != 1.0
-    assert again._timed == it._timed == 2
+    assert again.target.seen.slope(2.0) == it.target.seen.slope(2.0) != 1.0
+    assert again.target.timed == it.target.timed == 2
     assert again.progress() == it.progress()
     assert again._ratio([("a", 0)]) == it._ratio([("a", 0)])
 
 
 def test_no_target_makes_fragments_fewer_than_twentyfold():
     views: dict[str, object] = {}
-    clock = FrameClock(
-        lambda outputs: 100 + float(outputs.fragments_per_pixel.detach()), lambda shots: 1.1
+    clock = clocked(
+        2.0, lambda outputs: 100 + float(outputs.fragments_per_pixel.detach()), lambda shots: 1.1
     )
-    it = stage(settings=Settings(iterations=4, target_time=2.0), views=views, clock=clock)
+    it = stage(settings=Settings(iterations=4, goal=Faster(2.0)), views=views, target=clock)
 
     def draw(view):
         outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
@@ -276,8 +287,8 @@ def test_no_target_makes_fragments_fewer_than_twentyfold():
 
 
 def test_a_driver_without_a_clock_refuses_a_target_time():
-    with pytest.raises(UsageError, match="--target-speedup"):
-        stage(settings=Settings(iterations=10, target_time=1.5))
+    with pytest.raises(UsageError, match="fewer fragments"):
+        stage(settings=Settings(iterations=10, goal=Faster(1.5)))
 
 
 def test_opacities_are_worked_out_only_while_there_are_rows_to_open():
@@ -324,7 +335,7 @@ def test_a_model_with_many_faint_gaussians_is_not_taken_for_a_reset_one():
 
 
 def test_a_control_may_begin_after_a_reset():
-    it = Stage2(ThresholdStore(100), Settings(iterations=10, truncate=False))
+    it = Stage2(ThresholdStore(100), Settings(iterations=10, goal=Control()))
     it.begin(lambda: reset(1.0))
 
 
@@ -348,7 +359,7 @@ def drawn_by_one(it: Stage2, names: str) -> list[list[float]]:
 
 @pytest.mark.parametrize("own", ["a", "b"])
 def test_what_other_processes_drew_counts_like_ones_own_and_in_the_same_order(own):
-    settings, told = Settings(iterations=10, pressure=1e-2, views_per_step=2), ([], [])
+    settings, told = Settings(iterations=10, goal=Pressure(1e-2), views_per_step=2), ([], [])
     whole, it = (
         stage(views={"a": None, "b": None}, settings=settings, watch=each.append) for each in told
     )

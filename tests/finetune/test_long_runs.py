@@ -10,8 +10,9 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 
 PAGE = 4096
 A_POINT = 600  # bytes of one point of the curves, which are kept on purpose
@@ -44,7 +45,7 @@ def learn_for(steps: int, folder: Path) -> tuple[list[StepStats], list[tuple[int
                 looks.append((resident(), tensors()))
             return super().at(step)
 
-    settings = Settings(iterations=steps, train="opacity", pressure=1e-3)
+    settings = Settings(iterations=steps, train="opacity", goal=Pressure(1e-3))
     result = finetune(
         tiny.perturbed(truth),
         tiny.dataset_in_memory(folder, truth),

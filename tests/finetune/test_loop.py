@@ -11,12 +11,14 @@ from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
-from fragprune_plugins.learning.pressure import calibrate, calibrate_measured
+from fragprune_plugins.learning.goals import Control, Faster, Fewer, Pressure
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.targets import calibrate
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.finetune import loop, timing
-from fragprune_plugins.workbench.finetune.loop import finetune, mean_fragments
+from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.finetune.api import finetune
+from fragprune_plugins.workbench.prices import target as frames
 from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
@@ -24,7 +26,7 @@ ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
 @pytest.fixture(scope="module")
 def default(model, dataset):
-    return finetune(model, dataset, Settings(iterations=60, pressure=1e-3))
+    return finetune(model, dataset, Settings(iterations=60, goal=Pressure(1e-3)))
 
 
 @pytest.mark.parametrize(
@@ -45,6 +47,17 @@ def test_what_is_not_named_stays_to_the_bit(model, dataset, train, moving):
         assert not getattr(result.model, name).requires_grad
 
 
+def mean_fragments(model, shots, engine):
+    """Drawn fragments per pixel, averaged over views."""
+    drawn = [
+        engine.rasterize(
+            RasterInputs(shot.view, model.splats(), planes=(), stop=model.stop), model.falloff
+        )
+        for shot in shots
+    ]
+    return sum(float(each.fragments_per_pixel) for each in drawn) / len(drawn)
+
+
 def test_loss_falls_and_fragments_fall(default, model, dataset):
     passed = len(dataset.train)  # views differ more than steps do
     first, last = (
@@ -63,12 +76,12 @@ def test_loss_falls_and_fragments_fall(default, model, dataset):
 
 
 def test_more_pressure_draws_less(default, model, dataset):
-    hard = finetune(model, dataset, Settings(iterations=60, pressure=5e-3))
+    hard = finetune(model, dataset, Settings(iterations=60, goal=Pressure(5e-3)))
     assert hard.progress.speedup > default.progress.speedup
 
 
 def test_control_learns_opacities_alone(model, dataset):
-    result = finetune(model, dataset, Settings(iterations=20, truncate=False))
+    result = finetune(model, dataset, Settings(iterations=20, goal=Control()))
     assert result.model.thresholds is None
     assert result.progress.speedup == pytest.approx(1, abs=0.05)  # opacities alone move
     assert not torch.equal(result.model.opacity, model.opacity)
@@ -79,12 +92,12 @@ def test_same_seed_same_result_and_global_streams_untouched(default, model, data
     torch.manual_seed(7)
     random.seed(7)
     states = torch.random.get_rng_state(), random.getstate()
-    again = finetune(model, dataset, Settings(iterations=60, pressure=1e-3))
+    again = finetune(model, dataset, Settings(iterations=60, goal=Pressure(1e-3)))
     assert torch.equal(states[0], torch.random.get_rng_state())
     assert states[1] == random.getstate()
     assert torch.equal(again.model.opacity, default.model.opacity)
     assert torch.equal(again.model.thresholds.logits, default.model.thresholds.logits)
-    other = finetune(model, dataset, Settings(iterations=60, pressure=1e-3, seed=1))
+    other = finetune(model, dataset, Settings(iterations=60, goal=Pressure(1e-3), seed=1))
     assert not torch.equal(other.model.opacity, default.model.opacity)
 
 
@@ -103,7 +116,10 @@ class Noting:
 
 @pytest.mark.parametrize("truncate", [True, False], ids=["thresholds", "control"])
 def test_a_stop_is_trained_with_from_the_first_step_and_kept(model, dataset, truncate):
-    engine, settings = Noting(), Settings(iterations=3, stop=0.2, truncate=truncate)
+    engine, settings = (
+        Noting(),
+        Settings(iterations=3, stop=0.2, goal=Pressure() if truncate else Control()),
+    )
     result = finetune(model, dataset, settings, engine=engine)
     before = [(None, False)]  # fragments before are those of the model as it came
     assert engine.seen == 3 * [(0.2, truncate), *before]
@@ -117,7 +133,7 @@ def test_a_stop_is_trained_with_from_the_first_step_and_kept(model, dataset, tru
 
 @pytest.mark.parametrize("target", [1.4, 2.0])
 def test_target_is_met_on_training_views(model, dataset, target):
-    result = finetune(model, dataset, Settings(iterations=80, target_speedup=target))
+    result = finetune(model, dataset, Settings(iterations=80, goal=Fewer(target)))
     engine = create_engine("auto")
     before = mean_fragments(model, dataset.train, engine)
     after = mean_fragments(result.model, dataset.train, engine)
@@ -156,7 +172,7 @@ def test_gradients_that_are_not_finite_stop_their_step_or_are_skipped(
     model, dataset, monkeypatch, caplog, bad, rows
 ):
     """1e25 is finite; its square, which Adam keeps, is not."""
-    draw = loop._Run._draw
+    draw = loop.Training._draw
 
     def drawing(run, shot):
         if run.done in (4, 5):
@@ -169,7 +185,7 @@ def test_gradients_that_are_not_finite_stop_their_step_or_are_skipped(
             )
         return draw(run, shot)
 
-    monkeypatch.setattr(loop._Run, "_draw", drawing)
+    monkeypatch.setattr(loop.Training, "_draw", drawing)
     with pytest.raises(DivergedError) as caught:
         finetune(model, dataset, Settings(iterations=9))
     assert caught.value.where.startswith("stage 2, step 5, view view0")
@@ -200,7 +216,7 @@ def test_going_on_from_a_result_leaves_that_result_alone(default, dataset):
 
 
 def test_a_control_has_no_thresholds_even_of_a_model_with_some(default, dataset):
-    result = finetune(default, dataset, Settings(iterations=1, truncate=False))
+    result = finetune(default, dataset, Settings(iterations=1, goal=Control()))
     assert result.model.thresholds is None
 
 
@@ -240,10 +256,12 @@ def test_a_target_time_is_met_where_frames_take_what_is_measured(
         outputs = work()
         return outputs, real.ms(work_of(outputs))
 
-    monkeypatch.setattr(timing, "timed", timed)
-    monkeypatch.setattr(timing, "_SECONDS", 0.0)
-    settings = Settings(iterations=60, target_time=target)
-    result = finetune(model, dataset, settings, cost=COST, engine="cpu")
+    monkeypatch.setattr(frames, "timed", timed)
+    monkeypatch.setattr(frames, "_SECONDS", 0.0)
+    settings = Settings(iterations=60, goal=Faster(target))
+    result = finetune(
+        model, dataset, settings, target=frames.FrameTarget(target, COST), engine="cpu"
+    )
     assert result.progress.target_reached
     assert result.progress.faster == pytest.approx(target, rel=0.02)
     engine, times = create_engine("cpu"), []
@@ -258,13 +276,9 @@ def test_a_target_time_is_met_where_frames_take_what_is_measured(
 
 def test_a_target_time_that_no_threshold_reaches_is_refused_before_any_work(model, dataset):
     fixed = Cost(COST.prices | {"frame": 1e9})
+    settings, target = Settings(iterations=9, goal=Faster(1.5)), frames.FrameTarget(1.5, fixed)
     with pytest.raises(UsageError, match=r"less than 1\.\d\dx"):
-        finetune(model, dataset, Settings(iterations=9, target_time=1.5), cost=fixed, engine="cpu")
-
-
-def test_a_target_time_needs_prices(model, dataset):
-    with pytest.raises(UsageError, match="time single frames"):
-        finetune(model, dataset, Settings(iterations=9, target_time=1.5))
+        finetune(model, dataset, settings, target=target, engine="cpu")
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -278,6 +292,6 @@ def test_calibration_meets_what_is_measured_through_a_prediction_that_errs(noise
     def measured():
         return predicted() ** 0.5 * (1 + noise * (2 * stream.random() - 1))
 
-    reached = calibrate_measured(store, predicted, measured, 1.6)
+    reached = frames.calibrate_measured(store, predicted, measured, 1.6)
     assert reached == pytest.approx(1.6, rel=0.01 + noise)
     assert predicted() ** 0.5 == pytest.approx(1.6, rel=0.01 + 2 * noise)

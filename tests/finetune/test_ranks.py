@@ -16,10 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.goals import Control, Faster, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench import ranks as module
+from fragprune_plugins.workbench.distributed import processes
 from fragprune_plugins.workbench.finetune import loop
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint, launched, speaks
 
@@ -28,9 +30,9 @@ STEPS = 12
 
 CASES = {
     "all": Settings(iterations=STEPS, views_per_step=2),
-    "target": Settings(iterations=STEPS, views_per_step=2, train="opacity", target_speedup=1.3),
-    "control": Settings(iterations=STEPS, views_per_step=2, truncate=False, seed=3),
-    "portable": Settings(iterations=STEPS, views_per_step=2, portable=True),
+    "target": Settings(iterations=STEPS, views_per_step=2, train="opacity", goal=Fewer(1.3)),
+    "control": Settings(iterations=STEPS, views_per_step=2, goal=Control(), seed=3),
+    "portable": Settings(iterations=STEPS, views_per_step=2, goal=Portable()),
     "two views each": Settings(iterations=STEPS, views_per_step=4, train="appearance"),
 }
 
@@ -93,7 +95,7 @@ def test_a_view_more_a_step_costs_no_step_more(model, dataset):
 
 def test_the_mean_of_one_view_twice_is_that_view(model, dataset):
     twice = replace(dataset, train=[dataset.train[0]])
-    one = Settings(iterations=STEPS, train="opacity", pressure=1e-3)
+    one = Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3))
     two = replace(one, views_per_step=2, threshold_lr=0.05 / 2**0.5, opacity_lr=0.01 / 2**0.5)
     alone, doubled = (learned(model, twice, each) for each in (one, two))
     for name in ("opacity", "logits"):
@@ -131,7 +133,7 @@ def test_a_process_that_does_not_see_the_checkpoint_is_noticed(model, dataset, t
 
 
 def test_replicas_that_part_are_noticed_and_named(model, dataset, monkeypatch):
-    monkeypatch.setattr(loop, "_COMPARE", 4)
+    monkeypatch.setattr(processes, "_COMPARE", 4)
 
     def work(ranks):
         real = torch.optim.Adam.step
@@ -143,7 +145,7 @@ def test_replicas_that_part_are_noticed_and_named(model, dataset, monkeypatch):
 
         torch.optim.Adam.step = step
         return learned(
-            model, dataset, Settings(iterations=9, views_per_step=2, truncate=False), ranks
+            model, dataset, Settings(iterations=9, views_per_step=2, goal=Control()), ranks
         )
 
     one, other = messages(learn(2, work))
@@ -183,7 +185,7 @@ def test_a_process_that_gives_no_answer_is_not_waited_for_without_end(model, dat
 @pytest.mark.parametrize(
     ("settings", "found"),
     [
-        (Settings(target_time=1.2, views_per_step=2), "disturb each other's measurements"),
+        (Settings(goal=Faster(1.2), views_per_step=2), "disturb each other's measurements"),
         (Settings(views_per_step=3), "3 for 2 processes"),
     ],
 )

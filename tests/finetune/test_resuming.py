@@ -11,11 +11,13 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
+from fragprune_plugins.learning.goals import Control, Faster, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import checkpoints as files
-from fragprune_plugins.workbench.finetune import loop, resuming, timing
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune import loop, resuming
+from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+from fragprune_plugins.workbench.prices import target as frames
 from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
@@ -72,10 +74,10 @@ def require_same(one, other):
     "settings",
     [
         Settings(iterations=STEPS),
-        Settings(iterations=STEPS, train="opacity", pressure=1e-3),
-        Settings(iterations=STEPS, train="appearance", target_speedup=1.5),
-        Settings(iterations=STEPS, truncate=False, seed=3),
-        Settings(iterations=STEPS, portable=True),
+        Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3)),
+        Settings(iterations=STEPS, train="appearance", goal=Fewer(1.5)),
+        Settings(iterations=STEPS, goal=Control(), seed=3),
+        Settings(iterations=STEPS, goal=Portable()),
     ],
     ids=["all", "opacity", "target", "control", "portable"],
 )
@@ -106,15 +108,19 @@ def test_a_target_time_that_was_cut_off_keeps_what_was_timed(
         outputs = work()
         return outputs, real.ms(work_of(outputs))
 
-    monkeypatch.setattr(timing, "timed", timed)
-    monkeypatch.setattr(timing, "_SECONDS", 0.0)
-    settings, path = Settings(iterations=STEPS, target_time=1.2), tmp_path / "unfinished"
-    whole = run(model, dataset, settings, cost=PRICES)
+    monkeypatch.setattr(frames, "timed", timed)
+    monkeypatch.setattr(frames, "_SECONDS", 0.0)
+    settings, path = Settings(iterations=STEPS, goal=Faster(1.2)), tmp_path / "unfinished"
+
+    def target(cost=PRICES):
+        return frames.FrameTarget(1.2, cost)
+
+    whole = run(model, dataset, settings, target=target())
     for cut in (5, 8):
-        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch, cost=PRICES)
+        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch, target=target())
     with pytest.raises(CheckpointError, match="with other prices;"):
-        run(model, dataset, settings, path, cost=real)
-    require_same(whole, run(model, dataset, settings, path, cost=PRICES))
+        run(model, dataset, settings, path, target=target(real))
+    require_same(whole, run(model, dataset, settings, path, target=target()))
 
 
 def test_what_a_caller_decides_is_part_of_the_configuration(model, dataset, tmp_path, monkeypatch):
@@ -123,11 +129,6 @@ def test_what_a_caller_decides_is_part_of_the_configuration(model, dataset, tmp_
     run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch, schedule=later)
     with pytest.raises(CheckpointError, match="with other schedule;"):
         run(model, dataset, settings, path)
-    one, other = (lambda o, tau=tau: torch.full_like(o, tau) for tau in (0.1, 0.2))
-    path.unlink()
-    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch, rule=one)
-    with pytest.raises(CheckpointError, match="with other rule;"):
-        run(model, dataset, settings, path, rule=other)
 
 
 def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkeypatch):
@@ -209,7 +210,7 @@ def test_a_signal_waits_for_the_end_of_its_step_and_is_resumed_from_there(
 
 @pytest.mark.parametrize(
     ("changed", "named"),
-    [({"pressure": 1e-3}, "pressure"), ({"seed": 1, "train": "opacity"}, "seed, train")],
+    [({"goal": Pressure(1e-3)}, "goal"), ({"seed": 1, "train": "opacity"}, "seed, train")],
 )
 def test_another_configuration_is_refused_and_named(
     model, dataset, tmp_path, monkeypatch, changed, named
@@ -226,7 +227,7 @@ def test_another_code_for_the_loss_is_refused(model, dataset, tmp_path, monkeypa
     """Its last bits differ."""
     settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
     run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch)
-    monkeypatch.setattr(loop, "code_for", lambda _: "another")
+    monkeypatch.setattr(resuming, "code_for", lambda _: "another")
     with pytest.raises(CheckpointError, match="with other loss; "):
         run(model, dataset, settings, path)
 
@@ -303,7 +304,7 @@ def spoil(path, how):
         "steps: -1",
         "_open: null",
         "_median: {}",
-        "_seen: 3",
+        "_held: 3",
         "pressure.observe: 3",
     ],
 )

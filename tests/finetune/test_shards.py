@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import DivergedError, InputError, UsageError
+from fragprune_plugins.learning.goals import Control, Fewer, Portable
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, Splats
 from fragprune_plugins.workbench.distributed.processes import Shards, part_of, whole_of
 from fragprune_plugins.workbench.distributed.sharded import ShardedEngine, reaching
 from fragprune_plugins.workbench.finetune import loop
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.ranks import Ranks
 
@@ -240,8 +241,8 @@ def test_what_is_sent_ends_where_fragments_and_rims_end():
 
 CASES = {
     "all": Settings(iterations=STEPS, views_per_step=2),
-    "target": Settings(iterations=STEPS, views_per_step=2, train="opacity", target_speedup=1.3),
-    "control": Settings(iterations=STEPS, views_per_step=2, truncate=False, seed=3),
+    "target": Settings(iterations=STEPS, views_per_step=2, train="opacity", goal=Fewer(1.3)),
+    "control": Settings(iterations=STEPS, views_per_step=2, goal=Control(), seed=3),
     "two views each": Settings(iterations=STEPS, views_per_step=4, train="appearance"),
 }
 
@@ -353,7 +354,7 @@ def test_opacities_low_in_one_part_alone_are_no_reset(model, dataset):
 def test_portable_is_refused(model, dataset):
     engine = ShardedEngine(create_engine("cpu"), Ranks())
     with pytest.raises(UsageError, match="portable, and Gaussians divided"):
-        finetune(model, dataset, Settings(portable=True), engine=engine)
+        finetune(model, dataset, Settings(goal=Portable()), engine=engine)
 
 
 def test_parts_hold_every_gaussian_once_and_make_the_whole_again(model):

@@ -17,10 +17,11 @@ from miniatures.vanilla_3dgs import running
 
 from fragprune_plugins.engines.losses import photometric_loss
 from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.types import View
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 STEPS = 24
@@ -57,12 +58,12 @@ class Halting(Schedule):
 
 CASES = {
     "default": Settings(iterations=STEPS, train="opacity"),
-    "pressure": Settings(iterations=STEPS, pressure=2e-3, train="opacity"),
-    "target": Settings(iterations=STEPS, target_speedup=1.5, train="opacity"),
+    "pressure": Settings(iterations=STEPS, goal=Pressure(2e-3), train="opacity"),
+    "target": Settings(iterations=STEPS, goal=Fewer(1.5), train="opacity"),
     "appearance": Settings(iterations=STEPS, train="appearance"),
-    "control": Settings(iterations=STEPS, truncate=False, train="opacity"),
-    "a schedule of one's own": Settings(iterations=STEPS, pressure=1e-3, train="appearance"),
-    "a plugin's thresholds": Settings(iterations=STEPS, pressure=1e-3, train="opacity"),
+    "control": Settings(iterations=STEPS, goal=Control(), train="opacity"),
+    "a schedule of one's own": Settings(iterations=STEPS, goal=Pressure(1e-3), train="appearance"),
+    "a plugin's thresholds": Settings(iterations=STEPS, goal=Pressure(1e-3), train="opacity"),
 }
 
 
@@ -125,7 +126,7 @@ def test_both_drivers_learn_the_same_to_the_bit(case, tmp_path, plug):
         assert torch.equal(learned.state_dict()["exp_avg_sq"], store.state_dict()["exp_avg_sq"])
         assert learned.steps == store.steps
     assert result.progress.steps == summary.steps == settings.iterations
-    if settings.truncate:
+    if settings.goal.presses:
         assert store.steps > 0
         assert [vars(SimpleNamespace(**point)) for point in curves] == [
             vars(point) for point in result.curves

@@ -8,15 +8,16 @@ from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 
 
 def test_learned_and_measured_as_on_the_cpu(engine: CudaEngine, tmp_path) -> None:
     truth = tiny.random_model()
     dataset = tiny.dataset_in_memory(tmp_path, truth)
-    settings = Settings(iterations=3, pressure=1e-3)
+    settings = Settings(iterations=3, goal=Pressure(1e-3))
     courses = []
     for each in (engine, create_engine("cpu")):
         result = finetune(tiny.perturbed(truth), dataset, settings, engine=each)

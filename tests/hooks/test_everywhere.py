@@ -14,12 +14,13 @@ import fragprune_plugins
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure, measure_all
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 
 CUT_ALL = 0.999999
 HOST = fragprune_plugins.__path__[0] + "/workbench/demo/host/train.py"
@@ -179,7 +180,7 @@ def test_finetune_learns_opacities_under_a_plugins_thresholds(model, dataset, pl
             return torch.full((len(store),), 0.5)
 
     plug(Half())
-    result = finetune(model, dataset, Settings(iterations=5, pressure=1e-3))
+    result = finetune(model, dataset, Settings(iterations=5, goal=Pressure(1e-3)))
     start = ThresholdStore(len(model))
     start.open(torch.sigmoid(model.opacity))
     assert torch.equal(result.model.thresholds.logits, start.logits)  # they decided nothing

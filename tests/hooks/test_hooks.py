@@ -14,6 +14,7 @@ from miniatures.vanilla_3dgs import HOST, joint, running
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
@@ -224,7 +225,7 @@ def test_hook_fragprune_population_changed():
 
 def test_hook_fragprune_step():
     recorder = Recorder()
-    with joint(Settings(iterations=20, pressure=3e-4), plugins=[recorder]) as host:
+    with joint(Settings(iterations=20, goal=Pressure(3e-4)), plugins=[recorder]) as host:
         model, camera = host.model(), host.camera()
         for iteration in range(1, 4):
             host.step(model, camera, iteration)

@@ -25,6 +25,7 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.workbench.commands import cli
 
@@ -288,7 +289,7 @@ def test_the_engine_works_out_gradients_of_what_trains_alone(session_on, train, 
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
     """The cameras see ever less, so that no one of them could speak for all."""
-    settings = Settings(iterations=8, threshold_lr=0.3, target_speedup=1.5, train="opacity")
+    settings = Settings(iterations=8, threshold_lr=0.3, goal=Fewer(1.5), train="opacity")
     with session_on(Gsplat(), settings=settings) as session:
         from gsplat import DefaultStrategy
 
@@ -325,7 +326,7 @@ def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
 
 def test_a_target_is_met_without_views_drawn_before_rows_changed(session_on):
     """Their calls hold tensors of rows that are no more."""
-    settings = Settings(iterations=8, target_speedup=1.5, train="opacity")
+    settings = Settings(iterations=8, goal=Fewer(1.5), train="opacity")
     schedule = JointSchedule(settings, 1)
     with session_on(Gsplat(), settings=settings, schedule=schedule, freeze=False) as session:
         from gsplat import DefaultStrategy

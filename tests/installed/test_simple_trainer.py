@@ -18,6 +18,7 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Settings
 
 SCRIPT = Path(__file__).parents[1] / "miniatures" / "simple_trainer.py"
@@ -36,7 +37,7 @@ def train(tmp_path, single_thread):
     """``train(*words, stage=...)``: the script's command."""
 
     def command(*words, strategy="default", settings=None, **options):
-        settings = settings or Settings(iterations=MORE, threshold_lr=0.5, pressure=1e-2)
+        settings = settings or Settings(iterations=MORE, threshold_lr=0.5, goal=Pressure(1e-2))
         line = [str(SCRIPT), strategy, "--data_dir", str(tmp_path)]
         line += ["--result_dir", str(tmp_path / "out"), "--max_steps", str(TOTAL), *map(str, words)]
         return run(line, RunOptions(device="cpu", settings=settings, **options))
@@ -94,7 +95,7 @@ def test_the_thresholds_of_another_checkpoint_are_refused(train, tmp_path):
 
 
 def test_the_control_has_a_folder_of_its_own(train, tmp_path):
-    settings = Settings(iterations=MORE, truncate=False)
+    settings = Settings(iterations=MORE, goal=Control())
     summary = train(settings=settings)
     assert summary.model_after == checkpoint(tmp_path / "out" / "control", TOTAL + MORE)
     assert sidecar.load(summary.model_after, summary.gaussians)[0].neutral

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.goals import AtMost, Control
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.finetune import searching
@@ -68,6 +69,11 @@ def test_a_loss_that_stays_below_the_bound_ends_with_ever_more():
 Result = make_dataclass("Result", ["settings", "progress", "interrupted", "terminated"])
 
 
+def searched(bound):
+    settings = Settings(goal=AtMost(bound))
+    return strongest(tiny.random_model(), SimpleNamespace(test=[]), settings, engine="cpu")
+
+
 @pytest.fixture
 def trained(monkeypatch):
     """Trainings that lose 1 dB at a pressure of 1e-3, in proportion, and are not made."""
@@ -75,12 +81,13 @@ def trained(monkeypatch):
 
     def finetune(model, dataset, settings, **options):
         seen.append(settings)
-        pressure = 2e-4 if settings.pressure is None else settings.pressure
+        goal = settings.goal
+        pressure = 0.0 if goal == Control() else 2e-4 if goal.weight is None else goal.weight
         progress = SimpleNamespace(pressure=pressure, fragments_before=40.0)
         return Result(settings, progress, False, False)
 
     def held_out(result, shots, engine):
-        lost = 1000 * result.progress.pressure if result.settings.truncate else 0.0
+        lost = 1000 * result.progress.pressure if result.settings.goal.presses else 0.0
         return [30.0 - lost, 32.0 - lost], 20.0 - 5 * lost
 
     monkeypatch.setattr(searching, "finetune", finetune)
@@ -91,12 +98,14 @@ def trained(monkeypatch):
 def test_the_strongest_within_the_bound_is_kept_and_the_control_trains_equally_long(trained):
     model, dataset = tiny.random_model(), SimpleNamespace(test=[])
     said: list[str] = []
-    found = strongest(model, dataset, Settings(iterations=77), 0.1, engine="cpu", say=said.append)
+    found = strongest(
+        model, dataset, Settings(iterations=77, goal=AtMost(0.1)), engine="cpu", say=said.append
+    )
     assert found.trial is not None
     assert 0.1 - TOLERANCE <= found.trial.loss <= 0.1
     assert found.result.progress.pressure == found.trial.pressure
     assert {settings.iterations for settings in trained} == {77}
-    assert [settings.truncate for settings in trained] == [False] + [True] * len(found.trials)
+    assert [settings.goal.presses for settings in trained] == [False] + [True] * len(found.trials)
     assert found.as_dict()["met"]
     assert len(said) == 1 + 2 * len(found.trials)
 
@@ -105,9 +114,11 @@ def test_an_unreachable_bound_keeps_the_least_loss_and_says_so(trained, monkeypa
     monkeypatch.setattr(
         searching,
         "_held_out",
-        lambda result, shots, engine: ([30.0 - result.settings.truncate], 20.0),
+        lambda result, shots, engine: ([30.0 - result.settings.goal.presses], 20.0),
     )
-    found = strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), 0.1, engine="cpu")
+    found = strongest(
+        tiny.random_model(), SimpleNamespace(test=[]), Settings(goal=AtMost(0.1)), engine="cpu"
+    )
     assert len(found.trials) == TRAININGS
     assert not found.as_dict()["met"]
     assert found.trial is not None
@@ -119,7 +130,7 @@ def test_a_loss_that_never_reaches_the_bound_ends_before_a_pressure_that_is_none
 ):
     monkeypatch.setattr(searching, "_held_out", lambda result, shots, engine: ([30.0], 20.0))
     monkeypatch.setattr(searching, "next_pressure", lambda trials, bound: 9 * trials[-1].pressure)
-    found = strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), 5.0, engine="cpu")
+    found = searched(5.0)
     assert found.as_dict()["met"]
     assert max(trial.pressure for trial in found.trials) <= 0.5
 
@@ -127,7 +138,7 @@ def test_a_loss_that_never_reaches_the_bound_ends_before_a_pressure_that_is_none
 @pytest.mark.parametrize("bound", [-0.1, 11.0, float("nan")])
 def test_a_bound_out_of_range_is_usage(bound):
     with pytest.raises(UsageError):
-        strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), bound, engine="cpu")
+        searched(bound)
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, Terminate])
@@ -142,7 +153,9 @@ def test_a_signal_while_views_are_measured_keeps_what_was_trained(trained, monke
         return held_out(*args)
 
     monkeypatch.setattr(searching, "_held_out", signalled)
-    found = strongest(tiny.random_model(), SimpleNamespace(test=[]), Settings(), 0.1, engine="cpu")
+    found = strongest(
+        tiny.random_model(), SimpleNamespace(test=[]), Settings(goal=AtMost(0.1)), engine="cpu"
+    )
     kept = measured[1 if at == 3 else at - 1]  # the best that was measured, else the last
     assert found.result.settings == kept.settings
     assert found.result.interrupted

@@ -21,8 +21,8 @@ BEFORE, AFTER = measured(39.1, 2.33, 30.09), measured(25.0, 2.07, 30.26)
 CONTROL = measured(38.9, 2.31, 30.29)
 
 
-def data(truncate=True):
-    return {"before": BEFORE, "after": AFTER, "settings": {"truncate": truncate}}
+def data(goal="pressure"):
+    return {"before": BEFORE, "after": AFTER, "settings": {"goal": goal}}
 
 
 def test_fragments_come_with_frame_times_and_psnr():
@@ -65,7 +65,7 @@ def test_the_difference_to_the_control_is_quoted():
     assert "no control" not in line
 
 
-TARGET = {"settings": {"truncate": True, "target_speedup": 8.0}, "target_reached": False}
+TARGET = {"settings": {"goal": "fewer=8.0"}, "target_reached": False}
 
 
 @pytest.mark.parametrize("control", [None, CONTROL])
@@ -94,7 +94,7 @@ def test_a_picture_that_is_worse_by_half_a_decibel_is_warned_of(after, control, 
 
 
 def test_a_control_says_that_it_is_one():
-    line = outcome("finetune", data(truncate=False), None)
+    line = outcome("finetune", data("control"), None)
     assert "a control, nothing is truncated" in line
     assert "pruning" not in line
 

@@ -23,6 +23,7 @@ from plyfile import PlyData
 
 import fragprune_plugins
 from fragprune_nerfstudio import METHOD
+from fragprune_nerfstudio.learning import Learning
 from fragprune_plugins.errors import AlignmentError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.session import active_session
@@ -77,7 +78,7 @@ def configured(methods, scene, out, **model):
         "warmup_length": 5,
         "refine_every": 10,
         "stop_screen_size_at": 0,
-        "fragprune": fragprune_plugins.Settings(iterations=STAGE2, pressure=3e-3),
+        "fragprune": Learning(iterations=STAGE2, goal="pressure=3e-3"),
     }
     for name, value in (given | model).items():
         setattr(config.pipeline.model, name, value)
@@ -219,9 +220,7 @@ def test_stage_two_can_begin_at_a_checkpoint_of_plain_splatfacto(run, methods, s
     plain = tmp_path / "plain" / checkpoint.name
     plain.parent.mkdir()
     torch.save(content, plain)
-    config = configured(
-        methods, scene, tmp_path, fragprune=fragprune_plugins.Settings(iterations=4)
-    )
+    config = configured(methods, scene, tmp_path, fragprune=Learning(iterations=4))
     config.load_dir, config.max_num_iterations = plain.parent, 4
     trainer = trained(config)
     model = trainer.pipeline.model
@@ -231,7 +230,7 @@ def test_stage_two_can_begin_at_a_checkpoint_of_plain_splatfacto(run, methods, s
 
 
 def test_the_control_is_as_long_and_has_no_thresholds(methods, scene, tmp_path):
-    settings = fragprune_plugins.Settings(iterations=5, truncate=False)
+    settings = Learning(iterations=5, goal="control")
     config = configured(methods, scene, tmp_path, fragprune=settings)
     config.max_num_iterations = 12
     trainer = trained(config)
@@ -243,7 +242,7 @@ def test_the_control_is_as_long_and_has_no_thresholds(methods, scene, tmp_path):
 @pytest.mark.parametrize("train", ["opacity", "appearance", "all"])
 def test_what_does_not_learn_stays_as_it_is_to_the_bit(run, methods, scene, tmp_path, train):
     _, checkpoint, *_ = run
-    settings = fragprune_plugins.Settings(iterations=3, train=train)
+    settings = Learning(iterations=3, train=train)
     config = configured(methods, scene, tmp_path, fragprune=settings)
     config.load_dir, config.max_num_iterations = checkpoint.parent, 3
     after = trained(config).pipeline.model.gauss_params
@@ -267,8 +266,7 @@ def test_what_does_not_learn_stays_as_it_is_to_the_bit(run, methods, scene, tmp_
     [
         (STAGE2, {}, "--max-num-iterations"),
         (50, {"fragprune_from": 50}, "--max-num-iterations"),
-        (50, {"fragprune": fragprune_plugins.Settings(target_time=1.5)}, "target-speedup"),
-        (50, {"fragprune": fragprune_plugins.Settings(itself=True)}, "target-speedup"),
+        (50, {"fragprune": Learning(goal="faster=1.5")}, "fewer fragments"),
     ],
 )
 def test_a_training_in_which_nothing_can_be_learned_is_refused(

@@ -21,6 +21,7 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.choosing import usage
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import command, saving, session
+from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 # -- what it costs whoever has no nerfstudio
@@ -72,7 +73,7 @@ OWN = "--pipeline.model.fragprune"
         ([], {"device": "cuda:1"}, {"--machine.device-type": "cuda"}),
         ([], {"device": "cpu", "engine": "cpu"}, {f"{OWN}-engine": "cpu"}),
         ([], {"settings": Settings(train="opacity")}, {f"{OWN}.train": "opacity"}),
-        ([], {"settings": Settings(truncate=False)}, {f"{OWN}.truncate": "False"}),
+        ([], {"settings": Settings(goal=Control())}, {f"{OWN}.goal": "control"}),
     ],
 )
 def test_a_run_of_splatfacto_is_one_of_ours_that_is_longer_by_stage_two(words, options, expected):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.goals import Control, Portable, Pressure
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.learning.schedule import Settings, Train
 from lab.rules import (
@@ -84,7 +85,7 @@ class Arm:
     @property
     def is_control(self) -> bool:
         """Whether the arm trains all Gaussians as they came, without truncation."""
-        return not self.settings.truncate and self.pruning is None and self.start is None
+        return self.settings.goal == Control() and self.pruning is None and self.start is None
 
 
 @dataclass(frozen=True)
@@ -112,14 +113,7 @@ class Experiment:
 
 
 def _control(settings: Settings) -> Settings:
-    return replace(
-        settings,
-        truncate=False,
-        portable=False,
-        pressure=None,
-        target_speedup=None,
-        target_time=None,
-    )
+    return replace(settings, goal=Control())
 
 
 def rules(iterations: int, train: Train | None = None) -> Experiment:
@@ -138,7 +132,7 @@ def rules(iterations: int, train: Train | None = None) -> Experiment:
             Arm("control", "", _control(settings)),
             Arm("learned", "default", settings),
             *(
-                Arm("learned", f"λ={pressure:g}", replace(settings, pressure=pressure))
+                Arm("learned", f"λ={pressure:g}", replace(settings, goal=Pressure(pressure)))
                 for pressure in _PRESSURES
             ),
             *(Arm("falloff", f"{tau:g}", settings, falloff_threshold(tau)) for tau in _FALLOFFS),
@@ -274,7 +268,7 @@ def portable(iterations: int, train: Train | None = None) -> Experiment:
         iterations: of every arm.
         train: must be None or "all": shapes have to move.
     """
-    settings = Settings(iterations=iterations, train=train or "all", portable=True)
+    settings = Settings(iterations=iterations, train=train or "all", goal=Portable())
     control = _control(settings)
     return Experiment(
         "portable",
@@ -283,7 +277,7 @@ def portable(iterations: int, train: Train | None = None) -> Experiment:
         (
             Arm("control", "", control),
             *(
-                Arm("portable", f"λ={pressure:g}", replace(settings, pressure=pressure))
+                Arm("portable", f"λ={pressure:g}", replace(settings, goal=Portable(pressure)))
                 for pressure in _AREA_PRESSURES
             ),
             *(Arm("shrunk", f"{factor:g}", control, start=shrunk(factor)) for factor in _SHRINKS),

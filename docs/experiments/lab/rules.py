@@ -9,12 +9,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
-if TYPE_CHECKING:
-    from torch import Tensor
+import torch
+from torch import Tensor
 
-    from fragprune_plugins.files.model import Model
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.goals import Pressure
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
+from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,41 @@ class Rule:
     def __call__(self, opacities: Tensor) -> Tensor:
         """The thresholds (N,) for activated opacities (N,)."""
         return self.thresholds(opacities)
+
+
+def finetune_by(
+    rule: Rule, model: Model, dataset: Dataset, settings: Settings, **options: Any
+) -> FinetuneResult:
+    """Train a model whose thresholds follow a rule, instead of learning.
+
+    In the steps that would learn, views are drawn with the rule's thresholds. They get no gradient,
+    and nothing presses on fragments.
+    """
+    plugins, name = installed(), f"rule {rule.name}"
+    plugins.register(_Ruled(rule), name)
+    try:
+        result = finetune(model, dataset, replace(settings, goal=Pressure(0.0)), **options)
+    finally:
+        plugins.remove(name)
+    if (store := result.model.thresholds) is not None:
+        _follow(rule, store, torch.sigmoid(result.model.opacity[:, 0]))
+    return result
+
+
+class _Ruled:
+    """A plugin that puts the rule's thresholds into the store, and draws with them."""
+
+    def __init__(self, rule: Rule) -> None:
+        self.rule = rule
+
+    @hookimpl
+    def fragprune_truncate(self, inputs: RasterInputs, store: ThresholdStore) -> Tensor:
+        _follow(self.rule, store, inputs.splats.opacities.detach())
+        return store.values.detach()
+
+
+def _follow(rule: Rule, store: ThresholdStore, opacities: Tensor) -> None:
+    store.place(torch.logit(rule(opacities)))
 
 
 def falloff_threshold(tau: float) -> Rule:

@@ -18,12 +18,13 @@ from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times, measure_all
-from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
+from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.pruning.scores import SCORES, best
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from lab.catalogue import Arm, Experiment, Pruning
 from lab.folder import Folder
+from lab.rules import finetune_by
 from lab.scene import describe_drawing, describe_photographs
 
 ENLARGED = 4
@@ -145,12 +146,12 @@ def _outcome(
     """What ``Outcome`` holds of an arm, as plain values."""
     settings = replace(arm.settings, seed=seed)
     begun = splat if arm.pruning is None else scores.prune(arm.pruning)
-    result = finetune(
+    train = finetune if arm.rule is None else partial(finetune_by, arm.rule)
+    result = train(
         begun if arm.start is None else arm.start(begun),
         dataset,
         settings,
         schedule=_schedule(arm, settings),
-        rule=arm.rule,
         engine=engine,
         progress=progress,
     )

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import Chance, Running, joint
 from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, open_all, require
@@ -57,7 +58,9 @@ def _no_trace(case: Case) -> None:
     results = []
     for cut in (True, False):
         fixed = FixedThresholds()
-        with joint(Settings(iterations=9, pressure=0.0), plugins=[fixed], **case.options()) as host:
+        with joint(
+            Settings(iterations=9, goal=Pressure(0.0)), plugins=[fixed], **case.options()
+        ) as host:
             model, camera = host.model(24), host.camera()
             open_all(host, model)
             # No pixel's falloff comes within the surrogate's reach of the highest threshold.

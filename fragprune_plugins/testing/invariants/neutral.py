@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.testing.host import Chance, Running, alone, joint, running, tensors
 from fragprune_plugins.testing.invariants.case import COUNT, Case, require
@@ -72,7 +73,7 @@ def _opened_changes_nothing(case: Case) -> tuple[int, int]:
     """Newly opened thresholds change no pixel, and gradients only by rounding."""
     pictures, gradients = [], []
     for opened in (False, True):
-        with joint(Settings(iterations=9, pressure=0.0), **case.options()) as host:
+        with joint(Settings(iterations=9, goal=Pressure(0.0)), **case.options()) as host:
             model, camera = host.model(40), host.camera()
             if opened:
                 host.store(model).open(host.adapter.opacities(model))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import FragpruneError
+from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.fresh import NotApplicable
 from fragprune_plugins.testing.host import Chance, joint
@@ -56,7 +57,7 @@ def _drawn_by(
 ) -> tuple[dict[str, Tensor], Tensor]:
     """One engine's picture and gradients under the mask, and drawn fragments (H, W)."""
     fixed = FixedThresholds()
-    settings = Settings(iterations=9, pressure=0.0)
+    settings = Settings(iterations=9, goal=Pressure(0.0))
     with joint(settings, plugins=[fixed], engine=engine, **case.options()) as host:
         model, camera = host.model(24, seed=seed), host.camera(33, 17)
         store = open_all(host, model)

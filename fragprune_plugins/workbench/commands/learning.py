@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import click
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.goals import (
+    AtMost,
+    Control,
+    Faster,
+    Fewer,
+    Goal,
+    Portable,
+    Pressure,
+)
 from fragprune_plugins.learning.pressure import (
     ELASTICITY,
     LEAST_PRESSURE,
@@ -53,21 +64,6 @@ _OPTIONS = (
         "divided by those drawn now, on the training views that calibration measures.",
     ),
     click.option(
-        "--target-time",
-        type=float,
-        help="Target for the ratio of frame times: the untruncated model's at the start, divided "
-        "by those now, on this machine, at the size of the training views. 1.5 means frames 1.5 "
-        "times as fast. finetune only.",
-    ),
-    click.option(
-        "--max-drop",
-        type=Number(0, 10),
-        metavar="DB",
-        help="Find the strongest truncation that loses at most DB dB of PSNR against the "
-        "control. Trains the control and up to 7 times more, and chooses the pressure on the "
-        "held-out views. finetune only.",
-    ),
-    click.option(
         "--portable",
         is_flag=True,
         help="For viewers that ignore thresholds: learn none, and press on the area that the "
@@ -97,82 +93,127 @@ _OPTIONS = (
     ),
 )
 
-_EXCLUDE = (
-    ("--quick", "--iters"),
-    ("--pressure", "--target-speedup"),
-    ("--pressure", "--target-time"),
-    ("--target-speedup", "--target-time"),
-    ("--max-drop", "--pressure"),
-    ("--max-drop", "--target-speedup"),
-    ("--max-drop", "--target-time"),
-    ("--max-drop", "--control"),
-    ("--control", "--pressure"),
-    ("--control", "--target-speedup"),
-    ("--control", "--target-time"),
-    ("--control", "--portable"),
-    ("--portable", "--target-time"),
-    ("--portable", "--max-drop"),
+_OF_FINETUNE = (
+    click.option(
+        "--target-time",
+        type=float,
+        help="Target for the ratio of frame times: the untruncated model's at the start, divided "
+        "by those now, on this machine, at the size of the training views. 1.5 means frames 1.5 "
+        "times as fast.",
+    ),
+    click.option(
+        "--max-drop",
+        type=Number(0, 10),
+        metavar="DB",
+        help="Find the strongest truncation that loses at most so much PSNR, in dB, against the "
+        "control. Trains the control and up to 7 times more, and chooses the pressure on the "
+        "held-out views.",
+    ),
 )
+"""Goals that need a model of before to time frames against, or several trainings."""
 
 
-def learning_options(function: Callable[..., Any]) -> Callable[..., Any]:
+def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add the options of learning to a command.
 
     The command gets their values, and its own ``seed``, ``itself`` and ``views_per_step`` if it has
-    them, as ``settings``; ``max_drop`` apart, because it is a bound for several trainings.
+    them, as ``settings``.
+
+    Args:
+        every_goal: offer also goals that a host's training cannot meet.
 
     Raises:
         UsageError: options contradict each other, or a value is out of range.
     """
 
-    @functools.wraps(function)
-    def with_settings(
-        *args: Any,
-        iters: int | None,
-        quick: bool,
-        train: Any,
-        pressure: float | None,
-        target_speedup: float | None,
-        target_time: float | None,
-        portable: bool,
-        stop: float | None,
-        control: bool,
-        nonfinite: Any,
-        **kwargs: Any,
-    ) -> Any:
-        asked = {
-            "--quick": quick,
-            "--iters": iters is not None,
-            "--pressure": pressure is not None,
-            "--target-speedup": target_speedup is not None,
-            "--target-time": target_time is not None,
-            "--max-drop": kwargs["max_drop"] is not None,
-            "--portable": portable,
-            "--control": control,
-        }
-        for one, other in _EXCLUDE:
-            if asked[one] and asked[other]:
-                raise UsageError("options", f"{one} with {other}", "one of the two", "Remove one.")
-        itself = kwargs.get("itself", False)
-        default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
-        views = kwargs.pop("views_per_step", 1)
-        settings = Settings(
-            iterations=steps_of(default, views) if iters is None else iters,
-            train=train,
-            pressure=pressure,
-            target_speedup=target_speedup,
-            target_time=target_time,
-            itself=itself,
-            portable=portable,
-            truncate=not control,
-            stop=stop,
-            seed=kwargs.get("seed", 0),
-            views_per_step=views,
-            nonfinite=nonfinite,
-        )
-        return function(*args, settings=settings, **kwargs)
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def with_settings(
+            *args: Any,
+            iters: int | None,
+            quick: bool,
+            train: Any,
+            pressure: float | None,
+            target_speedup: float | None,
+            portable: bool,
+            stop: float | None,
+            control: bool,
+            nonfinite: Any,
+            target_time: float | None = None,
+            max_drop: float | None = None,
+            **kwargs: Any,
+        ) -> Any:
+            if quick and iters is not None:
+                raise UsageError("options", "--quick with --iters", "one of the two", "Remove one.")
+            itself = kwargs.get("itself", False)
+            default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
+            views = kwargs.pop("views_per_step", 1)
+            with _spelled():
+                settings = Settings(
+                    iterations=steps_of(default, views) if iters is None else iters,
+                    train=train,
+                    goal=_goal(pressure, target_speedup, target_time, max_drop, portable, control),
+                    itself=itself,
+                    stop=stop,
+                    seed=kwargs.get("seed", 0),
+                    views_per_step=views,
+                    nonfinite=nonfinite,
+                )
+            return function(*args, settings=settings, **kwargs)
 
-    return functools.reduce(lambda f, option: option(f), reversed(_OPTIONS), with_settings)
+        options = _OPTIONS + _OF_FINETUNE if every_goal else _OPTIONS
+        return functools.reduce(lambda f, option: option(f), reversed(options), with_settings)
+
+    return decorate
+
+
+@contextlib.contextmanager
+def _spelled() -> Iterator[None]:
+    """Name the options whose values are refused."""
+    try:
+        yield
+    except UsageError as error:
+        where = _SPELLED.get(error.where, error.where)
+        raise UsageError(where, error.found, error.expected, error.remedy) from error
+
+
+_SPELLED = {
+    "iterations": "--iters",
+    "views per step": "--views-per-step",
+    "pressure": "--pressure",
+    "target speed-up": "--target-speedup",
+    "target time": "--target-time",
+    "largest loss": "--max-drop",
+    "stop": "--stop",
+}
+"""Options by the names that errors give them."""
+
+
+def _goal(
+    pressure: float | None,
+    target_speedup: float | None,
+    target_time: float | None,
+    max_drop: float | None,
+    portable: bool,
+    control: bool,
+) -> Goal:
+    """The one goal that options name; raises UsageError if they name two."""
+    spelled: dict[str, Callable[[], Goal] | None] = {
+        "--control": Control if control else None,
+        "--portable": partial(Portable, pressure) if portable else None,
+    }
+    numbers: tuple[tuple[str, Any, float | None], ...] = (
+        ("--pressure", Pressure, None if portable else pressure),
+        ("--target-speedup", Fewer, target_speedup),
+        ("--target-time", Faster, target_time),
+        ("--max-drop", AtMost, max_drop),
+    )
+    spelled |= {flag: None if n is None else partial(kind, n) for flag, kind, n in numbers}
+    asked = {flag: goal for flag, goal in spelled.items() if goal is not None}
+    if len(asked) > 1:
+        one, other, *_ = asked
+        raise UsageError("options", f"{one} with {other}", "one goal", "Remove one.")
+    return next(iter(asked.values()), Pressure)()
 
 
 def resuming_options(kept: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

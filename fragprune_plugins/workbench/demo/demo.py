@@ -15,12 +15,13 @@ from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.demo.folder import claiming, clear
 from fragprune_plugins.workbench.demo.page import write_page
 from fragprune_plugins.workbench.demo.scene import POINTS, VIEWS, WIDTH, make_scene
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
@@ -152,7 +153,7 @@ def run_demo(
 def _run_options(settings: DemoSettings) -> RunOptions:
 
     learning = Settings(
-        iterations=settings.finetune, pressure=settings.pressure, seed=settings.seed
+        iterations=settings.finetune, goal=Pressure(settings.pressure), seed=settings.seed
     )
     return RunOptions(settings=learning, engine=settings.engine, device=settings.device)
 
@@ -161,7 +162,7 @@ def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> Model:
 
     assert summary.model_before is not None  # the host saves at its last iteration
     model = models.load(summary.model_before, device=settings.device)
-    learning = Settings(iterations=settings.finetune, truncate=False, seed=settings.seed)
+    learning = Settings(iterations=settings.finetune, goal=Control(), seed=settings.seed)
     data = load_dataset(scene)
     return finetune(model, data, learning, engine=settings.engine, progress=True).model
 

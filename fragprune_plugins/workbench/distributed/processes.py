@@ -6,10 +6,11 @@ Gaussians, which the ``ShardedEngine`` brings to them, and tell each other figur
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,23 +18,90 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.goals import Faster
+from fragprune_plugins.learning.interruption import Waiting
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.finetune.alone import Alone
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint
+from fragprune_plugins.workbench.scenes.dataset import Shot
+
+if TYPE_CHECKING:
+    from fragprune_plugins.workbench.finetune.loop import Training
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_COMPARE = 100  # steps from one comparison of replicas to the next
 
 
-class Replicas:
-    """Processes that each hold the whole model; often there is one.
+class Replicas(Alone):
+    """Processes that each hold the whole model.
 
     Args:
         ranks: the processes.
     """
 
-    sharded = False
-
     def __init__(self, ranks: Ranks) -> None:
-        self.ranks = ranks
+        self.ranks, self.first, self.several = ranks, ranks.first, ranks.several
+        self._due = False  # it is time for a checkpoint, some process says
+
+    def expect_able(self, settings: Settings) -> None:
+        """Refuse views that cannot be divided, and times, which others would disturb."""
+        if self.several and isinstance(settings.goal, Faster):
+            raise UsageError(
+                "target time",
+                f"{self.ranks.size} processes, which would disturb each other's measurements",
+                "one process",
+                "Aim for fewer fragments, or start one process.",
+            )
+        if settings.views_per_step % self.ranks.size:
+            raise UsageError(
+                "views per step",
+                f"{settings.views_per_step} for {self.ranks.size} processes",
+                f"a multiple of {self.ranks.size}",
+                "Change --views-per-step.",
+            )
+
+    def agree(self, known: dict[str, Any]) -> None:
+        """See whether all were asked for the same."""
+        self.ranks.agree(known, "fine-tuning, before its first step")
+
+    def share(self, shots: Sequence[Shot]) -> Sequence[Shot]:
+        """Every so-manieth view."""
+        return self.ranks.share(shots)
+
+    @torch.no_grad()
+    def went_backward(self, training: Training, shots: Sequence[Shot], waiting: Waiting) -> None:
+        """Take over from all processes gradients and figures; and whether to end, or to keep."""
+        if not self.several:
+            return
+        stage, keeper = training.stage, training.keeper
+        leaves = [*training.parameters().values(), stage.store.logits]
+        due = keeper is not None and keeper.due(training.done + 1)
+        flags = [*(waiting.number == number for number in _SIGNALS), due]
+        rows = stage.figures()
+        table, (*signals, self._due) = self.exchange(leaves, rows, len(shots), flags)
+        if rows:
+            stage.share(shots, table)
+        came = [number for number, some in zip(_SIGNALS, signals, strict=True) if some]
+        self.may_end = bool(came)  # one that comes later waits for the next exchange
+        if came and not waiting.number:
+            signal.raise_signal(came[0])  # it came to another process: all end after this step
+
+    def stepped(self, training: Training) -> None:
+        """Compare all that learns, from time to time."""
+        if training.done % _COMPARE == 0:
+            self.finished(training)
+
+    def finished(self, training: Training) -> None:
+        """Compare all that learns."""
+        if self.several:
+            learned = training.parameters() | {"thresholds": training.stage.store.logits}
+            self.compare(learned, training.done)
+
+    def keeps(self, training: Training) -> bool:
+        """As all decided in the step."""
+        return self._due if self.several else super().keeps(training)
 
     def exchange(
         self,
@@ -96,26 +164,6 @@ class Replicas:
         known = {name: fingerprint(tensor) for name, tensor in tensors.items()}
         self.ranks.agree(known, f"fine-tuning, after step {step}")
 
-    def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """What decides the result, in the words of all processes together."""
-        return configuration
-
-    def total(self, count: int) -> int:
-        """Gaussians of the whole model, from those that this process holds."""
-        return count
-
-    def everywhere(self, rows: Tensor) -> Tensor:
-        """The rows of all Gaussians, in each process."""
-        return rows
-
-    def whole(self, rows: Tensor) -> Tensor:
-        """The rows of all Gaussians, in the first process; there may be none in others."""
-        return rows
-
-    def own(self, rows: Tensor) -> Tensor:
-        """This process' rows, of those of all Gaussians."""
-        return rows
-
 
 class Shards(Replicas):
     """Processes that each hold a part of the model's Gaussians.
@@ -125,11 +173,22 @@ class Shards(Replicas):
         count: of this process' Gaussians.
     """
 
-    sharded = True
+    divided = True
 
     def __init__(self, ranks: Ranks, count: int) -> None:
         super().__init__(ranks)
         self.counts: list[int] = ranks.gather(count)
+
+    def expect_able(self, settings: Settings) -> None:
+        """Refuse views that cannot be divided, and an area that no process sees whole."""
+        if settings.goal.on_area:
+            raise UsageError(
+                "finetune",
+                "portable, and Gaussians divided among processes",
+                "thresholds, or the whole model in each process",
+                "Leave --portable or --shard-gaussians out.",
+            )
+        super().expect_able(settings)
 
     def _told(self, leaves: Sequence[Tensor]) -> list[Tensor]:
         """0, or NaN for a gradient that is not finite: as in a sum, it is everybody's then."""
@@ -172,40 +231,11 @@ class Shards(Replicas):
         return rows[start : start + self.counts[self.ranks.rank]]
 
 
-def processes_of(engine: Engine, ranks: Ranks, count: int) -> Replicas:
-    """What processes are to each other that draw with an engine and hold ``count`` Gaussians."""
-    return Shards(ranks, count) if isinstance(engine, ShardedEngine) else Replicas(ranks)
-
-
-def expect_divisible(settings: Settings, engine: Engine, ranks: Ranks) -> None:
-    """Check that several processes can share the work of settings.
-
-    Raises:
-        UsageError: they cannot.
-    """
-    if settings.portable and isinstance(engine, ShardedEngine):
-        raise UsageError(
-            "finetune",
-            "portable, and Gaussians divided among processes",
-            "thresholds, or the whole model in each process",
-            "Leave --portable or --shard-gaussians out.",
-        )
-    if not ranks.several:
-        return
-    if settings.target_time is not None:
-        raise UsageError(
-            "target time",
-            f"{ranks.size} processes, which would disturb each other's measurements",
-            "one process",
-            "Use --target-speedup, or start one process.",
-        )
-    if settings.views_per_step % ranks.size:
-        raise UsageError(
-            "views per step",
-            f"{settings.views_per_step} for {ranks.size} processes",
-            f"a multiple of {ranks.size}",
-            "Change --views-per-step.",
-        )
+def processes_of(engine: Engine, ranks: Ranks, count: int) -> Alone:
+    """Replicas, or shards if the engine is sharded; of ``count`` Gaussians in this process."""
+    if isinstance(engine, ShardedEngine):
+        return Shards(ranks, count)
+    return Replicas(ranks) if ranks.several else Alone()
 
 
 def part_of(model: Model, ranks: Ranks, device: torch.device | str) -> Model:

@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from fragprune_plugins.files.records import CONTROL
+from fragprune_plugins.learning.goals import Faster, Fewer, parse_goal
+
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00
 
 _STRANGE, _HARDLY = 6.0, 16.0  # dB: between two models, and of the worse one
@@ -144,7 +147,7 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
     """
     before, after = data["before"], data["after"]
     gained = f"{gain(before, after)} that were held out"
-    if not data["settings"]["truncate"]:
+    if data["settings"]["goal"] == CONTROL:
         said = f"{gained}{IS_CONTROL}"
     elif after.get("target") == ITSELF:
         said = f"{gained}. No photograph was used."
@@ -210,12 +213,12 @@ def missed(data: dict[str, Any]) -> str:
     """That a fine-tuning missed its target, a sentence with a space before it; else nothing."""
     if data.get("target_reached") is not False:
         return ""
-    target_time = data["settings"].get("target_time")
-    if target_time:
-        target, met = f"frames {target_time:g}x as fast", data.get("faster")
+    goal = parse_goal(data["settings"]["goal"])
+    if isinstance(goal, Faster):
+        target, met = f"frames {goal.ratio:g}x as fast", data.get("faster")
     else:
-        target = f"{data['settings']['target_speedup']:g}x fewer fragments"
-        met = data.get("speedup")
+        assert isinstance(goal, Fewer)  # nothing else has a target
+        target, met = f"{goal.ratio:g}x fewer fragments", data.get("speedup")
     got = f": {met:.2f}x there" if met else ""
     return (
         f" The target of {target} was missed by "

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.atomic import locked
+from fragprune_plugins.learning.goals import AtMost, Control, Faster
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Command, Report, first_process_prints
@@ -35,7 +36,7 @@ from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 if TYPE_CHECKING:
     from fragprune_plugins.engines import Engine
     from fragprune_plugins.files.model import Model
-    from fragprune_plugins.workbench.finetune.loop import FinetuneResult
+    from fragprune_plugins.workbench.finetune.api import FinetuneResult
     from fragprune_plugins.workbench.finetune.resuming import Checkpoints
     from fragprune_plugins.workbench.finetune.searching import Bounded
     from fragprune_plugins.workbench.scenes.dataset import Dataset
@@ -81,7 +82,7 @@ def _share(
     help="With --self: cameras.json of a 3DGS model, or transforms_*.json; every 8th is held out.",
 )
 @scene_options()
-@learning_options
+@learning_options(every_goal=True)
 @log_option
 @config_option
 @click.option(
@@ -128,7 +129,6 @@ def command(
     scene: SceneOptions,
     settings: Settings,
     keep: float | Literal["auto"] | None,
-    max_drop: float | None,
     seed: int,
     shard: bool,
     no_truncation: bool,
@@ -169,11 +169,11 @@ def command(
       fragprune finetune statue.spz --self --out pruned.spz
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
-    _require_sense(scene.data, itself, cameras, settings, max_drop, keep)
+    _require_sense(scene.data, itself, cameras, settings, keep)
     if shard:
-        _require_shards(settings, itself, max_drop, keep, drop)
+        _require_shards(settings, itself, keep, drop)
     if launched().first:
-        require_place(out, model, thresholds=settings.truncate and not settings.portable)
+        require_place(out, model, thresholds=settings.goal.learns)
         click.get_current_context().with_resource(locked(out, wait=0, what="run"))
 
     from fragprune_plugins.engines.cpu.memory import keep_freed_memory
@@ -196,7 +196,7 @@ def command(
         photographs = photographs_for(model, scene, remedy=remedy)
     rasterizer, where = open_engine(engine)
     keep_freed_memory()
-    truncation = settings.truncate and not no_truncation
+    truncation = settings.goal.presses and not no_truncation
     whole = models.load(model, truncation=truncation, device="cpu" if shard else where)
     if itself:
         dataset = pictures_of(whole, scene, cameras, rasterizer, seed=seed)
@@ -206,7 +206,7 @@ def command(
 
     checkpoints = Checkpoints(resuming.path_beside(out), every or None, tell=_say)
     asked = resuming.configuration(whole, dataset, settings, rasterizer.name)
-    asked |= {"drop_invisible": drop, "keep": keep, "max_drop": max_drop}
+    asked |= {"drop_invisible": drop, "keep": keep}
     asked |= {"sharded": True} if shard else {}
     with sigterm_interrupts():
         with joined(where) as ranks:
@@ -223,9 +223,7 @@ def command(
                 whole, rasterizer = part_of(whole, ranks, where), ShardedEngine(rasterizer, ranks)
             start = Candidate(whole, gaussians=count)
             kept = _keep(whole, keep, dataset.to(where), rasterizer)
-            result, found = _learn(
-                kept, dataset, settings, max_drop, rasterizer, checkpoints, ranks
-            )
+            result, found = _learn(kept, dataset, settings, rasterizer, checkpoints, ranks)
             saved = _whole(result, ranks) if shard else result
             if ranks.first:
                 models.save(out, saved)
@@ -286,40 +284,24 @@ def _learn(
     model: Model,
     dataset: Dataset,
     settings: Settings,
-    max_drop: float | None,
     engine: Engine,
     checkpoints: Checkpoints,
     ranks: Ranks,
 ) -> tuple[FinetuneResult, Bounded | None]:
-    """Fine-tune once, or as often as --max-drop needs."""
-    from fragprune_plugins.workbench.finetune.loop import finetune
+    """Fine-tune once, or as often as a bound on the loss needs."""
+    from fragprune_plugins.workbench.finetune.api import finetune
     from fragprune_plugins.workbench.finetune.searching import strongest
-    from fragprune_plugins.workbench.prices.calibration import prices_of
+    from fragprune_plugins.workbench.prices.target import frame_target
 
-    if max_drop is not None:
-        found = strongest(
-            model,
-            dataset,
-            settings,
-            max_drop,
-            engine=engine,
-            progress=True,
-            say=_say,
-            ranks=ranks,
-        )
+    options: dict[str, Any] = {"engine": engine, "progress": True, "ranks": ranks}
+    if isinstance(settings.goal, AtMost):
+        found = strongest(model, dataset, settings, say=_say, **options)
         return found.result, found
-    timed = settings.target_time is not None
-    result = finetune(
-        model,
-        dataset,
-        settings,
-        cost=prices_of(engine, model.device, say=_say) if timed else None,
-        engine=engine,
-        progress=True,
-        checkpoints=checkpoints,
-        ranks=ranks,
-    )
-    return result, None
+    target = None
+    if isinstance(settings.goal, Faster):
+        target = frame_target(settings.goal.ratio, engine, model.device, say=_say)
+    options |= {"target": target, "checkpoints": checkpoints}
+    return finetune(model, dataset, settings, **options), None
 
 
 def _whole(result: FinetuneResult, ranks: Ranks) -> FinetuneResult:
@@ -347,7 +329,6 @@ def _require_sense(
     itself: bool,
     cameras: Path | None,
     settings: Settings,
-    max_drop: float | None,
     keep: float | Literal["auto"] | None,
 ) -> None:
     """Prove, before any work, that it is clear what MODEL must look like.
@@ -366,14 +347,14 @@ def _require_sense(
         raise UsageError(
             "options", "--data with --cameras", "one source of cameras", "Drop one of the two."
         )
-    if itself and max_drop is not None:
+    if itself and isinstance(settings.goal, AtMost):
         raise UsageError(
             "options",
             "--self with --max-drop",
             "photographs, and with them a control to lose against",
             "Drop --max-drop; --pressure steers what --self may lose.",
         )
-    if itself and not settings.truncate:
+    if itself and isinstance(settings.goal, Control):
         raise UsageError(
             "options",
             "--self with --control",
@@ -392,7 +373,6 @@ def _require_sense(
 def _require_shards(
     settings: Settings,
     itself: bool,
-    max_drop: float | None,
     keep: float | Literal["auto"] | None,
     drop: bool,
 ) -> None:
@@ -404,8 +384,8 @@ def _require_shards(
     require_several()
     asked = {
         "--self": itself,
-        "--portable": settings.portable,
-        "--max-drop": max_drop is not None,
+        "--portable": settings.goal.on_area,
+        "--max-drop": isinstance(settings.goal, AtMost),
         "--keep": keep is not None,
         "--drop-invisible": drop,
     }

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.engines import Engine
     from fragprune_plugins.hosts.photographs import Photographs
     from fragprune_plugins.workbench.figures.evaluate import Candidate
-    from fragprune_plugins.workbench.finetune.loop import FinetuneResult
+    from fragprune_plugins.workbench.finetune.api import FinetuneResult
     from fragprune_plugins.workbench.finetune.searching import Bounded
     from fragprune_plugins.workbench.scenes.dataset import Dataset
 
@@ -112,7 +112,7 @@ class Finetuned:
             "already_finished": False,
             "iterations": done.steps,
             "skipped": done.skipped,
-            "pressure": done.pressure if settings.truncate else None,
+            "pressure": done.pressure if settings.goal.presses else None,
             "train_seconds": result.train_seconds,
             "engine": result.engine,
             "device": after["device"],
@@ -148,7 +148,7 @@ class Finetuned:
         from fragprune_plugins.workbench.figures.wording import describe, outcome
 
         result, settings, before = self.result, self.result.settings, data["before"]
-        pressure = f" at pressure {data['pressure']:.2g}" if settings.truncate else ""
+        pressure = f" at pressure {data['pressure']:.2g}" if settings.goal.presses else ""
         lines = [
             describe({"original": before, "pruned": data["after"]}),
             "",
@@ -181,7 +181,7 @@ class Finetuned:
             lines.append(describe_untruncated(before, plain))
         form = formats.named(self.out)
         held = ", which holds the thresholds" if plain else ""
-        if settings.portable:
+        if settings.goal.on_area:
             held = ", which every viewer draws as it is"
         lines.append(describe_written(self.out, held))
         if form.keeps:

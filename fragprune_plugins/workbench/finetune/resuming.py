@@ -6,28 +6,38 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
+from fragprune_plugins.engines.losses import code_for
 from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.finetune import checkpoints
+from fragprune_plugins.workbench.finetune.checkpoints import UNFIT
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph, Shot
 from fragprune_plugins.workbench.scenes.images import DOOR
+
+if TYPE_CHECKING:
+    from fragprune_plugins.workbench.finetune.loop import Training
 
 SUFFIX = ".fragprune-unfinished"
 EVERY = 300.0
 """Seconds between two checkpoints."""
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+_OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
 
 
 def path_beside(out: Path) -> Path:
@@ -100,6 +110,127 @@ class Checkpoints:
     def clear(self) -> None:
         """Remove the file: the result is saved."""
         self.path.unlink(missing_ok=True)
+
+
+class Keeper:
+    """Takes a training over from its checkpoint, and writes the next ones.
+
+    Args:
+        checkpoints: where they are; None keeps nothing.
+        training: has not begun yet.
+
+    Attributes:
+        checkpoints: those that this process writes.
+
+    Raises:
+        CheckpointError: the checkpoint is broken, or another fine-tuning's.
+        RanksError: another process is about to learn something else.
+    """
+
+    def __init__(self, checkpoints: Checkpoints | None, training: Training) -> None:
+        processes = training.processes
+        self.checkpoints = checkpoints if processes.first else None
+        if checkpoints is None and not processes.several:
+            return
+        stage = training.stage
+        asked = configuration(
+            training.start,
+            training.dataset,
+            training.settings,
+            training.engine.name,
+            stage.schedule,
+        )
+        self.asked = processes.described(asked) | {"loss": code_for(training.start.device)}
+        self.asked |= {} if stage.target is None else stage.target.decides()
+        del self.asked["nonfinite"]  # a run that such a step stopped may go on and skip it
+        if checkpoints is not None:
+            self._go_on(checkpoints, training)
+        processes.agree({**self.asked, "checkpoint": training.done, "torch": torch.__version__})
+
+    def _go_on(self, checkpoints: Checkpoints, training: Training) -> None:
+        """Take over what a checkpoint holds, if there is one."""
+        device = "cpu" if training.processes.divided else training.start.device
+        tensors, values = checkpoints.load(self.asked, device)
+        if not values:
+            return
+        try:
+            _unpack(training, tensors, values)
+        except UNFIT as error:
+            raise CheckpointError(
+                str(checkpoints.path),
+                f"parts that do not fit together ({error})",
+                "what a fine-tuning wrote",
+                "Begin anew with --again.",
+            ) from error
+        checkpoints.tell(
+            f"resuming at step {training.done} of {training.settings.iterations}, "
+            f"from {checkpoints.path}"
+        )
+        if values["threads"] != torch.get_num_threads():
+            checkpoints.tell(
+                f"it was begun on {values['threads']} threads, and goes on on "
+                f"{torch.get_num_threads()}: the last bits of the result may differ"
+            )
+
+    def due(self, step: int) -> bool:
+        """Whether it is time for a checkpoint after a step, by this process."""
+        return self.checkpoints is not None and self.checkpoints.due(step)
+
+    def keep(self, training: Training) -> None:
+        """Write a checkpoint, between two steps."""
+        mine = self.checkpoints is not None or training.processes.divided
+        if not mine or not training.optimizer.state:  # no step was taken
+            return
+        training.stage.check()
+        tensors, values = _packed(training)
+        if self.checkpoints is not None:  # the first process writes
+            self.checkpoints.save(tensors, values | {"configuration": self.asked})
+
+
+def _packed(training: Training) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and plain values from which ``_unpack`` goes on; all of the model's, in the first."""
+    tensors, values = training.stage.state_dict()
+    for name, parameter in training.parameters().items():
+        tensors[f"model.{name}"] = parameter
+        moments = training.optimizer.state[parameter]
+        for moment in _MOMENTS:
+            tensors[f"{moment}.{name}"] = moments[moment]
+    for name in sorted(tensors.keys() - _OF_VIEWS):  # in the same order in all processes
+        tensors[name] = training.processes.whole(tensors[name])
+    points = [astuple(point) for point in training.curves]
+    tensors["curves"] = torch.tensor(points, dtype=torch.float64).reshape(len(points), -1)
+    return tensors, values | {
+        "done": training.done,
+        "adam_step": float(moments["step"]),
+        "seconds": training.seconds,
+        "threads": torch.get_num_threads(),
+    }
+
+
+def _unpack(training: Training, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
+    """Take over what ``_packed`` gave; raises one of ``UNFIT`` if it does not fit."""
+    stage = training.stage
+    for name in tensors.keys() - _OF_VIEWS - {"curves"}:
+        tensors[name] = training.processes.own(tensors[name])
+    stage.load_state_dict(tensors, values)
+    if len(stage.store) != len(training.model):
+        raise ValueError(f"{len(stage.store)} thresholds of {len(training.model)} Gaussians")
+    adam_step, seconds = values["adam_step"], values["seconds"]
+    if min(adam_step, seconds) < 0:
+        raise ValueError(f"{adam_step} steps in {seconds} seconds")
+    for name, parameter in training.parameters().items():
+        parameter.data.copy_(tensors[f"model.{name}"])
+        step = torch.tensor(float(adam_step), dtype=torch.float32)
+        state: dict[str, Tensor] = {"step": step}
+        for moment in _MOMENTS:
+            state[moment] = torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
+        training.optimizer.state[parameter] = state
+    for row in tensors["curves"].tolist():
+        training.curves.append(StepStats(int(row[0]), *row[1:]))
+    training.done = int(values["done"])
+    if not 0 <= training.done == stage.steps <= training.settings.iterations:
+        raise ValueError(f"{training.done} steps, of which the thresholds took {stage.steps}")
+    training.started -= seconds
 
 
 def configuration(

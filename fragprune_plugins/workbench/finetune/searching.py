@@ -17,13 +17,14 @@ import torch
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.goals import AtMost, Control, Pressure
 from fragprune_plugins.learning.interruption import Terminate
-from fragprune_plugins.learning.pressure import FEWEST
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.targets import FEWEST
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.metrics import psnr
-from fragprune_plugins.workbench.finetune.loop import FinetuneResult, finetune
+from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
 from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
@@ -87,7 +88,6 @@ def strongest(
     model: Model,
     dataset: Dataset,
     settings: Settings,
-    bound: float,
     *,
     engine: str | Engine = "auto",
     progress: bool = False,
@@ -102,20 +102,19 @@ def strongest(
     Args:
         model: the trained splat; not changed.
         dataset: training views to learn from, held-out views to measure the loss on.
-        settings: of every training; without a pressure or a target.
-        bound: dB, 0 or more.
+        settings: of every training; their goal is ``AtMost``.
         engine: a name or an engine.
         progress: draw a bar for each training on stderr.
         say: called with a line of text before each training.
         ranks: the processes that learn together; this one alone when None.
 
     Raises:
-        UsageError: the bound is no number from 0 to 10.
+        UsageError: the goal is another one.
         DivergedError: NaN or infinity in what trains.
     """
-    if not 0 <= bound <= 10:
-        raise UsageError("--max-drop", f"{bound:g}", "0 to 10 dB", "Change --max-drop.")
-
+    if not isinstance(settings.goal, AtMost):
+        raise UsageError("goal", str(settings.goal), "AtMost(decibels)", "Pass such a goal.")
+    bound = settings.goal.decibels
     if isinstance(engine, str):
         engine = engine_for(engine, model.device)
 
@@ -123,7 +122,7 @@ def strongest(
         return finetune(model, dataset, each, engine=engine, progress=progress, ranks=ranks)
 
     say("Training the control, without truncation.")
-    control = train(replace(settings, truncate=False))
+    control = train(replace(settings, goal=Control()))
     result, trials = control, list[Trial]()
     best: tuple[FinetuneResult, Trial] | None = None
     pressure: float | None = None
@@ -140,7 +139,7 @@ def strongest(
         while len(trials) < TRAININGS:
             at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
             say(f"Training {len(trials) + 1} of at most {TRAININGS}, at {at}.")
-            result = train(replace(settings, pressure=pressure))
+            result = train(replace(settings, goal=Pressure(pressure)))
             if result.interrupted:
                 return ended(result.terminated)
             figures, fragments = _held_out(result, dataset.test, engine)

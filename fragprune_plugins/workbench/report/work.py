@@ -17,7 +17,16 @@ from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, 
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
-from fragprune_plugins.files.records import DOOR, Record, control_of, find, located, portable
+from fragprune_plugins.files.records import (
+    CONTROL,
+    DOOR,
+    Record,
+    control_of,
+    find,
+    located,
+    portable,
+)
+from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import open_engine, own_cameras
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -57,9 +66,9 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
     for record in records:
         _check(record)
     results = [record for record in records if record.command in ("run", "finetune")]
-    pruned = [record for record in results if record.data.get("settings", {}).get("truncate")]
+    pruned = [record for record in results if _goal(record) not in (None, CONTROL)]
     main = [*records, *results, *pruned][-1]
-    control = main.data.get("settings", {}).get("truncate") is False
+    control = _goal(main) == CONTROL
     others = [record for record in records if record is not main]
     files = [record.path for record in records]
     line = _sentence(main, files)
@@ -109,8 +118,8 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
 def _check(record: Record) -> None:
     """Raise RecordError if a record lacks what the page shows, or has it in other types."""
     with DOOR.stated(record.path):
-        settings = record.data.get("settings", {})
-        settings.get("truncate")
+        if (goal := _goal(record)) is not None:
+            parse_goal(goal)
         _table(record)
         _sentence(record, [])
         _settings(record)
@@ -162,16 +171,22 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     if not before or not after:
         return f"{of}nothing was learned."
     said = f"{of}{fewer(before, after)} on training views; frame times were not measured"
-    if data.get("settings", {}).get("truncate") is False:
+    if _goal(record) == CONTROL:
         return said + IS_CONTROL
     return f"{said}.{missed(data)}"
+
+
+def _goal(record: Record) -> str | None:
+    """The goal of a fine-tuning, as text; None of another command."""
+    goal: str | None = record.data.get("settings", {}).get("goal")
+    return goal
 
 
 def _heading(record: Record) -> str:
     """What a record is about, in words."""
     if record.command in ("compare", "profile"):
         return {"compare": "Comparison", "profile": "Profile"}[record.command]
-    if record.data.get("settings", {}).get("truncate") is False:
+    if _goal(record) == CONTROL:
         return "The control: the same training without pruning"
     return "Pruning"
 

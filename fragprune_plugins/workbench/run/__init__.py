@@ -30,7 +30,7 @@ from fragprune_plugins.workbench.commands.options import engine_options
     help="finetune, joint: learn after this iteration; joint's default is the end of densification "
     "by the host's own arguments.",
 )
-@learning_options
+@learning_options(every_goal=False)
 @log_option
 @config_option
 @engine_options(

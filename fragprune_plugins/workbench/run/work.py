@@ -40,13 +40,12 @@ def run(
     stage: Any,
     from_iter: int | None,
     settings: Settings,
-    max_drop: float | None,
     engine: EngineOptions,
     evaluate: bool,
     again: bool,
 ) -> Report:
     """Do what ``fragprune run`` promises; its options are the arguments."""
-    _expect_possible(stage, from_iter, settings, max_drop)
+    _expect_possible(stage, from_iter)
     bound_threads(engine.threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     options = launch.RunOptions(
@@ -80,9 +79,7 @@ def run(
     return Report(data, _describe(summary, data, not_compared))
 
 
-def _expect_possible(
-    stage: str, from_iter: int | None, settings: Settings, max_drop: float | None
-) -> None:
+def _expect_possible(stage: str, from_iter: int | None) -> None:
     """Refuse options that a host's run cannot follow."""
     if from_iter is not None and stage not in ("finetune", "joint"):
         raise UsageError(
@@ -90,20 +87,6 @@ def _expect_possible(
             f"--stage {stage}",
             "--stage finetune or joint, which learn inside one run",
             "Add one of them, or remove --from-iter.",
-        )
-    if settings.target_time is not None:
-        raise UsageError(
-            "--target-time",
-            "fragprune run: a host keeps no model as it came in to time frames against",
-            "--target-speedup, a ratio of fragments",
-            "Use --target-speedup, or --target-time with fragprune finetune on the trained PLY.",
-        )
-    if max_drop is not None:
-        raise UsageError(
-            "--max-drop",
-            "fragprune run: it would repeat the host's stage 2 many times",
-            "a bound for fragprune finetune",
-            "Use fragprune finetune with --max-drop on the trained PLY.",
         )
 
 
@@ -217,7 +200,7 @@ def _describe(
             models = f"{summary.model_before or 'OTHER'} {summary.model_after}"
             lines.append(f"Compare: fragprune compare {models}")
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
-    control = not summary.settings["truncate"]
+    control = summary.settings["goal"] == records.CONTROL
     learned = "of the control" if control else _WHERE.get(summary.stage, "of stage 2")
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "

@@ -158,7 +158,7 @@ def _record(folder: Path) -> bytes:
         "iterations": 2,
         "before": FIGURES,
         "after": after,
-        "settings": {"truncate": True, "train": "all", "opacity_lr": 0.02},
+        "settings": {"goal": "pressure", "train": "all", "opacity_lr": 0.02},
         "curves": [{"step": step, **curve} for step in range(3)],
         "photographs": {
             "folder": "scene",

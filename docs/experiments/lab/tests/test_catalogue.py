@@ -10,6 +10,7 @@ from lab.rules import shrunk, without_faint
 from lab.tests.commands import run
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.workbench.pruning.scores import SCORES
 
 
@@ -34,8 +35,8 @@ def test_rules_trains_everything_equally_long_and_moves_the_same():
         *(f"falloff_threshold({tau})" for tau in (0.03, 0.07, 0.12, 0.2)),
         *(f"alpha_cutoff({levels})" for levels in (4, 8, 12, 16)),
     ]
-    pressures = [arm.settings.pressure for arm in arms if arm.series == "learned"]
-    assert pressures == [None, 5e-5, 1e-4, 2e-4, 4e-4]
+    goals = [arm.settings.goal for arm in arms if arm.series == "learned"]
+    assert goals == [Pressure(weight) for weight in (None, 5e-5, 1e-4, 2e-4, 4e-4)]
 
 
 def test_moves_compares_what_moves():
@@ -47,20 +48,20 @@ def test_moves_compares_what_moves():
 
 def test_primitives_prunes_by_every_published_score_without_and_with_thresholds():
     arms = [arm for arm in EXPERIMENTS["primitives"](700, None).arms if arm.pruning]
-    alone = [arm.pruning for arm in arms if not arm.settings.truncate]
-    assert alone == [arm.pruning for arm in arms if arm.settings.truncate]
+    alone = [arm.pruning for arm in arms if arm.settings.goal == Control()]
+    assert alone == [arm.pruning for arm in arms if arm.settings.goal == Pressure()]
     assert {each.score for each in alone} == set(SCORES) - {"removal-error-per-price"}
     assert {each.keep for each in alone} == {0.4, 0.6, 0.8}
 
 
 def test_portable_compares_area_pressure_with_changes_before_training():
     experiment = EXPERIMENTS["portable"](700, None)
-    learned = [arm for arm in experiment.arms if arm.settings.portable]
-    assert [arm.settings.pressure for arm in learned] == [2e-4, 4e-4, None]
+    learned = [arm for arm in experiment.arms if arm.settings.goal.on_area]
+    assert [arm.settings.goal.weight for arm in learned] == [2e-4, 4e-4, None]
     started = [arm for arm in experiment.arms if arm.start]
     assert [arm.start.name for arm in started] == ["shrunk(0.7)", "without_faint(0.15)"]
-    assert not any(arm.is_control or arm.settings.truncate for arm in started)
-    with pytest.raises(UsageError, match="--train"):
+    assert all(not arm.is_control and arm.settings.goal == Control() for arm in started)
+    with pytest.raises(UsageError, match="only shapes that move"):
         EXPERIMENTS["portable"](700, "opacity")
 
 

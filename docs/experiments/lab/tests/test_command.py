@@ -16,12 +16,13 @@ from lab.rules import alpha_cutoff, shrunk
 from lab.tests.commands import run, run_json
 from PIL import Image
 
+from fragprune_plugins.learning.goals import Control, Portable, Pressure
 from fragprune_plugins.learning.schedule import Settings
 
 
 def few(iterations, train=None):
-    settings = Settings(iterations=iterations, train=train or "opacity", pressure=1e-2)
-    control = replace(settings, truncate=False, pressure=None)
+    settings = Settings(iterations=iterations, train=train or "opacity", goal=Pressure(1e-2))
+    control = replace(settings, goal=Control())
     return Experiment(
         "rules",
         "What wins?",
@@ -37,13 +38,18 @@ def few(iterations, train=None):
 def trained(monkeypatch):
     """Settings and rules that trainings were asked for."""
     calls = []
-    finetune = running.finetune
+    finetune, finetune_by = running.finetune, running.finetune_by
 
-    def counted(*arguments, **options):
-        calls.append((arguments[2], options["rule"]))
-        return finetune(*arguments, **options)
+    def learning(model, dataset, settings, **options):
+        calls.append((settings, None))
+        return finetune(model, dataset, settings, **options)
 
-    monkeypatch.setattr(running, "finetune", counted)
+    def following(rule, model, dataset, settings, **options):
+        calls.append((settings, rule))
+        return finetune_by(rule, model, dataset, settings, **options)
+
+    monkeypatch.setattr(running, "finetune", learning)
+    monkeypatch.setattr(running, "finetune_by", following)
     monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", few)
     monkeypatch.setattr(running, "ENLARGED", 2)
     return calls
@@ -73,7 +79,7 @@ def test_writes_table_sheet_plot_and_configuration(words, trained, tmp_path):
     asked = json.loads((out / "rules.json").read_text())
     assert asked["seeds"] == [0, 1]
     assert asked["arms"]["alpha 16/255"]["rule"] == "alpha_cutoff(16)"
-    assert asked["arms"]["learned"]["settings"]["pressure"] == 1e-2
+    assert asked["arms"]["learned"]["settings"]["goal"] == "pressure=0.01"
     assert {row["iterations"] for row in sheet} == {"0", "3"}
     assert all(0 < float(row["psnr_training"]) < 100 for row in sheet)
     assert {"version", "model", "machine", "photographs", "engine", "threads"} <= asked.keys()
@@ -113,7 +119,7 @@ def test_goes_on_without_training_again(words, trained, tmp_path):
     run_json(*words)
     assert len(trained) == 4
     settings, rule = trained[-1]
-    assert settings.truncate
+    assert settings.goal == Pressure(1e-2)
     assert rule is None
 
 
@@ -217,9 +223,9 @@ def test_the_configuration_tells_models_apart(words, trained, tmp_path):
 
 def test_an_arm_truncates_from_where_it_opens(words, trained, monkeypatch):
     """Until then it trains as the control does, to the bit."""
-    learned = Settings(iterations=3, train="opacity", pressure=1e-2)
+    learned = Settings(iterations=3, train="opacity", goal=Pressure(1e-2))
     arms = (
-        Arm("control", "", replace(learned, truncate=False, pressure=None)),
+        Arm("control", "", replace(learned, goal=Control())),
         *(Arm("learned", str(opens), learned, warmup=opens) for opens in (0, 3)),
     )
     experiment = Experiment("rules", "When?", arms, over="iterations")
@@ -257,8 +263,8 @@ def test_prunes_before_training_and_scores_once(words, trained, monkeypatch):
 
 
 def changed(iterations, train=None):
-    settings = Settings(iterations=iterations, portable=True, pressure=1e-2)
-    control = replace(settings, truncate=False, portable=False, pressure=None)
+    settings = Settings(iterations=iterations, goal=Portable(1e-2))
+    control = replace(settings, goal=Control())
     arms = (
         Arm("control", "", control),
         Arm("portable", "", settings),
@@ -286,7 +292,7 @@ def test_other_defaults_of_the_pressure_are_another_configuration(words, trained
 
     def default(iterations, train=None):
         settings = Settings(iterations=iterations)
-        control = replace(settings, truncate=False)
+        control = replace(settings, goal=Control())
         return Experiment("rules", "?", (Arm("control", "", control), Arm("learned", "", settings)))
 
     monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", default)

@@ -9,11 +9,12 @@ import torch
 from finetune import tiny
 from hypothesis import given
 from hypothesis import strategies as st
-from lab.rules import alpha_cutoff, falloff_threshold
+from lab.rules import Rule, alpha_cutoff, falloff_threshold, finetune_by
 
 from fragprune_plugins.engines import create_engine
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.workbench.finetune.loop import finetune
+from fragprune_plugins.workbench.finetune.api import finetune
 
 OPACITIES = st.lists(st.floats(1e-3, 0.999), min_size=1, max_size=20)
 
@@ -43,21 +44,21 @@ def scene(tmp_path):
 @pytest.mark.parametrize("rule", [falloff_threshold(0.2), alpha_cutoff(12)])
 def test_a_training_follows_a_rule_as_opacities_move(scene, rule):
     model, dataset = scene
-    result = finetune(model, dataset, Settings(iterations=4, pressure=1e-2), rule=rule)
+    settings = Settings(iterations=4, goal=Pressure(1e-2))
+    result = finetune_by(rule, model, dataset, settings)
     opacities = result.model.splats().opacities
     assert not torch.equal(opacities, model.splats().opacities)
-    torch.testing.assert_close(result.thresholds, rule(opacities), atol=2e-7, rtol=1e-5)
-    assert result.settings.pressure == 0
+    torch.testing.assert_close(result.model.falloff, rule(opacities), atol=2e-7, rtol=1e-5)
+    assert result.progress.pressure == 0
     assert result.progress.speedup > 1.05
 
 
 def test_a_rule_that_cuts_nothing_trains_as_the_control_does(scene):
     """Nothing presses on fragments."""
     model, dataset = scene
-    ruled = finetune(
-        model, dataset, Settings(iterations=6, train="opacity"), rule=falloff_threshold(1e-6)
-    )
-    control = finetune(model, dataset, Settings(iterations=6, train="opacity", truncate=False))
+    settings = Settings(iterations=6, train="opacity")
+    ruled = finetune_by(falloff_threshold(1e-6), model, dataset, settings)
+    control = finetune(model, dataset, Settings(iterations=6, train="opacity", goal=Control()))
     assert torch.equal(ruled.model.opacity, control.model.opacity)
 
 
@@ -73,7 +74,7 @@ def test_thresholds_of_a_rule_get_no_gradient(scene):
                 wanted.append(thresholds.requires_grad)
             return engine.rasterize(inputs, thresholds)
 
-    finetune(model, dataset, Settings(iterations=3), rule=alpha_cutoff(8), engine=Watched())
+    finetune_by(alpha_cutoff(8), model, dataset, Settings(iterations=3), engine=Watched())
     assert wanted == [False] * 3
 
 
@@ -86,5 +87,5 @@ def test_a_rule_waits_as_long_as_learned_thresholds_do(scene, monkeypatch):
         drawn.append(len(opacities))
         return falloff_threshold(0.2)(opacities)
 
-    finetune(model, dataset, Settings(iterations=5), rule=watched)
+    finetune_by(Rule("watched", watched), model, dataset, Settings(iterations=5))
     assert len(drawn) == 2 + 1  # two steps that truncate, and the finished model

@@ -1,0 +1,252 @@
+"""What a fine-tuning is for: one goal of several, which exclude each other.
+
+As text, for files and flags, a goal is its name and its number: ``fewer=2``, ``control``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.pressure import (
+    OWN_AREA_PRESSURE,
+    OWN_PRESSURE,
+    PORTABLE_ELASTICITY,
+    TIME_FOLLOWS,
+    ElasticPressure,
+    FixedPressure,
+    PressureController,
+    PressureRule,
+)
+
+if TYPE_CHECKING:
+    from fragprune_plugins.learning.targets import Target
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What every goal says.
+
+    Attributes:
+        name: in text.
+        learns: thresholds open and learn.
+        presses: a pressure acts on the loss.
+        on_area: it acts on the area of the Gaussians' ellipses, from the first step on, and shapes
+            must move.
+    """
+
+    name: ClassVar[str]
+    learns: ClassVar[bool] = True
+    presses: ClassVar[bool] = True
+    on_area: ClassVar[bool] = False
+
+    def __str__(self) -> str:
+        numbers = [f"{number!r}" for number in astuple(self) if number is not None]
+        return "=".join([self.name, *numbers])
+
+    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
+        """The pressure of a training, a new one.
+
+        Args:
+            elasticity: of a pressure that follows the loss.
+            itself: the model's own pictures are what it learns from.
+        """
+        raise NotImplementedError
+
+    def target(self) -> Target | None:
+        """What holds thresholds to a ratio; None without one.
+
+        Raises:
+            UsageError: a training alone cannot meet the goal.
+        """
+        return None
+
+
+@dataclass(frozen=True)
+class Pressure(Goal):
+    """Truncate under a pressure on drawn fragments.
+
+    Attributes:
+        weight: lambda, weight of drawn fragments per pixel in the loss, from 0 up to 1; None for
+            one that follows the loss per fragment, between two ends.
+    """
+
+    name: ClassVar[str] = "pressure"
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        _expect_weight(self.weight)
+
+    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
+        """The weight; without one, elastic, or fixed where there is no loss to follow."""
+        if self.weight is not None:
+            return FixedPressure(self.weight)
+        return FixedPressure(OWN_PRESSURE) if itself else ElasticPressure(elasticity=elasticity)
+
+
+@dataclass(frozen=True)
+class Fewer(Goal):
+    """Draw so many times fewer fragments.
+
+    Attributes:
+        ratio: fragments of the untruncated model as it came in over fragments drawn now, on the
+            training views that calibration measures; above 1, up to 20.
+    """
+
+    name: ClassVar[str] = "fewer"
+    ratio: float
+
+    def __post_init__(self) -> None:
+        _expect("target speed-up", self.ratio, 1, 20, "1 < X <= 20, fragments before over after")
+
+    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
+        """Steered towards the ratio."""
+        return PressureController(self.ratio)
+
+    def target(self) -> Target:
+        """One shift of all thresholds meets the ratio late in the training."""
+        from fragprune_plugins.learning.targets import Target
+
+        return Target(self.ratio)
+
+
+@dataclass(frozen=True)
+class Faster(Goal):
+    """Draw frames so many times as fast.
+
+    Attributes:
+        ratio: frame time of the untruncated model as it came in over frame time now, on this
+            machine; above 1, up to 20.
+    """
+
+    name: ClassVar[str] = "faster"
+    ratio: float
+
+    def __post_init__(self) -> None:
+        _expect("target time", self.ratio, 1, 20, "1 < X <= 20, frame time before over after")
+
+    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
+        """Steered towards the ratio."""
+        return PressureController(self.ratio, follows=TIME_FOLLOWS)
+
+    def target(self) -> Target:
+        """Refuse: whoever trains has to time frames."""
+        raise UsageError(
+            "target time",
+            "a training that cannot time single frames",
+            "a target in fragments",
+            "Aim for fewer fragments here, or use fragprune finetune on the trained PLY.",
+        )
+
+
+@dataclass(frozen=True)
+class AtMost(Goal):
+    """Truncate as strongly as a bound on the loss of quality allows; takes several trainings.
+
+    Attributes:
+        decibels: of PSNR lost against the control, 0 to 10.
+    """
+
+    name: ClassVar[str] = "at-most"
+    decibels: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= _number("largest loss", self.decibels) <= 10:
+            raise UsageError(
+                "largest loss", f"{self.decibels:g}", "0 to 10 dB", "Choose another bound."
+            )
+
+    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
+        """That of the first training with thresholds."""
+        return Pressure().pressure(elasticity, itself)
+
+    def target(self) -> Target:
+        """Refuse: the bound is one for several trainings."""
+        raise UsageError(
+            "largest loss",
+            "one training",
+            "several, of which the strongest truncation within the bound is chosen",
+            "Use fragprune finetune on the trained PLY.",
+        )
+
+
+@dataclass(frozen=True)
+class Portable(Goal):
+    """For viewers that ignore thresholds: learn none, and cover less area.
+
+    Attributes:
+        weight: lambda, weight of the ellipses' area per pixel (``area.area_per_pixel``) in the
+            loss, from 0 up to 1; None for one that follows the loss per pixel of area.
+    """
+
+    name: ClassVar[str] = "portable"
+    learns: ClassVar[bool] = False
+    on_area: ClassVar[bool] = True
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        _expect_weight(self.weight)
+
+    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
+        """The weight; without one, elastic, or fixed where there is no loss to follow."""
+        if self.weight is not None:
+            return FixedPressure(self.weight)
+        if itself:
+            return FixedPressure(OWN_AREA_PRESSURE)
+        return ElasticPressure(value=0.0, elasticity=PORTABLE_ELASTICITY, least=0.0, most=1.0)
+
+
+@dataclass(frozen=True)
+class Control(Goal):
+    """Train as long without thresholds or pressure, to compare with."""
+
+    name: ClassVar[str] = "control"
+    learns: ClassVar[bool] = False
+    presses: ClassVar[bool] = False
+
+    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
+        """None."""
+        return FixedPressure(0.0)
+
+
+GOALS: dict[str, type[Goal]] = {
+    each.name: each for each in (Pressure, Fewer, Faster, AtMost, Portable, Control)
+}
+"""By name."""
+
+
+def parse_goal(text: str) -> Goal:
+    """The goal that ``str`` made a text of.
+
+    Raises:
+        UsageError: the name is none of a goal, or the number is missing or out of range.
+    """
+    name, _, number = text.partition("=")
+    try:
+        return GOALS[name](*([float(number)] if number else []))
+    except (KeyError, ValueError, TypeError) as error:
+        raise UsageError(
+            "goal",
+            repr(text)[:80],
+            "pressure, pressure=X, fewer=X, faster=X, at-most=DB, portable, portable=X or control",
+            "Choose one.",
+        ) from error
+
+
+def _number(what: str, value: object) -> float:
+    """A finite number; raises UsageError for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise UsageError(what, repr(value)[:80], "a number", "Correct it.")
+    return value
+
+
+def _expect(what: str, value: float, above: float, most: float, expected: str) -> None:
+    if not above < _number(what, value) <= most:
+        raise UsageError(what, f"{value:g}", expected, "Choose another.")
+
+
+def _expect_weight(weight: float | None) -> None:
+    if weight is not None and not 0 <= _number("pressure", weight) < 1:
+        raise UsageError("pressure", f"{weight:g}", "0 <= X < 1 (1e-4 is usual)", "Change it.")

@@ -1,0 +1,131 @@
+"""A ratio that thresholds are held to, before over after, and the shift that meets it.
+
+Stage 2 asks its target what a picture costs, and late in the run to meet the ratio. This one counts
+fragments; what counts something else, such as the time of a frame, overrides it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from fragprune_plugins.learning.plain import put
+
+if TYPE_CHECKING:
+    from fragprune_plugins.learning.thresholds import ThresholdStore
+    from fragprune_plugins.types import RasterOutputs
+
+TOLERANCE = 0.05
+"""A target counts as reached within this relative distance."""
+
+FEWEST = 20
+"""No target makes fragments fewer than this many times."""
+
+CALIBRATE_AT = 0.85
+"""Share of the learning after which one shift of all thresholds meets the target, and they stay."""
+
+CALIBRATION_VIEWS = 24
+"""Number of training views that a calibration measures at most."""
+
+
+class Target:
+    """Meets a ratio of fragments.
+
+    Args:
+        ratio: untruncated over truncated.
+
+    Attributes:
+        figure: the name under which the ratio that was met is reported.
+        met: the ratio that was met; None before.
+    """
+
+    figure: ClassVar[str] = "speedup"
+
+    def __init__(self, ratio: float) -> None:
+        self.ratio = ratio
+        self.met: float | None = None
+
+    def attach(self, training: Any) -> None:
+        """A training begins that is to meet it; see ``finetune.loop.Training``."""
+
+    def decides(self) -> dict[str, Any]:
+        """What decides the result beside the goal, as plain values."""
+        return {}
+
+    def cost(self, outputs: RasterOutputs) -> float | None:
+        """What is counted of a picture, in any unit; None for its fragments."""
+        return None
+
+    def steers_by(self, step: int, ratio: Callable[[], float]) -> float | None:
+        """The ratio to steer the pressure by in a step; None for that of fragments.
+
+        NaN where the step is not looked at. ``ratio()`` draws its views once more, and gives the
+        ratio of their costs.
+        """
+        return None
+
+    def wants_look(self, progress: float) -> bool:
+        """Whether ``look`` is due before thresholds meet the target."""
+        return False
+
+    def look(self, progress: float, ratio: Callable[[], float], views: Sequence[Any]) -> None:
+        """Measure by the way; ``ratio`` and ``views`` as in ``meet``."""
+
+    def meet(self, store: ThresholdStore, ratio: Callable[[], float], views: Sequence[Any]) -> None:
+        """Shift all thresholds onto the target.
+
+        Args:
+            store: the thresholds.
+            ratio: draws the views and gives the ratio of their costs.
+            views: that calibration measures.
+        """
+        self.met = calibrate(store, ratio, self.ratio)
+
+    def state(self) -> dict[str, Any]:
+        """Plain values, for ``load_state``."""
+        return {"met": self.met}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Take over what ``state`` gave; raises ValueError for anything else."""
+        put(self, {name: state[name] for name in self.state()})
+
+
+def calibrate(
+    store: ThresholdStore,
+    ratio: Callable[[], float],
+    target: float,
+    *,
+    tolerance: float = 0.01,
+    reach: float = 8.0,
+    rounds: int = 16,
+) -> float:
+    """Shift all threshold logits by one number so that ``ratio()`` meets ``target``.
+
+    The ratio grows with the shift, so bisection finds it. Where the target lies out of reach the
+    nearest end is kept. Call it late in the run and let opacities adapt afterwards.
+
+    Args:
+        store: the thresholds; changed in place.
+        ratio: before over after, with the store as it stands.
+        target: of the ratio.
+        tolerance: relative distance at which to stop.
+        reach: largest shift either way, in logits.
+        rounds: most measurements.
+
+    Returns:
+        The ratio measured last.
+    """
+    start = store.logits.detach().clone()
+    low, high = -reach, reach
+    shift, reached = 0.0, ratio()
+    for _ in range(rounds):
+        if abs(reached / target - 1) <= tolerance:
+            break
+        if reached < target:
+            low = shift
+        else:
+            high = shift
+        shift = (low + high) / 2
+        store.place(start + shift)
+        reached = ratio()
+    return reached

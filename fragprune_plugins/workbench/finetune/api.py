@@ -1,0 +1,164 @@
+"""Fine-tuning from Python: checks what comes in, and gives a goal what it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.goals import AtMost, Faster
+from fragprune_plugins.learning.interruption import Terminate
+from fragprune_plugins.learning.schedule import Schedule, Settings
+from fragprune_plugins.learning.stage2 import Progress
+from fragprune_plugins.learning.targets import Target
+from fragprune_plugins.plugins.hooks import engine_for, schedule_for
+from fragprune_plugins.reprs import one_line
+from fragprune_plugins.workbench.finetune.loop import Training
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints, Keeper
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.ranks import Ranks
+from fragprune_plugins.workbench.scenes.dataset import Dataset
+
+
+@dataclass(frozen=True, eq=False)
+class FinetuneResult:
+    """Result of a fine-tuning.
+
+    Attributes:
+        model: the Gaussians with what they learned; what ``train`` did not name is the very tensor
+            that came in. A control and a portable model have no thresholds.
+        settings: of the fine-tuning.
+        curves: one point per step.
+        progress: steps done, fragments before and after on the training views, the target.
+        train_seconds: wall-clock seconds of the loop.
+        engine: the engine's name.
+        interrupted: Ctrl-C or SIGTERM ended it early; the result is what was learned until then.
+        terminated: SIGTERM ended it.
+        resumed_at: steps that came out of a checkpoint; 0 without one.
+    """
+
+    model: Model
+    settings: Settings
+    curves: Sequence[StepStats]
+    progress: Progress
+    train_seconds: float
+    engine: str
+    interrupted: bool
+    terminated: bool
+    resumed_at: int = 0
+
+    __repr__ = one_line
+
+
+def finetune(
+    model: Model | models.Trained | str | Path,
+    dataset: Dataset,
+    settings: Settings | None = None,
+    *,
+    schedule: Schedule | None = None,
+    target: Target | None = None,
+    engine: str | Engine = "auto",
+    progress: bool = False,
+    checkpoints: Checkpoints | None = None,
+    ranks: Ranks | None = None,
+) -> FinetuneResult:
+    """Learn the thresholds of a trained splat on its photographs; portable, its shapes.
+
+    Loss: 0.8 L1 + 0.2 (1 - SSIM) + pressure x drawn fragments per pixel; portable, pressure x
+    area of the ellipses per pixel. Views come in seeded
+    random permutations; the global random streams are not touched.
+
+    Args:
+        model: what ``load`` gave, the result of another fine-tuning, or a file; not changed.
+            Learning begins with its thresholds, or with neutral ones. Everything happens on its
+            device.
+        dataset: its photographs; only training views are learned from. Pixels stay in main memory
+            and follow the model one view at a time.
+        settings: iterations, what moves, the goal; defaults when None.
+        schedule: gives the plan of each step; when None a plugin's, or the default one.
+        target: holds thresholds to a ratio; that of the goal when None. For frame times it needs
+            the prices of this machine, which are measured at the first use and kept.
+        engine: a name or an engine.
+        progress: draw a bar on stderr.
+        checkpoints: where the unfinished fine-tuning is kept. If there is one of the same
+            configuration, this goes on from it; on the cpu engine the result is then the same to
+            the bit. Whoever saves the result clears them. ``AtMost`` keeps none.
+        ranks: the processes that learn together (``ranks.joined``), each of which calls this with
+            equal arguments and gets the same result; only the first writes checkpoints, draws the
+            bar and tells observers. This one alone when None. With a ``ShardedEngine`` each passes
+            its own Gaussians, and gets those back (``part_of``, ``whole_of``).
+
+    Raises:
+        EngineError: no such engine here.
+        CheckpointError: the checkpoint is broken, or another fine-tuning's.
+        PluginError: a plugin raised, or gave an answer that cannot be used.
+        UsageError: a target time that no thresholds reach; a portable goal for a model with
+            thresholds; a target time, or views that cannot be divided, in several processes.
+        RanksError: another process is gone, or differs.
+        DivergedError: NaN or infinity in what trains.
+    """
+    from fragprune_plugins.workbench.distributed.processes import processes_of
+
+    ranks, model = ranks or Ranks(), models.of(model)
+    settings, device = settings or Settings(), model.device
+    engine = engine_for(engine, device) if isinstance(engine, str) else engine
+    dataset = dataset.to(device)
+    goal = settings.goal
+    if isinstance(goal, AtMost):
+        from fragprune_plugins.workbench.finetune.searching import strongest
+
+        return strongest(
+            model, dataset, settings, engine=engine, progress=progress, ranks=ranks
+        ).result
+    processes = processes_of(engine, ranks, len(model))
+    processes.expect_able(settings)
+    if isinstance(goal, Faster) and target is None:
+        from fragprune_plugins.workbench.prices.target import frame_target
+
+        target = frame_target(goal.ratio, engine, device)
+    if goal.on_area and model.pruned:
+        raise UsageError(
+            "finetune",
+            "a portable goal, and a model with thresholds or a stop",
+            "a model without any: it is for viewers that ignore them",
+            "Pass model.untruncated(), or --no-truncation on the command line.",
+        )
+    training = Training(
+        model,
+        dataset,
+        settings,
+        schedule or schedule_for(settings),
+        engine,
+        processes,
+        target,
+    )
+    keeper = Keeper(checkpoints, training)
+    resumed, interrupted, terminated = training.done, False, False
+    try:
+        training.learn(keeper, progress and ranks.first)
+    except KeyboardInterrupt as error:
+        if training.processes.divided and not training.between:
+            raise  # a second signal did not wait for the others, who hold the other parts
+        interrupted, terminated = True, isinstance(error, Terminate)
+        if training.between:
+            keeper.keep(training)
+    training.stage.check()
+    return FinetuneResult(
+        model=training.result_model(),
+        settings=settings,
+        curves=training.curves,
+        progress=replace(
+            training.stage.progress(),
+            steps=training.done,
+            gaussians=training.processes.total(len(model)),
+        ),
+        train_seconds=training.seconds,
+        engine=engine.name,
+        interrupted=interrupted,
+        terminated=terminated,
+        resumed_at=resumed,
+    )
