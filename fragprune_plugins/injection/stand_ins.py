@@ -20,17 +20,21 @@ log = logging.getLogger("fragprune")
 def runs_here(dialect: Dialect, package: str) -> bool:
     """Whether the host can import and run its own compiled modules of a package here."""
     from torch.cuda import is_available
-    from torch.utils import cpp_extension
 
     names = dialect.names()
     own = package not in names and any(name.startswith(f"{package}.") for name in names)
     if own and dialect.own_kernels:  # the host's folder need not be on the path yet
-        compiler = dialect.own_kernels != "compiler" or cpp_extension.CUDA_HOME is not None
-        return compiler and is_available()
+        return is_available() and (dialect.own_kernels != "compiler" or _compiles())
     try:
         return find_spec(package) is not None
     except ValueError:  # a module without a spec is another tool's stand-in
         return True
+
+
+def _compiles() -> bool:
+    from torch.utils.cpp_extension import CUDA_HOME  # brings setuptools, which alters sys.path
+
+    return CUDA_HOME is not None
 
 
 class StandIns:

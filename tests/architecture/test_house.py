@@ -23,9 +23,9 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (14_905, 12_000),
+    "core lines": (15_110, 12_000),
     "core imports of the workbench": (0, 0),
-    "imports inside functions": (117, 60),
+    "imports inside functions": (121, 60),
     "functions over 60 lines": (16, 10),
     "longest function": (142, 80),
     "members of an adapter": (24, 24),

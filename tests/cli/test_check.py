@@ -12,9 +12,9 @@ from miniatures.skeletons import STATES, skeleton
 
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.plugins import loading
 from fragprune_plugins.testing import mutations
 from fragprune_plugins.workbench import demo
+from fragprune_plugins.workbench.check import work
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 MINIATURE = Path(demo.__file__).with_name("host")
@@ -168,7 +168,7 @@ def test_an_ancestor_of_the_host_steps_back_and_says_so(tmp_path, monkeypatch):
         name, descends_from = "fork", ("vanilla-3dgs",)
 
     plugins = SimpleNamespace(adapters=[Vanilla3DGS(), Fork()])
-    monkeypatch.setattr(loading, "load_plugins", lambda: plugins)
+    monkeypatch.setattr(work, "load_plugins", lambda: plugins)
     skeleton(tmp_path)
     assert run_json("check", tmp_path)["fits"] == "fork"
     said = run("check", tmp_path).stdout

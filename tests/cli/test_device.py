@@ -16,6 +16,7 @@ from finetune import tiny
 from fragprune_plugins import engines
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.run.work import measure_models
 
@@ -25,7 +26,8 @@ def engine(monkeypatch, plug):
     """Draws what is elsewhere, where every command is sent."""
     made = elsewhere.Engine()
     plug(made)
-    monkeypatch.setattr(engines, "device_for", lambda wanted, engine="auto": elsewhere.DEVICE)
+    for module in (engines, opening):
+        monkeypatch.setattr(module, "device_for", lambda wanted, engine="auto": elsewhere.DEVICE)
     with elsewhere.there():
         yield made
 
@@ -53,9 +55,9 @@ COMMANDS = {
     "render cameras": lambda data, path, cameras, out: (path, "--cameras", cameras, "--out", out),
     "profile": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
     "compare": lambda data, path, cameras, out: (path, path, "--data", data, "--out", out),
-    "bench": lambda *_: ("--size", "24x16", "--gaussians", 40, "--repeats", 2),
+    "bench": lambda *_: ("--size", "24x16", "--gaussians", 40),
     "bench a model": lambda data, path, cameras, out: (
-        *("--model", path, "--cameras", cameras, "--size", "24x16", "--repeats", 2),
+        *(path, "--cameras", cameras, "--size", "24x16"),
     ),
 }
 

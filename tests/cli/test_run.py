@@ -10,6 +10,7 @@ import sys
 import pytest
 import torch
 from cli.commands import run, run_json
+from finetune import tiny
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 from PIL import Image
@@ -192,6 +193,8 @@ def test_the_package_runs_as_a_module(tmp_path):
 
 
 def test_two_models_of_nobody_need_their_photographs_named(tmp_path):
+    for name in ("a.ply", "b.ply"):
+        tiny.scene(tmp_path / name[0])[1].rename(tmp_path / name)
     result = run("compare", tmp_path / "a.ply", tmp_path / "b.ply", "--json")
     assert result.exit_code == 2
     assert "no record" in json.loads(result.stdout)["error"]["found"]

@@ -92,11 +92,11 @@ def test_a_failed_film_leaves_the_earlier_one(tmp_path):
 def test_render_films_an_orbit_and_a_path(tmp_path):
     data, model, splat = tiny.scene(tmp_path)
     film = tmp_path / "a.mp4"
-    words = ("--seconds", 0.5, "--fps", 8)
+    words = ("--seconds", 0.15)
     report = run_json("render", model, "--orbit", *words, "--resolution", 16, "--out", film)
     assert report["files"] == [str(film)]
     size, fps, pictures = frames_of(film)
-    assert (size, fps, len(pictures)) == ((80, 44), 8, 4)
+    assert (size, fps, len(pictures)) == ((80, 44), 30, 4)
     run_json("render", model, "--data", data, "--views", "train", *words, "--out", film)
     size, _, pictures = frames_of(film)
     assert (size, len(pictures)) == ((tiny.SIDE, tiny.SIDE), 4)
@@ -108,7 +108,7 @@ def test_render_films_an_orbit_and_a_path(tmp_path):
 def test_an_orbit_can_be_pictures(tmp_path):
     _, model, _ = tiny.scene(tmp_path)
     out = tmp_path / "pictures"
-    words = ("--seconds", 0.5, "--fps", 8, "--resolution", 16)
+    words = ("--seconds", 0.15, "--resolution", 16)
     assert len(run_json("render", model, "--orbit", *words, "--out", out)["files"]) == 4
 
 

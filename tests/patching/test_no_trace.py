@@ -115,7 +115,7 @@ def after_run(folder: Path, scene: Path, name: str) -> tuple[int, list[str]]:
 def test_activating_and_deactivating_leaves_no_trace(tmp_path):
     count, differences = fresh(after_nothing, tmp_path)
     assert count > OBJECTS
-    assert differences == []
+    assert differences == [], "\n".join(differences)
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -123,7 +123,7 @@ def test_a_run_leaves_no_trace(name, scene, tmp_path):
     """The host itself seeds the random streams; after the run they are where the host left them."""
     count, differences = fresh(after_run, tmp_path, scene, name)
     assert count > OBJECTS
-    assert differences == []
+    assert differences == [], "\n".join(differences)
 
 
 def planted(folder: Path) -> list[str]:

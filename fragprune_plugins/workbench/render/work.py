@@ -91,7 +91,7 @@ def render(
         everybody = ranks.gather(drawing.fragments)
     if not ranks.first:
         return None
-    drawn = [figure for each in everybody for figure in each.values()]
+    drawn = {index: each[index] for each in everybody for index in each}  # some draw one twice
     figures = {
         "model": str(model),
         "files": [str(file) for file in files],
@@ -101,7 +101,7 @@ def render(
         "device": str(device),
     }
     wrote = f"{out}, {len(drawn)} frames" if film else f"{len(files)} pictures to {out}"
-    return _report(figures, wrote, drawn)
+    return _report(figures, wrote, [*drawn.values()])
 
 
 def _report(figures: dict[str, Any], wrote: str, fragments: list[float]) -> Report:

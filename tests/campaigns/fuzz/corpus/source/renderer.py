@@ -1,6 +1,8 @@
 import math
 
+import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+
 from scene.gaussian_model import GaussianModel
 
 
