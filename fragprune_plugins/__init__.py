@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
     from fragprune_plugins.workbench.figures.evaluate import measure
     from fragprune_plugins.workbench.figures.viewing import overview, render_view
-    from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
+    from fragprune_plugins.workbench.finetune.api import finetune
+    from fragprune_plugins.workbench.finetune.result import FinetuneResult
     from fragprune_plugins.workbench.models.model import load, save
     from fragprune_plugins.workbench.prices.calibration import prices_of
     from fragprune_plugins.workbench.prices.cost import Cost
@@ -63,7 +64,7 @@ _HOME = {
     "Cost": "workbench.prices.cost",
     "Faster": "learning.goals",
     "Fewer": "learning.goals",
-    "FinetuneResult": "workbench.finetune.api",
+    "FinetuneResult": "workbench.finetune.result",
     "Footprints": "types",
     "Model": "files.model",
     "Moment": "types",

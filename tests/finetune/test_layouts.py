@@ -19,7 +19,7 @@ from fragprune_plugins.workbench.finetune.loop import photometric_loss
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.memory import Pictures, Slot
-from fragprune_plugins.workbench.scenes.pinhole import Posed, split
+from fragprune_plugins.workbench.scenes.posed import Posed, split
 
 NAMES = [f"view{i:02d}" for i in range(9)]
 

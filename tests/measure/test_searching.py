@@ -6,7 +6,6 @@ from dataclasses import make_dataclass
 from types import SimpleNamespace
 
 import pytest
-from finetune import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -69,38 +68,38 @@ def test_a_loss_that_stays_below_the_bound_ends_with_ever_more():
 Result = make_dataclass("Result", ["settings", "progress", "interrupted", "terminated"])
 
 
-def searched(bound):
-    settings = Settings(goal=AtMost(bound))
-    return strongest(tiny.random_model(), SimpleNamespace(test=[]), settings, engine="cpu")
+def train(settings):
+    """A training that loses 1 dB at a pressure of 1e-3, in proportion, and is not made."""
+    goal = settings.goal
+    pressure = 0.0 if goal == Control() else 2e-4 if goal.weight is None else goal.weight
+    progress = SimpleNamespace(pressure=pressure, fragments_before=40.0)
+    return Result(settings, progress, False, False)
 
 
-@pytest.fixture
-def trained(monkeypatch):
-    """Trainings that lose 1 dB at a pressure of 1e-3, in proportion, and are not made."""
-    seen: list[Settings] = []
+def searched(bound, train=train, say=lambda _: None, **settings):
+    return strongest(train, Settings(goal=AtMost(bound), **settings), [], engine=None, say=say)
 
-    def finetune(model, dataset, settings, **options):
-        seen.append(settings)
-        goal = settings.goal
-        pressure = 0.0 if goal == Control() else 2e-4 if goal.weight is None else goal.weight
-        progress = SimpleNamespace(pressure=pressure, fragments_before=40.0)
-        return Result(settings, progress, False, False)
+
+@pytest.fixture(autouse=True)
+def _measured(monkeypatch):
+    """Held-out views of such trainings."""
 
     def held_out(result, shots, engine):
         lost = 1000 * result.progress.pressure if result.settings.goal.presses else 0.0
         return [30.0 - lost, 32.0 - lost], 20.0 - 5 * lost
 
-    monkeypatch.setattr(searching, "finetune", finetune)
     monkeypatch.setattr(searching, "_held_out", held_out)
-    return seen
 
 
-def test_the_strongest_within_the_bound_is_kept_and_the_control_trains_equally_long(trained):
-    model, dataset = tiny.random_model(), SimpleNamespace(test=[])
+def test_the_strongest_within_the_bound_is_kept_and_the_control_trains_equally_long():
     said: list[str] = []
-    found = strongest(
-        model, dataset, Settings(iterations=77, goal=AtMost(0.1)), engine="cpu", say=said.append
-    )
+    trained: list[Settings] = []
+
+    def noted(settings):
+        trained.append(settings)
+        return train(settings)
+
+    found = searched(0.1, noted, said.append, iterations=77)
     assert found.trial is not None
     assert 0.1 - TOLERANCE <= found.trial.loss <= 0.1
     assert found.result.progress.pressure == found.trial.pressure
@@ -110,24 +109,20 @@ def test_the_strongest_within_the_bound_is_kept_and_the_control_trains_equally_l
     assert len(said) == 1 + 2 * len(found.trials)
 
 
-def test_an_unreachable_bound_keeps_the_least_loss_and_says_so(trained, monkeypatch):
+def test_an_unreachable_bound_keeps_the_least_loss_and_says_so(monkeypatch):
     monkeypatch.setattr(
         searching,
         "_held_out",
         lambda result, shots, engine: ([30.0 - result.settings.goal.presses], 20.0),
     )
-    found = strongest(
-        tiny.random_model(), SimpleNamespace(test=[]), Settings(goal=AtMost(0.1)), engine="cpu"
-    )
+    found = searched(0.1)
     assert len(found.trials) == TRAININGS
     assert not found.as_dict()["met"]
     assert found.trial is not None
     assert found.trial.loss == pytest.approx(1.0)
 
 
-def test_a_loss_that_never_reaches_the_bound_ends_before_a_pressure_that_is_none(
-    trained, monkeypatch
-):
+def test_a_loss_that_never_reaches_the_bound_ends_before_a_pressure_that_is_none(monkeypatch):
     monkeypatch.setattr(searching, "_held_out", lambda result, shots, engine: ([30.0], 20.0))
     monkeypatch.setattr(searching, "next_pressure", lambda trials, bound: 9 * trials[-1].pressure)
     found = searched(5.0)
@@ -143,7 +138,7 @@ def test_a_bound_out_of_range_is_usage(bound):
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, Terminate])
 @pytest.mark.parametrize("at", [1, 2, 3])
-def test_a_signal_while_views_are_measured_keeps_what_was_trained(trained, monkeypatch, stop, at):
+def test_a_signal_while_views_are_measured_keeps_what_was_trained(monkeypatch, stop, at):
     measured, held_out = [], searching._held_out
 
     def signalled(*args):
@@ -153,9 +148,7 @@ def test_a_signal_while_views_are_measured_keeps_what_was_trained(trained, monke
         return held_out(*args)
 
     monkeypatch.setattr(searching, "_held_out", signalled)
-    found = strongest(
-        tiny.random_model(), SimpleNamespace(test=[]), Settings(goal=AtMost(0.1)), engine="cpu"
-    )
+    found = searched(0.1)
     kept = measured[1 if at == 3 else at - 1]  # the best that was measured, else the last
     assert found.result.settings == kept.settings
     assert found.result.interrupted

@@ -10,7 +10,7 @@ import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,12 +23,9 @@ from fragprune_plugins.learning.interruption import Waiting
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
-from fragprune_plugins.workbench.finetune.alone import Alone
+from fragprune_plugins.workbench.finetune.loop import Alone, Training
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint
 from fragprune_plugins.workbench.scenes.dataset import Shot
-
-if TYPE_CHECKING:
-    from fragprune_plugins.workbench.finetune.loop import Training
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _COMPARE = 100  # steps from one comparison of replicas to the next

@@ -2,56 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.goals import AtMost, Faster
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.stage2 import Progress
 from fragprune_plugins.learning.targets import Target
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for
-from fragprune_plugins.reprs import one_line
+from fragprune_plugins.workbench.distributed.processes import processes_of
 from fragprune_plugins.workbench.finetune.loop import Training
+from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, Keeper
+from fragprune_plugins.workbench.finetune.searching import strongest
 from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.prices.target import frame_target
 from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset
-
-
-@dataclass(frozen=True, eq=False)
-class FinetuneResult:
-    """Result of a fine-tuning.
-
-    Attributes:
-        model: the Gaussians with what they learned; what ``train`` did not name is the very tensor
-            that came in. A control and a portable model have no thresholds.
-        settings: of the fine-tuning.
-        curves: one point per step.
-        progress: steps done, fragments before and after on the training views, the target.
-        train_seconds: wall-clock seconds of the loop.
-        engine: the engine's name.
-        interrupted: Ctrl-C or SIGTERM ended it early; the result is what was learned until then.
-        terminated: SIGTERM ended it.
-        resumed_at: steps that came out of a checkpoint; 0 without one.
-    """
-
-    model: Model
-    settings: Settings
-    curves: Sequence[StepStats]
-    progress: Progress
-    train_seconds: float
-    engine: str
-    interrupted: bool
-    terminated: bool
-    resumed_at: int = 0
-
-    __repr__ = one_line
 
 
 def finetune(
@@ -101,24 +72,17 @@ def finetune(
         RanksError: another process is gone, or differs.
         DivergedError: NaN or infinity in what trains.
     """
-    from fragprune_plugins.workbench.distributed.processes import processes_of
-
     ranks, model = ranks or Ranks(), models.of(model)
     settings, device = settings or Settings(), model.device
     engine = engine_for(engine, device) if isinstance(engine, str) else engine
     dataset = dataset.to(device)
     goal = settings.goal
     if isinstance(goal, AtMost):
-        from fragprune_plugins.workbench.finetune.searching import strongest
-
-        return strongest(
-            model, dataset, settings, engine=engine, progress=progress, ranks=ranks
-        ).result
+        train = partial(finetune, model, dataset, engine=engine, progress=progress, ranks=ranks)
+        return strongest(train, settings, dataset.test, engine=engine).result
     processes = processes_of(engine, ranks, len(model))
     processes.expect_able(settings)
     if isinstance(goal, Faster) and target is None:
-        from fragprune_plugins.workbench.prices.target import frame_target
-
         target = frame_target(goal.ratio, engine, device)
     if goal.on_area and model.pruned:
         raise UsageError(
@@ -136,10 +100,14 @@ def finetune(
         processes,
         target,
     )
-    keeper = Keeper(checkpoints, training)
+    return _learned(training, Keeper(checkpoints, training), progress and ranks.first)
+
+
+def _learned(training: Training, keeper: Keeper, progress: bool) -> FinetuneResult:
+    """Learn to the end, or until a signal comes."""
     resumed, interrupted, terminated = training.done, False, False
     try:
-        training.learn(keeper, progress and ranks.first)
+        training.learn(keeper, progress)
     except KeyboardInterrupt as error:
         if training.processes.divided and not training.between:
             raise  # a second signal did not wait for the others, who hold the other parts
@@ -147,17 +115,15 @@ def finetune(
         if training.between:
             keeper.keep(training)
     training.stage.check()
+    count = training.processes.total(len(training.start))
+    progress_made = replace(training.stage.progress(), steps=training.done, gaussians=count)
     return FinetuneResult(
         model=training.result_model(),
-        settings=settings,
+        settings=training.settings,
         curves=training.curves,
-        progress=replace(
-            training.stage.progress(),
-            steps=training.done,
-            gaussians=training.processes.total(len(model)),
-        ),
+        progress=progress_made,
         train_seconds=training.seconds,
-        engine=engine.name,
+        engine=training.engine.name,
         interrupted=interrupted,
         terminated=terminated,
         resumed_at=resumed,

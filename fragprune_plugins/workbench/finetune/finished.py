@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files import records
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import EXIT_CODE
 from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.wording import (
+    FELL,
+    describe,
+    outcome,
+)
+from fragprune_plugins.workbench.finetune.result import FinetuneResult
+from fragprune_plugins.workbench.finetune.searching import Bounded
 from fragprune_plugins.workbench.models import formats
+from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.written import describe_dropped, describe_written
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from torch import Tensor
-
-    from fragprune_plugins.engines import Engine
-    from fragprune_plugins.hosts.photographs import Photographs
-    from fragprune_plugins.workbench.figures.evaluate import Candidate
-    from fragprune_plugins.workbench.finetune.api import FinetuneResult
-    from fragprune_plugins.workbench.finetune.searching import Bounded
-    from fragprune_plugins.workbench.scenes.dataset import Dataset
+from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 _OF_RECORDS = {"cameras", "curves", "photographs", "configuration", "text"}
 
@@ -37,6 +41,7 @@ class Finetuned:
         out: the file that was written.
         start: the model as it came in.
         result: what was learned.
+        saved: the model in ``out``: of all processes, where they divided it.
         keep: the share of Gaussians to learn with, or how to choose it; None for all.
         removed: Gaussians that went before learning.
         found: what a search for the strongest truncation found; None without one.
@@ -50,6 +55,7 @@ class Finetuned:
     out: Path
     start: Candidate
     result: FinetuneResult
+    saved: Model
     keep: float | Literal["auto"] | None
     removed: int
     found: Bounded | None
@@ -63,8 +69,6 @@ class Finetuned:
 
         The last two only where there are any.
         """
-        from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-
         result = self.result
         whole = result.progress.gaussians if self.shards > 1 else None
         candidates = [self.start, Candidate(result.model, gaussians=whole)]
@@ -91,11 +95,29 @@ class Finetuned:
             asked: the configuration, by which the same command is known again.
             pictures: the cameras of the model's own pictures, for the record.
         """
+        data = self._data(figures)
+        result = self.result
+        text = self._text(data, len(dataset.test), len(dataset.train) + len(dataset.test))
+        more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
+        more |= {"cameras": pictures} if pictures else {}
+        if not result.interrupted:
+            more |= {"configuration": asked, "text": text}
+        if photographs is not None:
+            more["photographs"] = photographs.as_dict() | {
+                "models": [str(self.model.resolve()), str(self.out.resolve())],
+                "filtered": False,
+                "drawing": {},
+            }
+        records.leave(self.out, "finetune", data | more)
+        return Report(data, text, exit_code=130 if result.interrupted else 0)
+
+    def _data(self, figures: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """What the record and ``--json`` say, from figures as ``measured``."""
         result, settings = self.result, self.result.settings
         before, after, *without = figures
         control = without.pop() if self.found is not None else None
         done = result.progress
-        data = {
+        data: dict[str, Any] = {
             "model": str(self.model),
             "out": str(self.out),
             "target": after["target"],
@@ -123,19 +145,7 @@ class Finetuned:
             "max_drop": None if self.found is None else self.found.as_dict(),
         }
         data["control"] = control or records.control_of(data, records.files(self.out.parent))
-        text = self._text(data, len(dataset.test), len(dataset.train) + len(dataset.test))
-        more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
-        more |= {"cameras": pictures} if pictures else {}
-        if not result.interrupted:
-            more |= {"configuration": asked, "text": text}
-        if photographs is not None:
-            more["photographs"] = photographs.as_dict() | {
-                "models": [str(self.model.resolve()), str(self.out.resolve())],
-                "filtered": False,
-                "drawing": {},
-            }
-        records.leave(self.out, "finetune", data | more)
-        return Report(data, text, exit_code=130 if result.interrupted else 0)
+        return data
 
     def _text(self, data: dict[str, Any], held_out: int, views: int) -> str:
         """What a person reads.
@@ -145,8 +155,6 @@ class Finetuned:
             held_out: number of held-out views.
             views: number of all views.
         """
-        from fragprune_plugins.workbench.figures.wording import describe, outcome
-
         result, settings, before = self.result, self.result.settings, data["before"]
         pressure = f" at pressure {data['pressure']:.2g}" if settings.goal.presses else ""
         lines = [
@@ -191,8 +199,6 @@ class Finetuned:
 
 def finished(model: Path, out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
     """The report of the same command, if it has written ``out`` already; else None."""
-    from fragprune_plugins.workbench.models import model as models
-
     if not out.is_file():
         return None
     try:
@@ -275,8 +281,6 @@ def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
         before: measurement of the model before fine-tuning.
         plain: measurement of the fine-tuned model without thresholds and stop.
     """
-    from fragprune_plugins.workbench.figures.wording import FELL
-
     own = plain["target"] == "itself"
     compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
     advice = ""

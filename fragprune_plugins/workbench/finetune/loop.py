@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -27,9 +27,7 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.types import RasterInputs, RasterOutputs
-from fragprune_plugins.workbench.finetune.alone import Alone
 from fragprune_plugins.workbench.finetune.order import order
-from fragprune_plugins.workbench.finetune.resuming import Keeper
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions
@@ -38,6 +36,78 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _POSTFIXES = 100  # times in a run that the bar says how it goes
+
+
+class Keeper(Protocol):
+    """Writes the checkpoints of a training."""
+
+    def due(self, step: int) -> bool:
+        """Whether it is time for one after a step."""
+
+    def keep(self, training: Training) -> None:
+        """Write one."""
+
+
+class Alone:
+    """One process, which holds the whole model.
+
+    A training asks it in every step. Several processes (``workbench.distributed``) override what
+    they do otherwise.
+
+    Attributes:
+        first: this process writes files and speaks.
+        several: there are others.
+        divided: other processes hold other Gaussians of the model.
+        may_end: a signal may end the training after this step.
+    """
+
+    first = True
+    several = False
+    divided = False
+    may_end = True
+
+    def expect_able(self, settings: Settings) -> None:
+        """Raise UsageError if these processes cannot share the work of settings."""
+
+    def agree(self, known: dict[str, Any]) -> None:
+        """Raise RanksError if another process is about to learn something else."""
+
+    def share(self, shots: Sequence[Shot]) -> Sequence[Shot]:
+        """The views of a step that this process draws."""
+        return shots
+
+    def went_backward(self, training: Training, shots: Sequence[Shot], waiting: Waiting) -> None:
+        """The gradients of a step are there; raises RanksError if another process is gone."""
+
+    def stepped(self, training: Training) -> None:
+        """A step is over; raises RanksError if processes have parted."""
+
+    def finished(self, training: Training) -> None:
+        """The last step is over; raises RanksError if processes have parted."""
+
+    def keeps(self, training: Training) -> bool:
+        """Whether it is time for a checkpoint after this step."""
+        return training.keeper is not None and training.keeper.due(training.done)
+
+    def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
+        """What decides the result, in the words of all processes together."""
+        return configuration
+
+    def total(self, count: int) -> int:
+        """Gaussians of the whole model, from those that this process holds."""
+        return count
+
+    def everywhere(self, rows: Tensor) -> Tensor:
+        """The rows of all Gaussians, in each process."""
+        return rows
+
+    def whole(self, rows: Tensor) -> Tensor:
+        """The rows of all Gaussians, in the first process; there may be none in others."""
+        return rows
+
+    def own(self, rows: Tensor) -> Tensor:
+        """This process' rows, of those of all Gaussians."""
+        return rows
 
 
 class Training:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import astuple, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,11 +26,9 @@ from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.finetune.checkpoints import UNFIT
+from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph, Shot
 from fragprune_plugins.workbench.scenes.images import DOOR
-
-if TYPE_CHECKING:
-    from fragprune_plugins.workbench.finetune.loop import Training
 
 SUFFIX = ".fragprune-unfinished"
 EVERY = 300.0

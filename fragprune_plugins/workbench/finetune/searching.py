@@ -16,17 +16,14 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.goals import AtMost, Control, Pressure
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.targets import FEWEST
-from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.metrics import psnr
-from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
-from fragprune_plugins.workbench.ranks import Ranks
-from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
+from fragprune_plugins.workbench.finetune.result import FinetuneResult
+from fragprune_plugins.workbench.scenes.dataset import Shot
 
 TOLERANCE = 0.02
 """A loss this far below the bound, in dB, is not worth another training."""
@@ -85,14 +82,12 @@ class Bounded:
 
 
 def strongest(
-    model: Model,
-    dataset: Dataset,
+    train: Callable[[Settings], FinetuneResult],
     settings: Settings,
+    held_out: Sequence[Shot],
     *,
-    engine: str | Engine = "auto",
-    progress: bool = False,
+    engine: Engine,
     say: Callable[[str], None] = lambda _: None,
-    ranks: Ranks | None = None,
 ) -> Bounded:
     """Train the control, then with ever better chosen pressures.
 
@@ -100,13 +95,11 @@ def strongest(
     to try next.
 
     Args:
-        model: the trained splat; not changed.
-        dataset: training views to learn from, held-out views to measure the loss on.
+        train: makes one fine-tuning of the model.
         settings: of every training; their goal is ``AtMost``.
-        engine: a name or an engine.
-        progress: draw a bar for each training on stderr.
+        held_out: views to measure the loss on.
+        engine: draws them.
         say: called with a line of text before each training.
-        ranks: the processes that learn together; this one alone when None.
 
     Raises:
         UsageError: the goal is another one.
@@ -114,53 +107,91 @@ def strongest(
     """
     if not isinstance(settings.goal, AtMost):
         raise UsageError("goal", str(settings.goal), "AtMost(decibels)", "Pass such a goal.")
-    bound = settings.goal.decibels
-    if isinstance(engine, str):
-        engine = engine_for(engine, model.device)
-
-    def train(each: Settings) -> FinetuneResult:
-        return finetune(model, dataset, each, engine=engine, progress=progress, ranks=ranks)
-
+    search = _Search(settings.goal.decibels, say)
     say("Training the control, without truncation.")
-    control = train(replace(settings, goal=Control()))
-    result, trials = control, list[Trial]()
-    best: tuple[FinetuneResult, Trial] | None = None
-    pressure: float | None = None
-
-    def ended(terminated: bool) -> Bounded:
-        kept, trial = best or (result, None)
-        kept = replace(kept, interrupted=True, terminated=terminated)
-        return Bounded(bound, kept, trial, control, trials)
-
+    search.last = search.control = control = train(replace(settings, goal=Control()))
     if control.interrupted:
-        return ended(control.terminated)
+        return search.ended(control.terminated)
     try:
-        reference, _ = _held_out(control, dataset.test, engine)
-        while len(trials) < TRAININGS:
-            at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
-            say(f"Training {len(trials) + 1} of at most {TRAININGS}, at {at}.")
-            result = train(replace(settings, goal=Pressure(pressure)))
+        reference, _ = _held_out(control, held_out, engine)
+        while not search.over():
+            search.announce()
+            search.last = result = train(replace(settings, goal=Pressure(search.pressure)))
             if result.interrupted:
-                return ended(result.terminated)
-            figures, fragments = _held_out(result, dataset.test, engine)
+                return search.ended(result.terminated)
+            figures, fragments = _held_out(result, held_out, engine)
             losses = [was - now for was, now in zip(reference, figures, strict=True)]
-            spread = statistics.stdev(losses) / len(losses) ** 0.5 if len(losses) > 1 else 0.0
-            trial = Trial(result.progress.pressure, statistics.fmean(losses), spread, fragments)
-            trials.append(trial)
-            say(
-                f"Loss against the control: {trial.loss:.3f} dB at {fragments:.1f} fragments/pixel."
-            )
-            if best is None or _better(trial, best[1], bound):
-                best = result, trial
-            before = result.progress.fragments_before or 0.0
-            enough = fragments * FEWEST < before and trial.loss <= bound
-            if enough or bound - TOLERANCE <= trial.loss <= bound or pressure == _STRONGEST:
-                break
-            pressure = min(next_pressure(trials, bound), _STRONGEST)
+            search.tried(result, losses, fragments)
     except KeyboardInterrupt as error:  # not in a training, which ends by itself
-        return ended(isinstance(error, Terminate))
-    assert best is not None
-    return Bounded(bound, *best, control, trials)
+        return search.ended(isinstance(error, Terminate))
+    return search.found()
+
+
+class _Search:
+    """A search under way.
+
+    Attributes:
+        bound: dB.
+        say: is told what happens.
+        control: its result, once there is one.
+        last: the training that ended last.
+        pressure: of the next training; None for the default one.
+        trials: all that were measured.
+        best: of them, with its result.
+    """
+
+    control: FinetuneResult
+    last: FinetuneResult
+
+    def __init__(self, bound: float, say: Callable[[str], None]) -> None:
+        self.bound, self.say = bound, say
+        self.pressure: float | None = None
+        self.trials: list[Trial] = []
+        self.best: tuple[FinetuneResult, Trial] | None = None
+        self._enough = False
+
+    def over(self) -> bool:
+        """Whether another training is not worth its time."""
+        return self._enough or len(self.trials) == TRAININGS
+
+    def announce(self) -> None:
+        """Say which training comes."""
+        pressure = self.pressure
+        at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
+        self.say(f"Training {len(self.trials) + 1} of at most {TRAININGS}, at {at}.")
+
+    def tried(self, result: FinetuneResult, losses: Sequence[float], fragments: float) -> None:
+        """Take a training into account, and choose the next pressure.
+
+        Args:
+            result: of the training.
+            losses: of each held-out view against the control, dB.
+            fragments: per pixel, mean over held-out views.
+        """
+        spread = statistics.stdev(losses) / len(losses) ** 0.5 if len(losses) > 1 else 0.0
+        trial = Trial(result.progress.pressure, statistics.fmean(losses), spread, fragments)
+        self.trials.append(trial)
+        self.say(
+            f"Loss against the control: {trial.loss:.3f} dB at {fragments:.1f} fragments/pixel."
+        )
+        if self.best is None or _better(trial, self.best[1], self.bound):
+            self.best = result, trial
+        before, kept = result.progress.fragments_before or 0.0, trial.loss <= self.bound
+        few, near = fragments * FEWEST < before, trial.loss >= self.bound - TOLERANCE
+        self._enough = (kept and (few or near)) or self.pressure == _STRONGEST
+        if not self.over():
+            self.pressure = min(next_pressure(self.trials, self.bound), _STRONGEST)
+
+    def found(self) -> Bounded:
+        """The best of all."""
+        assert self.best is not None
+        return Bounded(self.bound, *self.best, self.control, self.trials)
+
+    def ended(self, terminated: bool) -> Bounded:
+        """The best so far, after a signal; without a measured one the last."""
+        kept, trial = self.best or (self.last, None)
+        kept = replace(kept, interrupted=True, terminated=terminated)
+        return Bounded(self.bound, kept, trial, self.control, self.trials)
 
 
 def next_pressure(trials: Sequence[Trial], bound: float) -> float:

@@ -16,7 +16,7 @@ from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import Door, Reading
 from fragprune_plugins.workbench.scenes.images import find_image
 from fragprune_plugins.workbench.scenes.lenses import Lens
-from fragprune_plugins.workbench.scenes.pinhole import Posed, split
+from fragprune_plugins.workbench.scenes.posed import Posed, split
 
 NERFSTUDIOS = Path("colmap", "sparse", "0")
 

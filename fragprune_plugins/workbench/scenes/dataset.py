@@ -22,7 +22,8 @@ from fragprune_plugins.workbench.scenes import colmap, transforms
 from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened
 from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.memory import PICTURES, Slot
-from fragprune_plugins.workbench.scenes.pinhole import Camera, Posed
+from fragprune_plugins.workbench.scenes.pinhole import Camera
+from fragprune_plugins.workbench.scenes.posed import Posed
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -18,7 +18,7 @@ from torch import Tensor
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
-from fragprune_plugins.workbench.scenes.pinhole import HOLD_OUT
+from fragprune_plugins.workbench.scenes.posed import HOLD_OUT
 
 Named = list[tuple[str, View]]
 """Names of views, and the views."""

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.reprs import one_line
 from fragprune_plugins.types import View, check_lens, check_pose
-
-if TYPE_CHECKING:
-    from fragprune_plugins.workbench.scenes.lenses import Lens
 
 
 @dataclass(frozen=True)
@@ -85,45 +79,3 @@ class Camera:
             campos=exact.campos.float(),
             background=torch.zeros(3) if background is None else background,
         )
-
-
-log = logging.getLogger(__name__)
-
-HOLD_OUT = 8
-"""Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""
-
-
-class Posed(NamedTuple):
-    """A photograph that a scene lists, before any of its pixels is read.
-
-    Attributes:
-        name: unique in the scene.
-        camera: of the straightened photograph.
-        image: the file.
-        lens: what straightens it; None if it is straight.
-        mask: a picture of the same aspect, black where the photograph is to be ignored.
-    """
-
-    name: str
-    camera: Camera
-    image: Path
-    lens: Lens | None = None
-    mask: Path | None = None
-
-
-def split(rows: list[Posed]) -> tuple[list[Posed], list[Posed]]:
-    """The training views and the held-out views of a scene that does not say which they are.
-
-    Hosts sort by names without their suffix and folder, 3DGS since October 2024 by whole names. It
-    is warned of where that holds out other views.
-    """
-    ordered = sorted(rows, key=lambda row: Path(row.name).stem)
-    train, test = [row for i, row in enumerate(ordered) if i % HOLD_OUT], ordered[::HOLD_OUT]
-    whole = sorted(row.name for row in rows)[::HOLD_OUT]
-    if set(whole) != {row.name for row in test}:
-        log.warning(
-            "3DGS since October 2024 holds out other views of this scene: it sorts whole names. "
-            "For a model of it, rename the images so that both orders agree, and train again; "
-            "until then figures on held-out views include views that it was trained on"
-        )
-    return train, test

@@ -12,7 +12,7 @@ from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import MEBIBYTE, Door
 from fragprune_plugins.workbench.scenes.images import find_image, image_size
 from fragprune_plugins.workbench.scenes.lenses import Lens
-from fragprune_plugins.workbench.scenes.pinhole import Posed, split
+from fragprune_plugins.workbench.scenes.posed import Posed, split
 
 PAIR = ("transforms_train.json", "transforms_test.json")
 SINGLE = "transforms.json"

@@ -1,0 +1,311 @@
+"""Fine-tunes a model file: opens what is asked for, learns, saves, measures and reports."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.cpu.memory import keep_freed_memory
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files.atomic import locked
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.learning.goals import AtMost, Control, Faster
+from fragprune_plugins.learning.interruption import sigterm_interrupts
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import open_engine, photographs_for, pictures_of
+from fragprune_plugins.workbench.commands.options import (
+    EngineOptions,
+    SceneOptions,
+    require_several,
+)
+from fragprune_plugins.workbench.distributed.processes import part_of, whole_of
+from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.figures.evaluate import Candidate
+from fragprune_plugins.workbench.finetune import api, resuming
+from fragprune_plugins.workbench.finetune import finished as finetuned
+from fragprune_plugins.workbench.finetune.finished import Finetuned
+from fragprune_plugins.workbench.finetune.result import FinetuneResult
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.models.written import dropping, require_place
+from fragprune_plugins.workbench.prices.target import frame_target
+from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
+from fragprune_plugins.workbench.pruning.visibility import visible
+from fragprune_plugins.workbench.ranks import Ranks, joined, launched
+from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The options of the command, by their names there."""
+
+    model: Path
+    out: Path
+    itself: bool
+    cameras: Path | None
+    scene: SceneOptions
+    settings: Settings
+    keep: float | Literal["auto"] | None
+    seed: int
+    shard: bool
+    no_truncation: bool
+    curves: Path | None
+    drop: bool
+    every: float
+    again: bool
+    engine: EngineOptions
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """What a fine-tuning works with.
+
+    Attributes:
+        asked: the options.
+        whole: the model, on ``device``; of all processes on the CPU, if they divide it.
+        photographs: where they lie; None for the model's own pictures.
+        dataset: the photographs or pictures.
+        engine: draws.
+        device: where it draws.
+        checkpoints: of the unfinished fine-tuning.
+        configuration: what decides the result; a command of the same one is known again.
+    """
+
+    asked: Asked
+    whole: Model
+    photographs: Photographs | None
+    dataset: Dataset
+    engine: Engine
+    device: Any
+    checkpoints: Checkpoints
+    configuration: dict[str, Any]
+
+
+def finetune(asked: Asked) -> Report | None:
+    """Fine-tune; the report, in the first process.
+
+    Raises:
+        UsageError: options contradict each other, or ``out`` is no place for the result.
+    """
+    _require_sense(asked)
+    if asked.shard:
+        _require_shards(asked)
+    if launched().first:
+        require_place(asked.out, asked.model, thresholds=asked.settings.goal.learns)
+        lock = locked(asked.out, wait=0, what="run")
+        click.get_current_context().with_resource(lock)
+    opened = _open(asked)
+    with sigterm_interrupts():
+        with joined(opened.device) as ranks:
+            known = _finished(opened) if ranks.first else None
+            if ranks.gather(known is not None)[0]:
+                opened.checkpoints.clear()
+                return known
+            over, engine = _learned(opened, ranks)
+            measured = None
+            if asked.shard and not over.result.terminated:  # all draw, so all measure
+                measured = over.measured(opened.dataset, engine)
+        if not ranks.first:
+            return None
+    return _report(opened, over, measured)
+
+
+def _open(asked: Asked) -> _Opened:
+    """Read the model and its photographs, or draw its pictures."""
+    scene, settings, photographs = asked.scene, asked.settings, None
+    if scene.data is not None or not asked.itself:
+        remedy = "Pass --data FOLDER with photographs; without any, --self."
+        photographs = photographs_for(asked.model, scene, remedy=remedy)
+    engine, device = open_engine(asked.engine)
+    keep_freed_memory()
+    truncation = settings.goal.presses and not asked.no_truncation
+    where = "cpu" if asked.shard else device
+    whole = models.load(asked.model, truncation=truncation, device=where)
+    if asked.itself:
+        dataset = pictures_of(whole, scene, asked.cameras, engine, seed=asked.seed)
+    else:
+        assert photographs is not None
+        dataset = load_photographs(photographs)
+    checkpoints = Checkpoints(resuming.path_beside(asked.out), asked.every or None, tell=_say)
+    configuration = resuming.configuration(whole, dataset, settings, engine.name)
+    configuration |= {"drop_invisible": asked.drop, "keep": asked.keep}
+    configuration |= {"sharded": True} if asked.shard else {}
+    return _Opened(asked, whole, photographs, dataset, engine, device, checkpoints, configuration)
+
+
+def _finished(opened: _Opened) -> Report | None:
+    """The report of the same command, if it was finished before and --again was not given."""
+    asked = opened.asked
+    if asked.again:
+        opened.checkpoints.clear()
+        return None
+    return finetuned.finished(asked.model, asked.out, opened.configuration, asked.curves)
+
+
+def _learned(opened: _Opened, ranks: Ranks) -> tuple[Finetuned, Engine]:
+    """Learn with the other processes, save the result; also the engine that draws it."""
+    asked, whole, engine = opened.asked, opened.whole, opened.engine
+    count = len(whole)
+    if asked.shard:
+        whole, engine = part_of(whole, ranks, opened.device), ShardedEngine(engine, ranks)
+    start = Candidate(whole, gaussians=count)
+    kept = _keep(whole, asked.keep, opened.dataset.to(opened.device), engine)
+    result, found = _learn(kept, opened, engine, ranks)
+    saved = result
+    if asked.shard:
+        everything = whole_of(result.model, ranks)
+        saved = replace(result, model=everything) if ranks.first else result
+    if ranks.first:
+        models.save(asked.out, saved)
+    truncated = saved.model.falloff is not None
+    over = Finetuned(
+        model=asked.model,
+        out=asked.out,
+        start=start,
+        result=result,
+        saved=saved.model,
+        keep=asked.keep,
+        removed=len(whole) - len(kept),
+        found=found,
+        dropped=None,
+        seed=asked.seed,
+        truncated=ranks.gather(truncated)[0] if asked.shard else truncated,
+        shards=ranks.size if asked.shard else 1,
+    )
+    return over, engine
+
+
+def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | None) -> Report:
+    """Say what came of it; before that, draw and drop what was asked for."""
+    asked, result = opened.asked, over.result
+    if result.terminated:  # after SIGTERM there is no time for measurements
+        return finetuned.terminated(asked.model, asked.out, result, over.found)
+    if asked.drop:
+        over = _drop_invisible(over, opened.dataset, opened.engine)
+    if asked.curves is not None:
+        points = [asdict(point) for point in result.curves]
+        finetuned.draw_curves(asked.curves, points, over.saved.falloff)
+    figures = measured or over.measured(opened.dataset, opened.engine)
+    pictures = asked.scene.as_record(asked.cameras) if asked.itself else None
+    report = over.report(
+        figures, opened.dataset, opened.photographs, opened.configuration, pictures
+    )
+    if not result.interrupted:
+        opened.checkpoints.clear()  # not before: a kill while measuring goes on from it too
+    return report
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _keep(
+    whole: Model, keep: float | Literal["auto"] | None, dataset: Dataset, engine: Engine
+) -> Model:
+    """The Gaussians that --keep leaves."""
+    if keep is None:
+        return whole
+    if keep == "auto":
+        return keep_needed(whole, dataset.train, engine=engine, progress=True)
+    views = [shot.view for shot in dataset.train]
+    return keep_best(whole, keep, views, engine=engine, progress=True)
+
+
+def _learn(
+    model: Model, opened: _Opened, engine: Engine, ranks: Ranks
+) -> tuple[FinetuneResult, Bounded | None]:
+    """Fine-tune once, or as often as a bound on the loss needs."""
+    dataset, settings = opened.dataset, opened.asked.settings
+    train = partial(api.finetune, model, dataset, engine=engine, progress=True, ranks=ranks)
+    if isinstance(settings.goal, AtMost):
+        found = strongest(train, settings, dataset.test, engine=engine, say=_say)
+        return found.result, found
+    target = None
+    if isinstance(settings.goal, Faster):
+        target = frame_target(settings.goal.ratio, engine, model.device, say=_say)
+    return train(settings, target=target, checkpoints=opened.checkpoints), None
+
+
+def _drop_invisible(over: Finetuned, dataset: Dataset, engine: Engine) -> Finetuned:
+    """Write the result again without Gaussians that no view shows."""
+    out, result = over.out, over.result
+    size, views = out.stat().st_size, [shot.view for shot in (*dataset.train, *dataset.test)]
+    left = replace(result, model=result.model.keep(visible(result.model, views, engine=engine)))
+    models.save(out, left)
+    dropped = dropping(out, size, len(result.model), len(left.model))
+    return replace(over, result=left, saved=left.model, dropped=dropped)
+
+
+def _require_sense(asked: Asked) -> None:
+    """Prove, before any work, that it is clear what MODEL must look like.
+
+    Raises:
+        UsageError: nothing says so, two things do, or an option needs photographs.
+    """
+    itself, goal = asked.itself, asked.settings.goal
+    refusals = (
+        (
+            not itself and asked.cameras is not None,
+            "--cameras without --self",
+            "photographs, or the model's own pictures from those cameras",
+            "Add --self, or pass --data FOLDER instead of --cameras.",
+        ),
+        (
+            asked.scene.data is not None and asked.cameras is not None,
+            "--data with --cameras",
+            "one source of cameras",
+            "Drop one of the two.",
+        ),
+        (
+            itself and isinstance(goal, AtMost),
+            "--self with --max-drop",
+            "photographs, and with them a control to lose against",
+            "Drop --max-drop; --pressure steers what --self may lose.",
+        ),
+        (
+            itself and isinstance(goal, Control),
+            "--self with --control",
+            "something to learn: without truncation the model is its own target already",
+            "Drop --control; what it came in as is the comparison.",
+        ),
+        (
+            itself and asked.keep == "auto",
+            "--self with --keep auto",
+            "photographs, whose error says what can be spared",
+            "Pass a share, such as --keep 0.9.",
+        ),
+    )
+    for refused, found, expected, remedy in refusals:
+        if refused:
+            raise UsageError("options", found, expected, remedy)
+
+
+def _require_shards(asked: Asked) -> None:
+    """Check that Gaussians which are divided among processes can learn what is asked for.
+
+    Raises:
+        UsageError: there is one process, or an option needs the whole model.
+    """
+    require_several()
+    given = {
+        "--self": asked.itself,
+        "--portable": asked.settings.goal.on_area,
+        "--max-drop": isinstance(asked.settings.goal, AtMost),
+        "--keep": asked.keep is not None,
+        "--drop-invisible": asked.drop,
+    }
+    if found := [name for name, is_given in given.items() if is_given]:
+        raise UsageError(
+            "options",
+            f"--shard-gaussians with {', '.join(found)}",
+            "options that each process can follow with a part of the Gaussians",
+            "Leave one of them out.",
+        )
