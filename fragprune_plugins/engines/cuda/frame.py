@@ -319,6 +319,26 @@ class Drawn(NamedTuple):
     winners: Tensor | None
 
 
+class Memory(NamedTuple):
+    """The memory of one frame.
+
+    Attributes:
+        cleared: begins with zeros.
+        scratch: needed until the lists are made.
+        kept: what backward reads.
+        passes: of sorting, by tile.
+        keep: backward will come.
+        slots: each list entry has one, so that backward adds in a fixed order.
+    """
+
+    cleared: Arena
+    scratch: Arena
+    kept: Arena
+    passes: int
+    keep: bool
+    slots: bool
+
+
 class Drawing:
     """One rasterization: its forward pass, the data kept for backward, its backward pass.
 
@@ -357,12 +377,50 @@ class Drawing:
             packed: store Gaussians in fewer bytes; only without gradients.
         """
         inputs, n, where = self._inputs, self._n, self.where
-        height, width = inputs.view.height, inputs.view.width
-        tiles, pixels = self._across * self._down, width * height
-        passes = max(1, _blocks((tiles - 1).bit_length(), 8))
-        keep, slots = bool(wanted), bool(wanted) and deterministic
+        tiles, pixels = self._across * self._down, inputs.view.width * inputs.view.height
+        keep = bool(wanted)
         packed = packed and not keep
-        scene = {"FP_PACKED": int(packed)}
+        memory = self._room(capacity, keep, keep and deterministic, packed)
+        outputs = self._new_outputs()
+        weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
+        frame = self._new_frame(capacity, memory)
+        frame.inputs = native_inputs(inputs, self._arrays, widen="thresholds" in wanted)
+        frame.outputs = binding.Outputs(**{name: address(each) for name, each in outputs.items()})
+        frame.weights = address(weights)
+        self._list(frame, memory, {"FP_PACKED": int(packed)})
+        macros = blend_macros(
+            self._channels,
+            counts=inputs.counts,
+            scores=inputs.scores,
+            packed=packed,
+            stop=inputs.stop is not None,
+        )
+        self._launch("blend", macros, "fp_blend", tiles, frame)
+        found = memory.cleared.tensor("counters", 4, torch.int64)
+        if keep:
+            frame.outputs = binding.Outputs()  # backward does without
+            self._frame = frame
+        self._memory = (memory.cleared, memory.kept)
+        self._found = found
+        return Drawn(
+            fragments_per_pixel=(found[2].double() / pixels).float(),
+            weights_per_gaussian=None if weights is None else (weights.double() * 2.0**-32).float(),
+            **outputs,
+        )
+
+    def _room(self, capacity: int, keep: bool, slots: bool, packed: bool) -> Memory:
+        """The memory of a frame.
+
+        Args:
+            capacity: list entries.
+            keep: gradients will be needed.
+            slots: in a fixed order.
+            packed: Gaussians are stored in fewer bytes.
+        """
+        n, where = self._n, self.where
+        tiles = self._across * self._down
+        pixels = self._inputs.view.width * self._inputs.view.height
+        passes = max(1, _blocks((tiles - 1).bit_length(), 8))
         cleared = Arena(
             where,
             torch.zeros,
@@ -394,21 +452,18 @@ class Drawing:
             transmittance=4 * pixels * keep,
             stop=4 * pixels * keep,
         )
-        outputs = self._new_outputs()
-        weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
-        # The last sorting pass of the entries must end in `kept`.
-        keys = [scratch["entry_keys"], scratch["entry_keys_2"]]
-        values = [kept["entry_values"], scratch["entry_values_2"]]
-        if passes % 2:
-            values.reverse()
-        frame = Frame(
-            inputs=native_inputs(inputs, self._arrays, widen="thresholds" in wanted),
-            outputs=binding.Outputs(**{name: address(each) for name, each in outputs.items()}),
+        return Memory(cleared, scratch, kept, passes, keep, slots)
+
+    def _new_frame(self, capacity: int, memory: Memory) -> Frame:
+        """The kernels' arguments that are places in the memory of a frame."""
+        cleared, scratch, kept = memory.cleared, memory.scratch, memory.kept
+        keep, slots = memory.keep, memory.slots
+        return Frame(
             spread=address(self._spread),
             capacity=capacity,
             tiles_x=self._across,
             tiles_y=self._down,
-            tile_passes=passes,
+            tile_passes=memory.passes,
             counters=cleared["counters"],
             project_words=cleared["project_words"],
             emit_words=cleared["emit_words"],
@@ -421,14 +476,27 @@ class Drawing:
             first_slot=kept["first_slot"] if slots else None,
             depth_keys=scratch["depth_keys"],
             depth_ids=scratch["depth_ids"],
-            entry_keys=keys[0],
-            entry_values=values[0],
             owners=kept["owners"] if slots else None,
             reached=kept["reached"] if keep else None,
             transmittance=kept["transmittance"] if keep else None,
             stop=kept["stop"] if keep else None,
-            weights=address(weights),
         )
+
+    def _list(self, frame: Frame, memory: Memory, scene: dict[str, int]) -> None:
+        """Project the Gaussians, and list them by tile and depth.
+
+        Args:
+            frame: the kernels' arguments; told where the lists end up.
+            memory: of the frame.
+            scene: macros of these kernels.
+        """
+        n, capacity, passes = self._n, frame.capacity, memory.passes
+        cleared, scratch, kept = memory.cleared, memory.scratch, memory.kept
+        keys = [scratch["entry_keys"], scratch["entry_keys_2"]]
+        values = [kept["entry_values"], scratch["entry_values_2"]]
+        if passes % 2:  # the last sorting pass of the entries must end in `kept`
+            values.reverse()
+        frame.entry_keys, frame.entry_values = keys[0], values[0]
         counters = cleared["counters"]
         by_depth = Sort(
             count=counters,
@@ -453,25 +521,6 @@ class Drawing:
             launch_sort(self._device, self.where, scene, by_tile, keys, values, passes)
             frame.entry_keys, frame.entry_values = keys[passes % 2], values[passes % 2]
             self._launch("scene", scene, "fp_ranges", _blocks(capacity), frame)
-        macros = blend_macros(
-            self._channels,
-            counts=inputs.counts,
-            scores=inputs.scores,
-            packed=packed,
-            stop=inputs.stop is not None,
-        )
-        self._launch("blend", macros, "fp_blend", tiles, frame)
-        found = cleared.tensor("counters", 4, torch.int64)
-        if keep:
-            frame.outputs = binding.Outputs()  # backward does without
-            self._frame = frame
-        self._memory = (cleared, kept)
-        self._found = found
-        return Drawn(
-            fragments_per_pixel=(found[2].double() / pixels).float(),
-            weights_per_gaussian=None if weights is None else (weights.double() * 2.0**-32).float(),
-            **outputs,
-        )
 
     def read(self) -> int:
         """Wait for the GPU, then return the number of entries.

@@ -231,79 +231,113 @@ def audit(
     Returns:
         Figures as plain values, and the views that pictures show.
     """
-
-    splats = model.splats()
-    candidates = _candidates(model, splats)
-    found: dict[str, list[dict[str, Any]]] = {name: [] for name in candidates}
-    asked: dict[str, list[float]] = {}
-    idle, shown, overdraw = Idle(), [], []
+    survey = _Survey(model, engine)
     chosen = _amid(len(views))
     with tqdm(total=2 * len(views) + 1, desc="audit", unit="step", disable=not progress) as bar:
         for number, (name, view) in enumerate(views):
-            itself = None
-            for label, candidate in candidates.items():
-                out = candidate.draw(engine, view, splats, counts=itself is None)
-                itself = out if itself is None else itself
-                error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
-                row = {
-                    "timed": number in chosen,
-                    "work": work_of(out),
-                    "mse": float(error),
-                    "psnr": psnr(out.image, itself.image),
-                }
-                row |= {key: float(getattr(out, key)) for key in _COUNTS}
-                found[label].append(row)
-            assert itself is not None
-            inputs = candidates[AS_IT_IS].inputs(view, splats)
-            squared = SQRT8.squared(splats.opacities)
-            ellipses = covered(engine, replace(inputs, counts=True), squared)
-            overdraw.append(float(ellipses.fragments_per_pixel))
-            for viewer in VIEWERS:
-                asked.setdefault(viewer.names, []).append(shaded(engine, inputs, viewer))
-            cut = candidates[AS_IT_IS].thresholds(inputs)
-            if cut is not None:
-                reach = honouring(cut, splats.opacities)
-                quads = 4 / math.pi * float(covered(engine, inputs, reach).fragments_per_pixel)
-                asked.setdefault(HONOURING, []).append(quads)
-            if number in chosen:
-                assert itself.fragments is not None
-                assert ellipses.fragments is not None
-                shown.append(Shown(name, itself.image, itself.fragments, ellipses.fragments))
+            survey.draw(name, view, shown=number in chosen)
             bar.update()
-            kinds = 3 * torch.bucketize(splats.opacities, splats.opacities.new_tensor(OPACITIES))
-            kinds += torch.bucketize(itself.radii, itself.radii.new_tensor(RADII))
-            for tile in fragments(inputs, cut, max(1, tiles // len(views))):
-                if len(tile.rows):
-                    idle.add(kinds[tile.rows], weigh(tile, view.background))
+            survey.weigh(view, max(1, tiles // len(views)))
             bar.update()
         timed: list[View] = [views[number][1] for number in chosen]
-        frames = frame_times(list(candidates.values()), timed, engine, repeats=repeats)
+        frames = frame_times(list(survey.candidates.values()), timed, engine, repeats=repeats)
         bar.update()
-    cost = _prices(engine, model)
-    cuts: list[dict[str, Any]] = [
-        {"name": label}
-        | _mean(found[label])
-        | frame
-        | {"foreseen_ms": _foreseen(cost, found[label])}
-        for label, frame in zip(candidates, frames, strict=True)
-    ]
-    figures = {
-        "gaussians": len(model),
-        "truncated": model.falloff is not None,
-        "stop": model.stop,
-        "views": len(views),
-        "fragments_per_pixel": cuts[0]["fragments_per_pixel"],
-        "evaluated_per_pixel": cuts[0]["evaluated_per_pixel"],
-        "overdraw": statistics.fmean(overdraw),
-        "frame_ms": cuts[0]["frame_ms"],
-        "frame_ms_se": cuts[0]["frame_ms_se"],
-        "engine": engine.name,
-        "device": str(splats.device),
-        "idle": idle.as_dict(),
-        "cuts": cuts,
-        "viewers": _viewers(asked),
-    }
-    return figures, shown
+    return survey.figures(frames), survey.shown
+
+
+class _Survey:
+    """An audit under way.
+
+    Args:
+        model: that is audited.
+        engine: draws and counts.
+
+    Attributes:
+        candidates: the model and its cuts, by name.
+        shown: the views that pictures show.
+    """
+
+    def __init__(self, model: Model, engine: Engine) -> None:
+        self._model, self._engine, self._splats = model, engine, model.splats()
+        self.candidates = _candidates(model, self._splats)
+        self.shown: list[Shown] = []
+        self._rows: dict[str, list[dict[str, Any]]] = {name: [] for name in self.candidates}
+        self._asked: dict[str, list[float]] = {}
+        self._overdraw: list[float] = []
+        self._idle = Idle()
+        self._radii = torch.empty(0)
+
+    def draw(self, name: str, view: View, shown: bool) -> None:
+        """Draw a view of the model and of its cuts.
+
+        Args:
+            name: of the view.
+            view: the camera.
+            shown: pictures show it, and frames of it are timed.
+        """
+        engine, splats, itself = self._engine, self._splats, None
+        for label, candidate in self.candidates.items():
+            out = candidate.draw(engine, view, splats, counts=itself is None)
+            itself = out if itself is None else itself
+            error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
+            row = {
+                "timed": shown,
+                "work": work_of(out),
+                "mse": float(error),
+                "psnr": psnr(out.image, itself.image),
+            }
+            row |= {key: float(getattr(out, key)) for key in _COUNTS}
+            self._rows[label].append(row)
+        assert itself is not None
+        self._radii = itself.radii
+        inputs = self.candidates[AS_IT_IS].inputs(view, splats)
+        squared = SQRT8.squared(splats.opacities)
+        ellipses = covered(engine, replace(inputs, counts=True), squared)
+        self._overdraw.append(float(ellipses.fragments_per_pixel))
+        for viewer in VIEWERS:
+            self._asked.setdefault(viewer.names, []).append(shaded(engine, inputs, viewer))
+        cut = self.candidates[AS_IT_IS].thresholds(inputs)
+        if cut is not None:
+            reach = honouring(cut, splats.opacities)
+            quads = 4 / math.pi * float(covered(engine, inputs, reach).fragments_per_pixel)
+            self._asked.setdefault(HONOURING, []).append(quads)
+        if shown:
+            assert itself.fragments is not None
+            assert ellipses.fragments is not None
+            self.shown.append(Shown(name, itself.image, itself.fragments, ellipses.fragments))
+
+    def weigh(self, view: View, tiles: int) -> None:
+        """Weigh the fragments of some tiles of the view that was drawn last, one by one."""
+        opacities, radii = self._splats.opacities, self._radii
+        candidate = self.candidates[AS_IT_IS]
+        inputs = candidate.inputs(view, self._splats)
+        kinds = 3 * torch.bucketize(opacities, opacities.new_tensor(OPACITIES))
+        kinds += torch.bucketize(radii, radii.new_tensor(RADII))
+        for tile in fragments(inputs, candidate.thresholds(inputs), tiles):
+            if len(tile.rows):
+                self._idle.add(kinds[tile.rows], weigh(tile, view.background))
+
+    def figures(self, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """Everything as plain values, with the frame times of each candidate."""
+        cost = _prices(self._engine, self._model)
+        cuts: list[dict[str, Any]] = [
+            {"name": label} | _mean(rows) | frame | {"foreseen_ms": _foreseen(cost, rows)}
+            for (label, rows), frame in zip(self._rows.items(), frames, strict=True)
+        ]
+        same = ("fragments_per_pixel", "evaluated_per_pixel", "frame_ms", "frame_ms_se")
+        return {
+            "gaussians": len(self._model),
+            "truncated": self._model.falloff is not None,
+            "stop": self._model.stop,
+            "views": len(self._overdraw),
+            "overdraw": statistics.fmean(self._overdraw),
+            **{name: cuts[0][name] for name in same},
+            "engine": self._engine.name,
+            "device": str(self._splats.device),
+            "idle": self._idle.as_dict(),
+            "cuts": cuts,
+            "viewers": _viewers(self._asked),
+        }
 
 
 def _amid(count: int) -> list[int]:
