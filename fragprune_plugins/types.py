@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from fragprune_plugins.constants import (
     ALPHA_MAX,
@@ -22,7 +22,6 @@ from fragprune_plugins.constants import (
     TRANSMITTANCE_MIN,
 )
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.reprs import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,6 +34,29 @@ Compensation = Literal["none", "antialiasing", "mip"]
 
 Plane = Literal["invdepth", "alpha", "surface"]
 """What is drawn beside the image, by its name in ``RasterOutputs``."""
+
+
+def one_line(thing: Any) -> str:
+    """The ``__repr__`` of a dataclass with tensors; fields that are None are left out."""
+    held = {each.name: getattr(thing, each.name) for each in fields(thing)}
+    inside = [f"{name}={short(value)}" for name, value in held.items() if value is not None]
+    return f"{type(thing).__name__}({', '.join(inside)})"
+
+
+def short(value: Any) -> str:
+    """A tensor as ``float32[9, 3]``, with its device unless it is the CPU; a list as its length.
+
+    Of a tensor that holds one number without an axis, that number.
+    """
+    if getattr(value, "ndim", None) == 0:
+        return f"{float(value):.6g}"
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        kind = str(value.dtype).removeprefix("torch.")
+        device = str(getattr(value, "device", "cpu"))
+        return f"{kind}{list(value.shape)}" + ("" if device == "cpu" else f" on {device}")
+    if isinstance(value, list | tuple | dict):
+        return f"[{len(value)} items]"
+    return repr(value)
 
 
 def _check(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = False) -> None:

@@ -17,7 +17,7 @@ from fragprune_plugins.engines.inputs import native_threads
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning import losses
 from fragprune_plugins.learning.losses import SSIM_WEIGHT
-from fragprune_plugins.reprs import short
+from fragprune_plugins.types import short
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError, InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import Splats
+from fragprune_plugins.types import Splats, one_line
 
 REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
 """The SH degree by the number of values in a row of ``f_rest``."""

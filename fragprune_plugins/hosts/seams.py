@@ -14,7 +14,7 @@ from inspect import Signature, signature
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
-from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import one_line
 
 if TYPE_CHECKING:
     from torch import Tensor

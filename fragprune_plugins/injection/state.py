@@ -31,7 +31,7 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for
 from fragprune_plugins.plugins.loading import Plugins
-from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import one_line
 
 log = logging.getLogger("fragprune")
 

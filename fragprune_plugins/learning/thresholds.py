@@ -14,8 +14,7 @@ from torch import Tensor
 from fragprune_plugins.constants import ALPHA_MIN, LOGIT_MAX, LOGIT_MIN, NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError, InputError, SidecarError
 from fragprune_plugins.learning.adam import make_adam
-from fragprune_plugins.reprs import short
-from fragprune_plugins.types import is_stop
+from fragprune_plugins.types import is_stop, short
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99

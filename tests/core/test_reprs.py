@@ -12,7 +12,7 @@ import torch
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.reprs import one_line, short
+from fragprune_plugins.types import one_line, short
 
 EXCLUDED = (".demo.host", ".testing", "__main__")
 

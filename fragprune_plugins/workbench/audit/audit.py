@@ -25,8 +25,7 @@ from tqdm import tqdm
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.reference import fragments
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import Splats, View
+from fragprune_plugins.types import Splats, View, one_line
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
 from fragprune_plugins.workbench.figures.extents import (
     CUTS,

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
 from fragprune_plugins.workbench.figures.clock import synchronize, timed
 
 Pass = Literal["forward", "forward_backward"]

@@ -16,8 +16,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
-from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
 from fragprune_plugins.workbench.figures.clock import timed
 from fragprune_plugins.workbench.figures.extents import covered
 from fragprune_plugins.workbench.figures.metrics import lpips, psnr, ssim

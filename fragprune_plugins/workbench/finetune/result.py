@@ -9,7 +9,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.stage2 import Progress
-from fragprune_plugins.reprs import one_line
+from fragprune_plugins.types import one_line
 
 
 @dataclass(frozen=True, eq=False)

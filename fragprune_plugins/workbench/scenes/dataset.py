@@ -16,8 +16,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError, printable
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
-from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import View
+from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.scenes import colmap, transforms
 from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened
 from fragprune_plugins.workbench.scenes.lenses import Lens

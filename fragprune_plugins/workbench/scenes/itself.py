@@ -13,8 +13,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import engine_for
-from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.types import RasterInputs, View, one_line
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.generated import Named, around, between, hold_out

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fragprune_plugins.reprs import one_line
-from fragprune_plugins.types import View, check_lens, check_pose
+from fragprune_plugins.types import View, check_lens, check_pose, one_line
 
 
 @dataclass(frozen=True)
