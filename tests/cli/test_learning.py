@@ -97,3 +97,12 @@ def test_more_views_a_step_see_as_many_views_in_fewer_steps(options, iterations,
     views = options[1] if options else 1
     said = CliRunner().invoke(show, list(map(str, options))).stdout.split()
     assert said == [str(iterations), str(warmup), str(views)]
+
+
+def test_a_log_of_several_trainings_is_refused_before_it_is_begun(tmp_path):
+    place = tmp_path / "steps.csv"
+    words = ("--max-drop", 0.1, "--log", f"csv:{place}")
+    result = run("finetune", __file__, "--data", tmp_path, "--out", "out.ply", *words)
+    assert result.exit_code == 2
+    assert "--log with --max-drop" in result.stderr
+    assert not place.exists()

@@ -10,14 +10,9 @@ import pytest
 from native.sanitize import building
 from native.sanitize.building import MEMORY, THREADS, Toolchain
 
-BUILDS = [
-    pytest.param(build, marks=[] if build == "avx2" else [pytest.mark.slow])
-    for build in building.builds()
-]
-"""They compile for minutes, and their sources differ in a hundred lines only."""
 
-
-@pytest.mark.parametrize("build", BUILDS)
+@pytest.mark.slow
+@pytest.mark.parametrize("build", building.builds())
 def test_no_access_out_of_bounds_no_leak_nothing_undefined(
     toolchain: Toolchain, build: str
 ) -> None:
