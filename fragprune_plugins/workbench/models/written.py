@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from fragprune_plugins.errors import OutputError, UsageError
@@ -24,7 +25,7 @@ def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
     form = formats.named(out)
     if thresholds:
         formats.expect_carrier(form, out)
-    own, other = out.resolve(), model.resolve()
+    own, other = (Path(os.path.realpath(path)) for path in (out, model))  # a loop does not raise
     if form.paired and other.suffix.lower() == ".ply":
         own, other = own.with_suffix(""), other.with_suffix("")
     if own == other:
