@@ -96,6 +96,12 @@ class HostFailed(FragpruneError):  # noqa: N818 - the host's failure, reported
     code = "host-failed"
 
 
+class ProofError(FragpruneError):
+    """A host's own rasterizer draws, or differentiates, otherwise than our engine does."""
+
+    code = "proof"
+
+
 class SeamError(FragpruneError):
     """A host lacks a function that we wrap, or the function has other parameters."""
 

@@ -44,13 +44,12 @@ MODEL = "scene.gaussian_model"
 class MCMCDialect(GraphdecoDialect):
     """Vanilla's call, with ``is_used`` as third output and the relocation formula beside it."""
 
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
-        """(colour (3, H, W), radii (P,) int32, is_used (P,) int32).
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
+        """(colour (3, H, W), radii (P,) int32, None for ``is_used``).
 
-        The host passes ``is_used`` on and never reads it. Here it means "on screen", an upper bound
-        of the host's "reached a pixel".
+        The host passes ``is_used`` on and never reads it.
         """
-        return outputs.image, outputs.radii, (outputs.radii > 0).to(outputs.radii)
+        return outputs.image, outputs.radii, None
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Vanilla's stand-ins, with the relocation formula in the rasterizer's module."""

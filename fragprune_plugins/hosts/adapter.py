@@ -175,7 +175,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
-        """Translate outputs into the tuple that the host expects."""
+        """Translate outputs into the tuple that the host expects, None where it reads none."""
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]

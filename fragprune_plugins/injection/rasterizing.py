@@ -17,6 +17,8 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.adapter import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
+from fragprune_plugins.injection.proof import answer, proved
+from fragprune_plugins.injection.proofs import Proof
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.injection.stepping import (
@@ -144,8 +146,12 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     state = session.models.get(rendering[0]) if rendering else None
     drawn = HostCall.of(call)
     means, gpu = drawn[session.dialect.means], session.dialect.own_kernels == "gpu"
-    by_host = partial(draw, session, drawn) if gpu and not means.is_cuda else call.run
-    if rendering is None or state is None or session.pausing.get():
+    runs = not gpu or means.is_cuda
+    by_host = call.run if runs else partial(draw, session, drawn)
+    if rendering is None or session.pausing.get():
+        return by_host()
+    proof = prove(session, call, drawn, state) if runs else None
+    if state is None:
         return by_host()
     rows = session.dialect.rows_drawn(rendering[0], drawn)
     if rows is not None:
@@ -173,8 +179,32 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
             if thresholds is not None and rows is not None:
                 thresholds = thresholds[rows]
             truncated = partial(rasterize, engine, state, rendering[1], thresholds)
-            return session.dialect.answer(drawn, inputs, truncated)
+            return answer(session.dialect, drawn, inputs, truncated, proof)
     return by_host()
+
+
+def prove(
+    session: SessionState, call: SeamCall, drawn: HostCall, state: ModelState | None
+) -> Proof | None:
+    """The proof of a call of the host's own rasterizer; None if it needs none, or cannot have one.
+
+    A later call of a stage in which nothing of ours draws may fail: stage 2 would refuse it.
+
+    Raises:
+        ProofError: it draws otherwise than our engine.
+    """
+    ours = state is not None and state.store.cuts
+    if not session.prove and not ours:
+        return None
+    why_not = "" if hasattr(call.instance, "raster_settings") else "its calls have another form"
+    if session.stand_ins.answers(call.seam.module):
+        why_not = "a stand-in of ours draws here"
+    if not why_not:
+        return proved(session, call, drawn, strict=ours or session.learn or not session.proofs)
+    if call.seam not in session.unproved:
+        session.unproved.add(call.seam)
+        log.info("%s: nothing is proved, because %s", call.seam.module, why_not)
+    return None
 
 
 def draw(session: SessionState, call: HostCall) -> Any:

@@ -44,7 +44,8 @@ class Session(SessionState):
     _ledger: PatchLedger | None = None
 
     @cached_property
-    def _stand_ins(self) -> StandIns:
+    def stand_ins(self) -> StandIns:  # type: ignore[override]
+        """The stand-ins for the host's compiled packages."""
         return StandIns(self.dialect, partial(rasterizing.draw, self), self.drop_in)
 
     def activate(self) -> Session:
@@ -75,7 +76,7 @@ class Session(SessionState):
             extra = similarity.seam_of(self.repo)
             if extra is not None and extra.module not in sys.modules:  # late, it is the host's
                 self._ledger.wrap(extra, partial(enter, extra))
-            self._stand_ins.refuse_leftovers(self.repo.root)
+            self.stand_ins.refuse_leftovers(self.repo.root)
         except BaseException:
             self._take_back()
             raise
@@ -100,7 +101,7 @@ class Session(SessionState):
             state.hooked.clear()
         findings = self._ledger.undo() if self._ledger else []
         self._ledger = None
-        self._stand_ins.take_back()
+        self.stand_ins.take_back()
         return findings
 
     def __enter__(self) -> Session:
@@ -181,7 +182,7 @@ class Session(SessionState):
         Raises:
             LateImportError: the host has already imported one of these packages.
         """
-        self._stand_ins.place()
+        self.stand_ins.place()
 
     def _enter(self, seam: Seam, function: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         """Hand a call to the handler of its role; ``_OF_MODELS`` handlers also get its model."""

@@ -201,6 +201,7 @@ class Stages:
             learn=learn,
             engine=self.options.engine,
             drop_in=True if self.device == "cpu" else None,
+            prove=self.options.stage != "off",
             output=self.output,
             origin=self.around,
             **options,

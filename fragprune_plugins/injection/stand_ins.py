@@ -80,6 +80,10 @@ class StandIns:
                 log.warning("%s is not installed: the host imports an empty stand-in", name)
                 sys.modules[name] = self._placed[name] = module
 
+    def answers(self, module: str) -> bool:
+        """Whether a stand-in is in a module's place."""
+        return module in self._placed
+
     def take_back(self) -> None:
         """Remove the stand-ins from ``sys.modules``."""
         for name, module in self._placed.items():

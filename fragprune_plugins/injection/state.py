@@ -24,6 +24,8 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import HostAdapter, trained_groups
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.proofs import Proof
+from fragprune_plugins.injection.stand_ins import StandIns
 from fragprune_plugins.learning.events import PopulationChange
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Stage2
@@ -90,9 +92,13 @@ class SessionState:
         engine: the engine's name; see ``hooks.engine_for``.
         drop_in: whether stand-ins replace the host's compiled packages; None replaces those that
             cannot be imported.
+        prove: whether to prove each call of the host's own rasterizer before it draws; None does
+            so if thresholds learn. One that would draw with thresholds is always proved.
         output: the host's output folder, if it is known.
         origin: stage 1's output folder, if stage 2 has its own.
     """
+
+    stand_ins: StandIns
 
     def __init__(
         self,
@@ -108,6 +114,7 @@ class SessionState:
         start: int = 0,
         engine: str = "auto",
         drop_in: bool | None = None,
+        prove: bool | None = None,
         output: Path | None = None,
         origin: Path | None = None,
     ) -> None:
@@ -121,10 +128,13 @@ class SessionState:
         self.engine_name = engine
         self.engines: dict[torch.device, Engine] = {}
         self.drop_in = drop_in
+        self.prove = learn if prove is None else prove
+        self.proofs: dict[tuple[Any, ...], Proof | None] = {}  # by the shape of the call
         self.dialect = adapter.dialect(repo)
         self.trained = trained_groups(adapter.groups, self.settings.train)  # names; None for all
         self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # waits for its model
         self.similar: bool | None = None  # compiled similarity agrees with the host's own
+        self.unproved: set[Seam] = set()  # rasterizers of which that was said
         self.absent: set[Seam] = set()  # metrics whose weights cannot be loaded
         self.models: weakref.WeakKeyDictionary[Any, ModelState] = weakref.WeakKeyDictionary()
         self.optimizers: weakref.WeakKeyDictionary[Any, list[weakref.ReferenceType[Any]]] = (

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,8 @@ from fragprune_plugins.hosts.choosing import Tried, attempt, closest, locate, us
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.hosts.verdict import judge
+from fragprune_plugins.injection import proofs
+from fragprune_plugins.injection.proofs import Proof
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
 
@@ -40,9 +45,14 @@ def check(*, host: Path, adapter: str | None, verbose: bool, every: bool) -> Rep
     fitting = [each for each in tried if each.adapter in closer]
     verdict = fitting[0] if len(fitting) == 1 else None
     judged = judge(repo, tried, adapters)
+    proved = _proved(repo, verdict.adapter.dialect(repo).names()) if verdict else []
+    if proved:
+        sentence = f"It fits {judged.adapter}, and its rasterizer was proved on this machine."
+        judged = replace(judged, sentence=sentence, reason="")
     missing = _missing(repo, verdict.adapter) if verdict else []
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
     lines += ["", judged.sentence]
+    lines += [f"  {proof}" for proof in proved]
     if judged.differs:
         lines += ["", f"It differs from {judged.adapter}:", *(f"  {d}" for d in judged.differs)]
     lines += [""]
@@ -56,6 +66,7 @@ def check(*, host: Path, adapter: str | None, verbose: bool, every: bool) -> Rep
         "commit": repo.commit,
         **judged.as_dict(),
         "fits": verdict.adapter.name if verdict else None,
+        "proved": [str(proof) for proof in proved],
         "missing": [
             {"module": each.module, "distribution": each.distribution, "at": each.at}
             for each in missing
@@ -161,6 +172,21 @@ def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
     scripts, dialect = adapter.command_line(repo).scripts, adapter.dialect(repo)
     answered = {*dialect.names(), *dialect.spares()}
     return missing_imports(repo, [repo.root / name for name in scripts], answered)
+
+
+def _proved(repo: HostRepo, packages: frozenset[str]) -> list[Proof]:
+    """The kept proofs of a host's compiled packages as they are installed or vendored now."""
+    found: dict[str, Proof] = {}
+    for name in sorted(packages):
+        file = repo.path(name)
+        if file is None and "." not in name and name not in sys.modules:
+            spec = find_spec(name)
+            file = Path(spec.origin) if spec and spec.origin else None
+        pattern = proofs.file_of(proofs.digest_of(file), "*") if file else None
+        for path in sorted(pattern.parent.glob(pattern.name)) if pattern else ():
+            if (proof := proofs.read(path)) is not None:
+                found[str(proof)] = proof
+    return list(found.values())
 
 
 def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:

@@ -1,0 +1,360 @@
+"""Proves that a host's own rasterizer and our engine draw the same, before anything is trained.
+
+The import name of a rasterizer proves nothing. So the first call at each place is drawn by both,
+with the host's own arguments and again with a chart of Gaussians that shows every rule.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.constants import VERSION
+from fragprune_plugins.engines.cuda.kernels import digest_of_sources
+from fragprune_plugins.errors import ProofError
+from fragprune_plugins.hosts.adapter import Dialect, HostCall
+from fragprune_plugins.hosts.graphdeco.call import ARGUMENTS
+from fragprune_plugins.hosts.seams import SeamCall
+from fragprune_plugins.hosts.source import parsed
+from fragprune_plugins.injection import likeness, proofs
+from fragprune_plugins.injection.proofs import Proof
+
+if TYPE_CHECKING:
+    from fragprune_plugins.injection.state import SessionState
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
+
+log = logging.getLogger("fragprune")
+
+OF_A_VIEW = frozenset(
+    {
+        *("image_height", "image_width", "tanfovx", "tanfovy", "viewmatrix", "projmatrix"),
+        *("campos", "bg", "timestamp", "sh_degree", "prefiltered", "debug"),
+    }
+)
+"""Settings that may change from view to view. A proof covers every SH degree and background;
+another value of any other setting needs another proof."""
+
+_DETACHED = ", without gradient"
+
+
+def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bool) -> Proof | None:
+    """The proof of a call of the host's own rasterizer, made now if there is none yet.
+
+    Args:
+        session: the state of the session.
+        call: at the seam.
+        drawn: the same as data.
+        strict: False warns where the proof fails, and returns None.
+
+    Raises:
+        ProofError: it draws otherwise, or returns something that the host uses and we do not know.
+    """
+    place = _place(session)
+    shape = (str(call.seam), place, *_shape(drawn))
+    if shape not in session.proofs:
+        try:
+            session.proofs[shape] = _read_or_prove(session, call, drawn, place, shape)
+        except ProofError as error:
+            if strict:
+                raise
+            log.warning("%s", error)
+            session.proofs[shape] = None
+    return session.proofs[shape]
+
+
+def _read_or_prove(
+    session: SessionState, call: SeamCall, drawn: HostCall, place: _Place, shape: tuple[Any, ...]
+) -> Proof:
+    """A kept proof of a call of this shape, else a new one, which is kept."""
+    means = drawn[session.dialect.means]
+    engine = session.engine(means.device)
+    where = torch.cuda.get_device_name(means.device) if means.is_cuda else "cpu"
+    known = (VERSION, digest_of_sources(), session.adapter.name, engine.name, where, shape)
+    key = hashlib.sha256(repr(known).encode()).hexdigest()[:16]
+    file = sys.modules[call.seam.module].__file__
+    kept = proofs.file_of(proofs.digest_of(Path(file)), key) if file else None
+    proof = proofs.read(kept) if kept else None
+    if proof is None:
+        proof = _Trial(session, call, drawn, place).prove()
+        if kept:
+            proofs.keep(proof, kept)
+    log.info("proved: %s", proof)
+    return proof
+
+
+def answer(
+    dialect: Dialect,
+    call: HostCall,
+    inputs: RasterInputs,
+    draw: Callable[..., RasterOutputs],
+    proof: Proof | None,
+) -> Any:
+    """Answer a host's call by the dialect, and by what the proof found beyond it.
+
+    An output that is unknown and that the host does not read is the dialect's, or None.
+    """
+    if proof is None:
+        return dialect.answer(call, inputs, draw)
+    if not proof.made:
+        packed: tuple[Any, ...] = _tuple(dialect.answer(call, inputs, draw))
+    else:
+        packed, seen = _packed(dialect, call, inputs, draw)
+    answered = [*packed, *[None] * (len(proof.outputs) - len(packed))]
+    for number, name in proof.made.items():
+        answered[number] = _made(name, seen)
+    return tuple(answered) if len(answered) > 1 else answered[0]
+
+
+def _packed(
+    dialect: Dialect, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
+) -> tuple[tuple[Any, ...], RasterOutputs]:
+    """The dialect's answer, and the engine's outputs with all meanings."""
+    seen: list[RasterOutputs] = []
+
+    def drawing(each: RasterInputs, *part: int) -> RasterOutputs:
+        seen.append(draw(likeness.widened(each), *part))
+        return likeness.narrowed(seen[-1])
+
+    return _tuple(dialect.answer(call, inputs, drawing)), seen[0]
+
+
+def _made(name: str, drawn: RasterOutputs) -> Any:
+    value = likeness.MEANINGS[name.removesuffix(_DETACHED)](drawn)
+    return value.detach() if value is not None and name.endswith(_DETACHED) else value
+
+
+def _tuple(answered: Any) -> tuple[Any, ...]:
+    return tuple(answered) if isinstance(answered, tuple | list) else (answered,)
+
+
+# ---- the shape of a call -----------------------------------------------------------------------
+
+
+def _shape(call: HostCall) -> Iterator[tuple[str, str]]:
+    """Which arguments a call has, and every rule that it sets."""
+    settings = call.settings._asdict() if hasattr(call.settings, "_asdict") else {}
+    for name, value in settings.items():
+        if name not in OF_A_VIEW:
+            yield name, _rule(value)
+    for name, value in call.arguments.items():
+        if isinstance(value, Tensor) and name in (*ARGUMENTS, "dc"):
+            yield name, str(value.numel() and (*value.shape[1:], value.dtype))
+        elif value is not None:
+            yield name, _rule(value)
+
+
+def _rule(value: Any) -> str:
+    """A setting's value; of a tensor the number that all its elements are, if there is one."""
+    if not isinstance(value, Tensor):
+        return repr(value) if isinstance(value, bool | int | float | str | None) else "an object"
+    if value.numel() == 0:
+        return "empty"
+    low, high = (float(each) for each in value.detach().float().aminmax())
+    return f"all {low:g}" if low == high else f"{value.ndim} dimensions"
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A call in the host's source.
+
+    Attributes:
+        name: function, file and line, for people.
+        values: what the host names the values that come back; () if it keeps them together.
+        unread: numbers of those that its function never reads again.
+    """
+
+    name: str
+    values: tuple[str, ...] = ()
+    unread: frozenset[int] = frozenset()
+
+
+def _place(session: SessionState) -> _Place:
+    """The innermost place in the host's own files that this call comes from."""
+    root = session.repo.root
+    inside, frame = f"{root / session.repo.package}{os.sep}", sys._getframe(1)
+    while frame.f_back is not None:
+        file = frame.f_code.co_filename
+        if file.startswith(inside) and "site-packages" not in file[len(inside) :]:
+            at = f"{frame.f_code.co_name} ({os.path.relpath(file, root)}:{frame.f_lineno})"
+            return _read_place(Path(file), frame.f_lineno, at)
+        frame = frame.f_back
+    return _Place("a call from outside the host")
+
+
+@cache
+def _read_place(file: Path, line: int, at: str) -> _Place:
+    around: dict[type, Any] = {}  # the innermost of each kind, because it is walked to last
+    for node in ast.walk(parsed(file.read_text(errors="replace")) or ast.Module([], [])):
+        if getattr(node, "lineno", line + 1) <= line <= (getattr(node, "end_lineno", 0) or 0):
+            around[type(node)] = node
+    assigned, function = around.get(ast.Assign), around.get(ast.FunctionDef)
+    target = assigned.targets[0] if assigned else None
+    if function is None or not isinstance(target, ast.Tuple):
+        return _Place(at)
+    names = tuple(ast.unparse(each) for each in target.elts)
+    nodes = (node for node in ast.walk(function) if isinstance(node, ast.Name))
+    read = {node.id for node in nodes if isinstance(node.ctx, ast.Load)}
+    unread = {k for k, name in enumerate(names) if name.isidentifier() and name not in read}
+    return _Place(at, names, frozenset(unread))
+
+
+# ---- the proof ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Both:
+    """One call, drawn by both.
+
+    Attributes:
+        what: which arguments, for people.
+        leaves: the arguments that get gradients, one row per Gaussian.
+        theirs: what the host's rasterizer returned.
+        ours: what the dialect answers.
+        seen: our engine's outputs with all meanings.
+    """
+
+    what: str
+    leaves: dict[str, Tensor]
+    theirs: tuple[Any, ...]
+    ours: tuple[Any, ...]
+    seen: RasterOutputs
+
+
+class _Trial:
+    """Draws one call of the host by both rasterizers and compares them."""
+
+    def __init__(
+        self, session: SessionState, call: SeamCall, drawn: HostCall, place: _Place
+    ) -> None:
+        self.session, self.call, self.drawn, self.place = session, call, drawn, place
+        self.dialect = session.dialect
+        self.engine = session.engine(drawn[self.dialect.means].device)
+        self.where = f"{call.seam} in {place.name}"
+
+    def prove(self) -> Proof:
+        """Compare every output and every gradient.
+
+        Raises:
+            ProofError: names the first difference that matters.
+        """
+        count, settings = len(self.drawn[self.dialect.means]), self.drawn.settings
+        own = {
+            name: value
+            for name, value in self.drawn.arguments.items()
+            if isinstance(value, Tensor) and value.ndim and len(value) == count
+        }
+        with torch.enable_grad():
+            chart = likeness.chart(own, self.dialect.unpack(self.drawn).view)
+            both = [
+                self._draw("the host's own call", own, settings),
+                self._draw("a chart through its camera", chart, self._with_all_bands()),
+            ]
+            found = [self._output(number, both) for number in range(len(both[0].theirs))]
+        made = {number: name for number, (name, new) in enumerate(found) if new}
+        return Proof(self.where, tuple(name for name, _ in found), made)
+
+    def _with_all_bands(self) -> Any:
+        """The call's settings with the highest SH degree that its coefficients allow."""
+        settings, sh = self.drawn.settings, self.drawn.get("shs")
+        if sh is None or settings.sh_degree >= 3:
+            return settings
+        count = sh.shape[1] + (self.drawn.get("dc") is not None)
+        return settings._replace(sh_degree=max(settings.sh_degree, min(3, int(count**0.5) - 1)))
+
+    def _draw(self, what: str, arguments: dict[str, Tensor], settings: Any) -> _Both:
+        floating = {name: each for name, each in arguments.items() if each.is_floating_point()}
+        leaves = {name: each.detach().requires_grad_() for name, each in floating.items()}
+        given = {**arguments, **leaves}
+        rasterizer = self.call.instance
+        rasterizer.raster_settings = settings
+        try:
+            theirs = _tuple(self.call.run(**given))
+        finally:
+            rasterizer.raster_settings = self.drawn.settings
+        named = {**self.drawn.arguments, **given}
+        call = replace(self.drawn, settings=settings, arguments=named, engine=self.engine)
+        with torch._C.DisableTorchFunction():  # see ``rasterizing.directly``
+            draw = partial(self.engine.rasterize, thresholds=None)
+            ours, seen = _packed(
+                self.dialect, call, self.dialect.unpack(call), lambda each, _=0: draw(each)
+            )
+        return _Both(what, leaves, theirs, ours, seen)
+
+    def _output(self, number: int, both: list[_Both]) -> tuple[str, bool]:
+        """The meaning of an output, and whether it is another than the dialect answers."""
+        theirs = [each.theirs[number] for each in both]
+        ours = [dict(enumerate(each.ours)).get(number) for each in both]
+        own, chart = both
+        unread = number in self.place.unread or (number < len(own.ours) and ours[0] is None)
+        is_picture = not likeness.difference(ours[1], chart.seen.image)
+        name, new = likeness.meaning(ours[1], chart.seen) or "as the adapter answers", False
+        if told := _first(both, map(likeness.difference, theirs, ours)):
+            if is_picture:
+                self._refuse(f"another picture: {told}")
+            name, new = likeness.meaning(theirs[1], chart.seen), True
+            if not name or likeness.difference(theirs[0], _made(name, own.seen)):
+                if unread:
+                    return "something unknown that is not read", False
+                self._refuse(f"{self._called(number)}, which the host uses, is unknown: {told}")
+            ours = [_made(name, each.seen) for each in both]
+        if unread and not is_picture:
+            return name, new
+        wrong = _first(both, map(_gradient_difference, both, theirs, ours))
+        if wrong and new:
+            name += _DETACHED
+            ours = [_made(name, each.seen) for each in both]
+            wrong = _first(both, map(_gradient_difference, both, theirs, ours)) and wrong
+        if wrong:
+            self._refuse(f"another backward pass from {self._called(number)}: {wrong}")
+        return name, new
+
+    def _called(self, number: int) -> str:
+        known = number < len(self.place.values)
+        return f"output {number + 1}{f' ({self.place.values[number]})' if known else ''}"
+
+    def _refuse(self, found: str) -> NoReturn:
+        raise ProofError(
+            self.where,
+            found,
+            f"what {self.session.adapter.name} draws, forward and backward",
+            "Thresholds would learn from other pictures than its own. fragprune check says whether "
+            "its PLY is plain 3DGS, which fragprune finetune prunes; --stage off trains without.",
+        )
+
+
+def _first(both: list[_Both], told: Iterable[str]) -> str:
+    """The first difference, and in which drawing; "" without one."""
+    found = (f"in {each.what} {what}" for each, what in zip(both, told, strict=True) if what)
+    return next(found, "")
+
+
+def _gradient_difference(both: _Both, theirs: Any, ours: Any) -> str:
+    """The first difference between the gradients of two outputs; "" without one."""
+    found, expected = (_gradient(each, both.leaves) for each in (theirs, ours))
+    return next(likeness.gradient_differences(found, expected, both.leaves), "")
+
+
+def _gradient(output: Any, leaves: dict[str, Tensor]) -> dict[str, Tensor | None]:
+    """Gradients of an output's numbers, weighed at random; None for zero."""
+    if not isinstance(output, Tensor) or not output.requires_grad:
+        return dict.fromkeys(leaves)
+    weights = torch.rand(output.numel(), generator=torch.Generator().manual_seed(0)) - 0.3
+    found = torch.autograd.grad(
+        output,
+        list(leaves.values()),
+        weights.reshape(output.shape).to(output),
+        allow_unused=True,
+        retain_graph=True,
+    )
+    return dict(zip(leaves, found, strict=True))

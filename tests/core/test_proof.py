@@ -1,0 +1,190 @@
+"""A host's own rasterizer is compared with our engine before anything is trained."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from dataclasses import replace
+from importlib import import_module
+
+import pytest
+import torch
+from cli.commands import run_json
+from miniatures import compiled, vanilla_3dgs
+from miniatures.compiled import DIFFERENCES
+
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.errors import ProofError
+from fragprune_plugins.injection import proof, rasterizing
+from fragprune_plugins.learning.goals import Pressure
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.testing.invariants.case import FixedThresholds, open_all
+
+RENDERER = "gaussian_renderer/__init__.py"
+EQUAL = {
+    "none": ("the picture", "radii"),
+    "depth": ("the picture", "radii", "depth"),
+    "depth without gradient": ("the picture", "radii", "depth, without gradient"),
+    "depth over alpha": ("the picture", "radii", "depth over alpha"),
+    "inverse depth": ("the picture", "radii", "inverse depth"),
+    "alpha": ("the picture", "radii", "alpha"),
+}
+OTHERWISE = {
+    "projection": "another picture: in the host's own call",
+    "dilation": "another picture",
+    "exponent": "another picture",
+    "alpha's cap": "another picture: in a chart",
+    "faint fragments": "another picture",
+    "stop": "another picture",
+    "near plane": "another picture: in a chart",
+    "colours below 0": "another picture: in a chart",
+    "absolute gradient": "gradient of means2D, column 2 differs",
+    "gradient by pixels": "gradient of means2D, column 0, 1 differs",
+    "frozen positions": "gradient of means3D is zero",
+    "regularised scales": "gradient of scales differs",
+    "straight-through opacities": "gradient of opacities differs",
+    "unknown": "output 3 (more), which the host uses, is unknown",
+    "constant": "output 3 (more), which the host uses, is unknown",
+    "half the radii": "output 2 (radii), which the host uses, is unknown",
+}
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("FRAGPRUNE_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def host(tmp_path):
+    """Makes the demo's host with a rasterizer of its own that has a difference built in."""
+
+    def make(difference, returned="more", result='"more": more'):
+        folder = tmp_path / "host"
+        shutil.copytree(vanilla_3dgs.HOST, folder, dirs_exist_ok=True)
+        compiled.write(folder, difference)
+        if DIFFERENCES[difference].also:
+            source = (folder / RENDERER).read_text()
+            source = source.replace("image, radii =", f"image, radii, {returned} =")
+            source = source.replace('"radii": radii,', f'"radii": radii, {result}')
+            (folder / RENDERER).write_text(source)
+        return folder
+
+    return make
+
+
+def running(folder, **options):
+    options = {"learn": False, "prove": True} | options
+    return vanilla_3dgs.running(path=folder, drop_in=None, **options)
+
+
+def draw(folder, **options):
+    """Draw one view under a session; its proofs."""
+    with running(folder, **options) as host:
+        host.render(host.camera(96, 64), host.model(40, setup=False))
+        return list(host.session.proofs.values())
+
+
+@pytest.mark.parametrize("difference", EQUAL)
+def test_outputs_are_told_by_their_numbers(host, difference):
+    (proved,) = draw(host(difference))
+    assert proved.outputs == EQUAL[difference]
+    assert f"render ({RENDERER}:" in proved.call
+
+
+@pytest.mark.parametrize("difference", OTHERWISE)
+def test_a_rasterizer_that_draws_otherwise_is_refused(host, difference):
+    with pytest.raises(ProofError) as refused:
+        draw(host(difference))
+    assert OTHERWISE[difference] in refused.value.found
+    assert "fragprune finetune" in refused.value.remedy
+
+
+def test_every_difference_is_tried():
+    assert {*EQUAL, *OTHERWISE, "scale modifier"} == DIFFERENCES.keys()
+
+
+def test_an_unknown_output_that_nobody_reads_is_let_be(host):
+    (proved,) = draw(host("unknown", "_more", ""))
+    assert proved.outputs[2] == "something unknown that is not read"
+
+
+@pytest.mark.parametrize("difference", ["depth", "depth without gradient", "depth over alpha"])
+def test_an_output_that_was_found_is_made_with_thresholds(host, difference):
+    fixed = FixedThresholds(torch.linspace(0.02, 0.4, 40))
+    settings = Settings(iterations=9, goal=Pressure(0.0))
+    options = {"path": host(difference), "drop_in": None, "plugins": [fixed]}
+    with vanilla_3dgs.joint(settings, **options) as running:
+        model, camera = running.model(40), running.camera(96, 64)
+        open_all(running, model)
+        found = running.render(camera, model)["more"]
+        view, splats = fixed.inputs.view, fixed.inputs.splats
+        depths = splats.means @ view.viewmatrix[:3, 2:3] + view.viewmatrix[3, 2]
+        inputs = replace(fixed.inputs, splats=replace(splats, features=depths))
+        drawn = ReferenceEngine().rasterize(inputs, fixed.values)
+        expected = DIFFERENCES[difference].also[0](drawn)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+        assert found.requires_grad == expected.requires_grad
+
+
+def test_a_setting_with_another_value_is_proved_again(host, caplog):
+    folder = host("scale modifier")
+    with running(folder, learn=True) as session:
+        model, camera = session.model(40), session.camera(96, 64)
+        draw = import_module("gaussian_renderer").render
+        black, pipe = torch.zeros(3), session.driver.pipe()
+        draw(camera, model, pipe, black)
+        draw(session.camera(64, 48, side=0.1), model, pipe, torch.ones(3))
+        model.active_sh_degree = 0
+        draw(camera, model, pipe, black)
+        assert len(session.session.proofs) == 1  # views, backgrounds and bands need no other
+        with pytest.raises(ProofError, match="another picture"):
+            draw(camera, model, pipe, black, 1.5)
+    with running(folder) as session:  # the host's own stage: stage 2 would refuse it
+        model, camera = session.model(40, setup=False), session.camera(96, 64)
+        draw = import_module("gaussian_renderer").render
+        draw(camera, model, pipe, black)
+        draw(camera, model, pipe, black, 1.5)
+    assert "another picture" in caplog.text
+
+
+def test_a_proof_is_kept_until_the_rasterizer_changes(host, monkeypatch):
+    folder, made = host("none"), []
+    prove = proof._Trial.prove
+    monkeypatch.setattr(proof._Trial, "prove", lambda trial: made.append(1) or prove(trial))
+    first, second = draw(folder), draw(folder)
+    assert first == second
+    assert len(made) == 1
+    told = run_json("check", folder)
+    assert told["proved"] == [str(first[0])]
+    assert "proved" in told["sentence"]
+    file = folder / compiled.PACKAGE / "__init__.py"
+    file.write_text(file.read_text() + "# another build\n")
+    assert run_json("check", folder)["proved"] == []
+    draw(folder)
+    assert len(made) == 2
+
+
+def test_a_stand_in_proves_nothing_and_says_so(caplog):
+    caplog.set_level(logging.INFO, logger="fragprune")
+    with vanilla_3dgs.running(learn=False, prove=True) as host:
+        host.render(host.camera(), host.model(setup=False))
+        host.render(host.camera(), host.model(setup=False))
+        assert not host.session.proofs
+    assert caplog.text.count("nothing is proved, because a stand-in of ours draws") == 1
+
+
+def test_a_session_that_never_draws_by_ours_proves_nothing(host):
+    assert draw(host("projection"), prove=False) == []
+
+
+def test_the_proof_leaves_no_trace_in_a_training(host, monkeypatch):
+    folder, after = host("none"), []
+    for way in (proof.proved, lambda *_, **__: None):
+        monkeypatch.setattr(rasterizing, "proved", way)
+        torch.manual_seed(3)
+        with running(folder, learn=True) as session:
+            model = session.model(40)
+            session.step(model, session.camera(96, 64), 1)
+            after.append({**vanilla_3dgs.tensors(model), "random": torch.get_rng_state()})
+    for name, value in after[0].items():
+        assert torch.equal(value, after[1][name]), name
