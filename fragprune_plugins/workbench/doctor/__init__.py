@@ -14,7 +14,13 @@ from fragprune_plugins.workbench.commands.command import Command, Report
     help="Compile the GPU kernels in advance for these compute capabilities, such as 80,90; needs "
     "no GPU.",
 )
-def command(build_cuda: str | None) -> Report:
+@click.option(
+    "--prove",
+    is_flag=True,
+    help="Check every engine that runs here against the oracle, then time those that agree, in "
+    "turns with other rasterizers that are installed. Takes minutes.",
+)
+def command(build_cuda: str | None, prove: bool) -> Report:
     """Report versions, engines, the native build and plugins, for a bug report.
 
     If there is a GPU, the cuda engine is checked on it: its pictures and gradients are compared
@@ -25,7 +31,11 @@ def command(build_cuda: str | None) -> Report:
     Examples:
       fragprune doctor --json
       fragprune doctor --build-cuda 80,86,90
+      fragprune doctor --prove --json > proof.json
     """
-    from fragprune_plugins.workbench.doctor.work import build, examine
+    from fragprune_plugins.workbench.doctor import prove as proving
+    from fragprune_plugins.workbench.doctor import work
 
-    return examine() if build_cuda is None else build(build_cuda)
+    if prove:
+        return proving.prove()
+    return work.examine() if build_cuda is None else work.build(build_cuda)

@@ -1,0 +1,272 @@
+"""Proves what fragprune is worth on one machine: first that it draws rightly, then how fast.
+
+Every engine that runs here, and every other rasterizer that is installed, draws fixed scenes. Its
+pictures and gradients are compared with the oracle's. Only who agrees is timed, all in turns.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import math
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import torch
+from torch import Tensor
+
+from fragprune_plugins.constants import VERSION
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.cuda import comparison, driver, kernels
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.errors import FragpruneError
+from fragprune_plugins.types import RasterInputs, Splats
+from fragprune_plugins.workbench.bench.timing import Case, Pass, measure
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.doctor import peers
+from fragprune_plugins.workbench.prices.machine import describe_machine, load_average
+from fragprune_plugins.workbench.prices.scene import make_scene, make_view
+
+FORMAT = "fragprune-proof 1"
+
+SCENES = {
+    "cpu": ((100_000, (640, 480)),),
+    "cuda": ((100_000, (640, 480)), (1_000_000, (1920, 1080))),
+}
+"""Gaussians and size of the timed pictures, by the kind of device."""
+
+TRUNCATION = 16 / 255
+"""One threshold for all Gaussians of the timed scene."""
+
+PEER_PICTURE_DB, PEER_GRADIENT = 50.0, 0.01
+"""Peers end Gaussians at other radii: what their pictures and gradients may differ by.
+
+PSNR of the picture, and the relative L2 error of each gradient.
+"""
+
+_LEARNED = ("means", "opacities", "scales", "rotations", "sh")
+_KINDS: tuple[Pass, ...] = ("forward", "forward_backward")
+_CLOCKS = ("driver_version", "clocks.sm", "clocks.max.sm", "clocks.mem", "temperature.gpu")
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """Who is to be proved.
+
+    Attributes:
+        name: for people.
+        engine: draws.
+        ours: it knows thresholds, and must equal the oracle in everything.
+    """
+
+    name: str
+    engine: Engine
+    ours: bool = True
+
+
+def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
+    """Check, then time; ``fragprune doctor --prove``.
+
+    Args:
+        say: is told how far it is; None tells stderr.
+        repeats: timed frames of each row.
+    """
+    say = say or (lambda text: click.echo(text, err=True))
+    kind = "cuda" if torch.cuda.is_available() else "cpu"
+    contestants, left_out = list(_ours(kind)), {}
+    for name in peers.installed():
+        if kind == "cuda":
+            contestants.append(Contestant(name, peers.peer(name), ours=False))
+        else:
+            left_out[name] = "it runs on a GPU only, and torch sees none"
+    if kind == "cuda" and (missing := driver.missing()) is not None:
+        left_out["cuda"] = missing
+    checks = []
+    for each in contestants:
+        say(f"checking {each.name}")
+        checks.append(
+            {"name": each.name, "ours": each.ours, "differences": list(_check(each, kind))}
+        )
+    passed = [c for c, check in zip(contestants, checks, strict=True) if not check["differences"]]
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "fragprune": VERSION,
+        "when": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+        "machine": describe_machine(kind) | {"load_before": load_average()},
+        "clocks": _clocks() if kind == "cuda" else None,
+        "peers": peers.installed(),
+        "hashes": _hashes(),
+        "left_out": left_out,
+        "checks": checks,
+        "times": list(_times(passed, kind, repeats, say)),
+    }
+    data["machine"]["load_after"] = load_average()
+    wrong = any(check["ours"] and check["differences"] for check in checks)
+    return Report(data, _text(data), exit_code=1 if wrong else 0)
+
+
+def _ours(kind: str) -> Iterator[Contestant]:
+    """Our engines that run here."""
+    for build in binding.usable_builds():
+        yield Contestant(f"cpu ({build})", CpuEngine(binding.open_build(build)))
+    if kind == "cuda" and driver.missing() is None:
+        yield Contestant("cuda", CudaEngine())
+
+
+# ---- correctness ---------------------------------------------------------------------------------
+
+
+def _check(contestant: Contestant, kind: str) -> Iterator[str]:
+    """Every difference from the oracle in float64; empty if there is none."""
+    inputs, thresholds = comparison.scene(200, (70, 50), 3.0)
+    wide = comparison.on(inputs, "cpu", torch.float64)
+    where = "cpu" if isinstance(contestant.engine, CpuEngine) else kind
+    there = comparison.on(inputs, where)
+    oracle = ReferenceEngine()
+    try:
+        if not contestant.ours:
+            yield from _peer_differences(contestant.engine, there, wide)
+            return
+        found = comparison.drawn_and_learned(contestant.engine, there, thresholds)
+    except (FragpruneError, RuntimeError, TypeError, AttributeError) as error:
+        yield f"it fails: {str(error).splitlines()[0]}"
+        return
+    expected = comparison.drawn_and_learned(oracle, wide, thresholds)
+    yield from comparison.differences("with thresholds", found, expected)
+
+
+def _peer_differences(engine: Engine, here: RasterInputs, wide: RasterInputs) -> Iterator[str]:
+    found, expected = _learned(engine, here), _learned(ReferenceEngine(), wide)
+    picture = found.pop("picture"), expected.pop("picture")
+    error = float((picture[0].double() - picture[1]).square().mean())
+    if not error <= 10 ** (-PEER_PICTURE_DB / 10):
+        yield f"another picture: its mean squared error is {error:.2g}"
+    for name, right in expected.items():
+        away = float((found[name].double() - right).norm() / right.norm())
+        if not away <= PEER_GRADIENT:
+            yield f"another gradient of {name}: off by {away:.1%}"
+
+
+def _learned(engine: Engine, inputs: RasterInputs) -> dict[str, Tensor]:
+    """The picture without thresholds, and its gradients by name; on the CPU."""
+    assert isinstance(inputs.splats, Splats)
+    leaves = {
+        name: getattr(inputs.splats, name).detach().clone().requires_grad_() for name in _LEARNED
+    }
+    image = engine.rasterize(replace(inputs, splats=replace(inputs.splats, **leaves)), None).image
+    asked = torch.rand(image.shape, generator=torch.Generator().manual_seed(0)) - 0.3
+    torch.autograd.backward(image, asked.to(image))
+    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    return {name: each.detach().cpu() for name, each in {"picture": image, **gradients}.items()}
+
+
+# ---- time ----------------------------------------------------------------------------------------
+
+
+def _times(
+    contestants: Sequence[Contestant], kind: str, repeats: int, say: Callable[[str], None]
+) -> Iterator[dict[str, Any]]:
+    """Rows of all that passed and draw on the device, timed in turns."""
+    timed = [c for c in contestants if kind == "cpu" or not isinstance(c.engine, CpuEngine)]
+    ours = [each for each in timed if each.ours]
+    for count, size in SCENES[kind]:
+        splats, view = make_scene(count).to(kind).splats(), make_view(*size).to(kind)
+        cut = torch.full_like(splats.opacities, TRUNCATION)
+        cases = [
+            Case(f"bench-{count}", view, splats, way, thresholds)
+            for way in _KINDS
+            for thresholds in (None, cut)
+        ]
+        plain = [case for case in cases if case.thresholds is None]
+        rounds = [("truncation", cases, ours)]
+        rounds += [("peers", plain, timed)] if len(timed) > len(ours) else []
+        for what, some, engines in rounds:
+            if not engines:
+                continue
+            say(f"timing {what}: {count:,} Gaussians at {size[0]}x{size[1]}")
+            rows = measure(some, [each.engine for each in engines], repeats=repeats)
+            names = [each.name for _ in some for each in engines]
+            for name, row in zip(names, rows, strict=True):
+                yield {"round": what} | _finite(row) | {"engine": name}
+
+
+def _finite(row: dict[str, Any]) -> dict[str, Any]:
+    """None for what a peer does not count."""
+    return {
+        key: None if isinstance(each, float) and math.isnan(each) else each
+        for key, each in row.items()
+    }
+
+
+# ---- what is printed -----------------------------------------------------------------------------
+
+
+def _hashes() -> dict[str, str]:
+    """What was proved: the compiled libraries, the kernels' sources, the timed scene."""
+    found = {
+        build: _digest(Path(binding.open_build(build).path).read_bytes())
+        for build in binding.usable_builds()
+    }
+    scene = make_scene(1000)
+    numbers = b"".join(t.numpy().tobytes() for t in (scene.xyz, scene.opacity, scene.scaling))
+    return found | {"kernels": _digest(kernels.digest_of_sources()), "scene": _digest(numbers)}
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _clocks() -> dict[str, str] | None:
+    """Driver, clocks in MHz and temperature of the GPU, as nvidia-smi tells them."""
+    command = ["nvidia-smi", f"--query-gpu={','.join(_CLOCKS)}", "--format=csv,noheader,nounits"]
+    with suppress(OSError, ValueError, IndexError, subprocess.SubprocessError):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+        values = done.stdout.splitlines()[0].split(", ")
+        return dict(zip(_CLOCKS, values, strict=True))
+    return None
+
+
+def _text(data: dict[str, Any]) -> str:
+    """What a person reads."""
+    machine = data["machine"]
+    lines = [f"{machine['processor']}, {machine['gpu'] or 'no GPU'}, torch {machine['torch']}", ""]
+    for check in data["checks"]:
+        verdict = "; ".join(check["differences"]) or "agrees with the oracle"
+        lines.append(f"{check['name']}: {verdict}")
+    lines += [f"{name}: left out, {why}" for name, why in data["left_out"].items()]
+    if data["times"]:
+        loads = [f"{machine[key]:.1f}" for key in ("load_before", "load_after") if machine[key]]
+        lines += ["", _table(data["times"]), f"Load before and after: {' and '.join(loads)}."]
+    if any(check["differences"] for check in data["checks"]):
+        lines += ["", "Who disagrees was not timed."]
+    return "\n".join(lines)
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> str:
+    """Times in turns; a ratio is that to the untruncated row of the same engine."""
+    lines = [
+        f"{'engine':<28}{'size':>11}  {'pass':<17}{'cut':<5}{'median ms':>10}{'±se':>7}{'':>8}"
+    ]
+    plain: dict[tuple[str, ...], float] = {}
+    for row in rows:
+        key = row["round"], row["engine"], row["scene"], row["pass"]
+        faster = ""
+        if row["truncated"]:
+            faster = f"{plain[key] / row['ms_median']:.2f}x"
+        else:
+            plain[key] = row["ms_median"]
+        size = f"{row['width']}x{row['height']}"
+        lines.append(
+            f"{row['engine']:<28}{size:>11}  {row['pass']:<17}"
+            f"{'yes' if row['truncated'] else 'no':<5}{row['ms_median']:>10.2f}{row['ms_se']:>7.2f}"
+            f"{faster and '  ' + faster}"
+        )
+    return "\n".join(lines)
