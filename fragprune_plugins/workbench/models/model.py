@@ -6,10 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from fragprune_plugins.errors import ModelFileError, SidecarError
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.atomic import put, staging
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.finite import expect_finite
+from fragprune_plugins.workbench.models import formats
+
 if TYPE_CHECKING:
     import torch
-
-    from fragprune_plugins.files.model import Model
 
 DEFORMATION = "deformation.pth"
 """The network that 4DGaussians saves beside a PLY."""
@@ -29,8 +34,6 @@ def of(given: Model | Trained | str | Path) -> Model:
     Raises:
         ModelFileError, SidecarError: as ``load``.
     """
-    from fragprune_plugins.files.model import Model
-
     if isinstance(given, str | Path):
         return load(given)
     return given if isinstance(given, Model) else given.model
@@ -55,10 +58,6 @@ def load(
         ModelFileError: the model cannot be read, or is drawn only after a network has moved it.
         SidecarError: the sidecar is broken, another model's, or has another number of rows.
     """
-    from fragprune_plugins.errors import SidecarError
-    from fragprune_plugins.files import sidecar
-    from fragprune_plugins.workbench.models import formats
-
     path = Path(path)
     _expect_whole(path)
     paired = truncation and formats.found(path).paired
@@ -78,8 +77,6 @@ def load(
 
 def _expect_whole(path: Path) -> None:
     """Raise ModelFileError if the file is drawn only after a network has moved its Gaussians."""
-    from fragprune_plugins.errors import ModelFileError
-
     if path.with_name(DEFORMATION).exists():
         raise ModelFileError(
             str(path),
@@ -92,8 +89,6 @@ def _expect_whole(path: Path) -> None:
 
 def _versions(path: Path) -> list[tuple[int, ...] | None]:
     """What changes when another process replaces a model or its sidecar."""
-    from fragprune_plugins.files import sidecar
-
     found: list[tuple[int, ...] | None] = []
     for each in (path, sidecar.path_beside(path)):
         try:
@@ -119,11 +114,6 @@ def save(path: str | Path, model: Model | Trained) -> None:
             thresholds; existing files stay as they were.
         DivergedError: learned values are not finite.
     """
-    from fragprune_plugins.files import sidecar
-    from fragprune_plugins.files.atomic import put, staging
-    from fragprune_plugins.learning.finite import expect_finite
-    from fragprune_plugins.workbench.models import formats
-
     path, model = Path(path), of(model)
     form = formats.named(path)
     if model.thresholds is not None:
