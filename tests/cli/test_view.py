@@ -26,7 +26,7 @@ def test_a_folder_with_cameras_and_photographs(scene, tmp_path):
     out = tmp_path / "page"
     report = run_json("view", path, "--data", data, "--out", out)
     held = json.loads((out / "scene.json").read_text())
-    assert [each["name"] for each in held["layers"]] == ["Without cutoffs", "Pruned"]
+    assert [each["name"] for each in held["layers"]] == ["No cutoffs", "Pruned"]
     assert [each["name"] for each in held["cameras"]] == ["view00.png", "view08.png"]
     assert all((out / each["photograph"]).exists() for each in held["cameras"])
     assert held["start"]["position"] == held["cameras"][0]["position"]

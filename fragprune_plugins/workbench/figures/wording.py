@@ -198,7 +198,7 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
         )
     return [
         (f"{was / max(now, 1e-9):.1f}x", f"fewer fragments to draw: {was:.1f} → {now:.1f} a pixel"),
-        (f"{slow / max(fast, 1e-9):.2f}x", f"as fast: frames{of} of {slow:.2f} → {fast:.2f} ms"),
+        (f"{slow / max(fast, 1e-9):.2f}x", f"as fast: frames{of} in {slow:.2f} → {fast:.2f} ms"),
         picture,
     ]
 

@@ -91,7 +91,7 @@ def view(
 def _layers(paths: list[Path], truncated: list[bool]) -> list[Layer]:
     """The sides of the split, from left to right."""
     if len(paths) == 1:
-        pruned = [Layer("Without cutoffs", 0, False), Layer("Pruned", 0, True)]
+        pruned = [Layer("No cutoffs", 0, False), Layer("Pruned", 0, True)]
         return pruned if truncated[0] else [Layer(paths[0].stem, 0, False)]
     names = ("Original", "Pruned") if truncated == [False, True] else _told_apart(*paths)
     return [Layer(name, index, truncated[index]) for index, name in enumerate(names)]
