@@ -83,7 +83,7 @@ def _told(off: Tensor, away: Tensor) -> str:
     wrong, total = int(off.sum()), off.numel()
     if wrong <= 1 + total // SHARE:
         return ""
-    return f"{100 * wrong / total:.2g}% of {total} are off, by up to {float(away.max()):.2g}"
+    return f"{wrong} of {total} are off, by up to {float(away.max()):.2g}"
 
 
 # ---- what an output is -------------------------------------------------------------------------

@@ -47,6 +47,10 @@ another value of any other setting needs another proof."""
 
 _DETACHED = ", without gradient"
 
+_SHAPE = ("means3D", "scales", "rotations", "cov3D_precomp")
+"""Arguments through which vanilla differentiates its antialiasing as if the covariance were dilated
+once more. Ours is the derivative, so antialiased calls are not compared in them."""
+
 
 def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bool) -> Proof | None:
     """The proof of a call of the host's own rasterizer, made now if there is none yet.
@@ -258,23 +262,30 @@ class _Trial:
             chart = likeness.chart(own, self.dialect.unpack(self.drawn).view)
             both = [
                 self._draw("the host's own call", own, settings),
-                self._draw("a chart through its camera", chart, self._with_all_bands()),
+                self._draw("a chart through its camera", chart, self._for_the_chart()),
             ]
             found = [self._output(number, both) for number in range(len(both[0].theirs))]
         made = {number: name for number, (name, new) in enumerate(found) if new}
         return Proof(self.where, tuple(name for name, _ in found), made)
 
-    def _with_all_bands(self) -> Any:
-        """The call's settings with the highest SH degree that its coefficients allow."""
-        settings, sh = self.drawn.settings, self.drawn.get("shs")
-        if sh is None or settings.sh_degree >= 3:
-            return settings
-        count = sh.shape[1] + (self.drawn.get("dc") is not None)
-        return settings._replace(sh_degree=max(settings.sh_degree, min(3, int(count**0.5) - 1)))
+    def _for_the_chart(self) -> Any:
+        """The call's settings with all SH bands that its coefficients allow, not antialiased."""
+        settings, sh, dc = self.drawn.settings, self.drawn.get("shs"), self.drawn.get("dc")
+        changed: dict[str, Any] = {}
+        if sh is not None and settings.sh_degree < 3:
+            count = sh.shape[1] + (dc is not None)
+            changed["sh_degree"] = max(settings.sh_degree, min(3, int(count**0.5) - 1))
+        if getattr(settings, "antialiasing", False):
+            changed["antialiasing"] = False
+        return settings._replace(**changed) if changed else settings
 
     def _draw(self, what: str, arguments: dict[str, Tensor], settings: Any) -> _Both:
-        floating = {name: each for name, each in arguments.items() if each.is_floating_point()}
-        leaves = {name: each.detach().requires_grad_() for name, each in floating.items()}
+        excused = _SHAPE if getattr(settings, "antialiasing", False) else ()
+        leaves = {
+            name: each.detach().requires_grad_()
+            for name, each in arguments.items()
+            if each.is_floating_point() and name not in excused
+        }
         given = {**arguments, **leaves}
         rasterizer = self.call.instance
         rasterizer.raster_settings = settings

@@ -147,6 +147,23 @@ def test_a_setting_with_another_value_is_proved_again(host, caplog):
     assert "another picture" in caplog.text
 
 
+def antialiased(folder):
+    source = (folder / RENDERER).read_text()
+    (folder / RENDERER).write_text(source.replace("pipe.debug,", "pipe.debug, antialiasing=True,"))
+    return folder
+
+
+def test_antialiasing_is_differentiated_otherwise_by_vanilla(host):
+    (proved,) = draw(antialiased(host("none")))
+    assert proved.outputs == EQUAL["none"]
+
+
+@pytest.mark.parametrize("difference", ["dilation", "frozen positions", "regularised scales"])
+def test_antialiasing_excuses_nothing_else(host, difference):
+    with pytest.raises(ProofError):
+        draw(antialiased(host(difference)))
+
+
 def test_a_proof_is_kept_until_the_rasterizer_changes(host, monkeypatch):
     folder, made = host("none"), []
     prove = proof._Trial.prove

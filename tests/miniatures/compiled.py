@@ -106,7 +106,8 @@ DIFFERENCES = {
     "constant": Difference(also=(lambda drawn: torch.zeros_like(drawn.alpha),)),
 }
 
-Settings = NamedTuple("Settings", [(name, Any) for name in SHARED])
+Settings = NamedTuple("Settings", [(name, Any) for name in (*SHARED, "antialiasing")])
+Settings.__new__.__defaults__ = (False,)
 
 
 class Rasterizer(nn.Module):
@@ -132,6 +133,8 @@ class Rasterizer(nn.Module):
         """(colour (3, H, W), radii (N,), and what the difference adds)."""
         s, other = self.raster_settings, self.difference
         given = {"means3D": means3D, "means2D": means2D, "opacities": opacities, "scales": scales}
+        if s.antialiasing:  # vanilla's backward pass
+            given["scales"] = _Changed.apply(scales, lambda grad, own: 1.1 * grad)
         for name, change in (other.backward or {}).items():
             given[name] = _Changed.apply(given[name], change)
         camera = Camera(
@@ -156,7 +159,9 @@ class Rasterizer(nn.Module):
             sh_degree=s.sh_degree,
             features=means @ s.viewmatrix[:3, 2:3] + s.viewmatrix[3, 2],
         )
-        options = Options(**{"scale_modifier": s.scale_modifier, **(other.options or {})})
+        own = {"compensation": "antialiasing" if s.antialiasing else "none"}
+        own["scale_modifier"] = s.scale_modifier
+        options = Options(**own | (other.options or {}))
         with other.patched():
             drawn = render(camera, gaussians, means2d_hook=given["means2D"], options=options)
         return drawn.image, drawn.radii // other.radii, *(of(drawn) for of in other.also)
