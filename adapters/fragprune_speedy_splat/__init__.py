@@ -35,6 +35,8 @@ UNTIL = "--prune_until_iter"
 class SpeedySplatDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with a tensor for scores, and the time taken as third output."""
 
+    otherwise = "it draws beyond three sigma, and returns a time"
+
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call as vanilla's; refuse a call that needs scores.
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.engines.cuda.kernels import digest_of_sources
-from fragprune_plugins.errors import ProofError
+from fragprune_plugins.errors import EngineError, InputError, ProofError
 from fragprune_plugins.hosts.adapter import Dialect, HostCall
 from fragprune_plugins.hosts.graphdeco.call import ARGUMENTS
 from fragprune_plugins.hosts.seams import SeamCall
@@ -59,7 +59,11 @@ def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bo
         session: the state of the session.
         call: at the seam.
         drawn: the same as data.
-        strict: False warns where the proof fails, and returns None.
+        strict: False warns where the proof fails.
+
+    Returns:
+        None where there is no proof: our engines do not draw such a call, or the proof failed and
+        may fail.
 
     Raises:
         ProofError: it draws otherwise, or returns something that the host uses and we do not know.
@@ -67,13 +71,17 @@ def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bo
     place = _place(session)
     shape = (str(call.seam), place, *_shape(drawn))
     if shape not in session.proofs:
+        session.proofs[shape] = None
         try:
             session.proofs[shape] = _read_or_prove(session, call, drawn, place, shape)
         except ProofError as error:
-            if strict:
+            known = getattr(session.dialect, "otherwise", "")
+            if strict and not known:
+                del session.proofs[shape]
                 raise
-            log.warning("%s", error)
-            session.proofs[shape] = None
+            log.warning("%s", f"not proved: {error.found}; as known: {known}" if known else error)
+        except (EngineError, InputError) as error:  # raised again where ours has to draw
+            log.info("not proved: %s", error)
     return session.proofs[shape]
 
 
@@ -284,7 +292,7 @@ class _Trial:
         leaves = {
             name: each.detach().requires_grad_()
             for name, each in arguments.items()
-            if each.is_floating_point() and name not in excused
+            if (each.requires_grad or name in (*ARGUMENTS, "dc")) and name not in excused
         }
         given = {**arguments, **leaves}
         rasterizer = self.call.instance

@@ -14,11 +14,12 @@ from miniatures import compiled, vanilla_3dgs
 from miniatures.compiled import DIFFERENCES
 
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.errors import ProofError
+from fragprune_plugins.errors import EngineError, ProofError
 from fragprune_plugins.injection import proof, rasterizing
 from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.invariants.case import FixedThresholds, open_all
+from fragprune_vanilla_3dgs import Vanilla3DGS
 
 RENDERER = "gaussian_renderer/__init__.py"
 EQUAL = {
@@ -162,6 +163,26 @@ def test_antialiasing_is_differentiated_otherwise_by_vanilla(host):
 def test_antialiasing_excuses_nothing_else(host, difference):
     with pytest.raises(ProofError):
         draw(antialiased(host(difference)))
+
+
+def adapted(**members):
+    """Vanilla's adapter, with a dialect that has other members."""
+    dialect = type("Dialect", (Vanilla3DGS.dialect_type,), members)
+    return type("Adapter", (Vanilla3DGS,), {"dialect_type": dialect})()
+
+
+def test_an_adapter_can_say_that_its_host_draws_otherwise(host, caplog):
+    adapter = adapted(otherwise="it widens more")
+    assert draw(host("dilation"), adapter=adapter, learn=True) == [None]
+    assert "another picture" in caplog.text
+    assert "as known: it widens more" in caplog.text
+
+
+def test_a_call_that_no_engine_of_ours_draws_is_left_to_the_host(host):
+    def unpack(self, call):
+        raise EngineError("a score", "one that ours lack", "none", "Draw it yourself.")
+
+    assert draw(host("none"), adapter=adapted(unpack=unpack)) == [None]
 
 
 def test_a_proof_is_kept_until_the_rasterizer_changes(host, monkeypatch):

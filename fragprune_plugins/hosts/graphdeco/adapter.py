@@ -88,7 +88,11 @@ class GraphdecoDialect(Dialect):
         outputs: number of values that the host unpacks: 2 (colour, radii) or 3 (also inverse
             depth).
         sparse_adam: the revision looks for SparseGaussianAdam in the package.
+        otherwise: how the host's own rasterizer is known to draw otherwise than our engines; its
+            proof then warns.
     """
+
+    otherwise: ClassVar[str] = ""
 
     package: str
     settings: tuple[str, ...]
