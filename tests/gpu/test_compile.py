@@ -12,10 +12,8 @@ from fragprune_plugins.engines.cuda import kernels
 from fragprune_plugins.engines.cuda.frame import MACROS, VARIANTS, unblend_macros
 
 ARCHITECTURES = (
-    75,
     90,
-    120,
-    *(pytest.param(n, marks=pytest.mark.slow) for n in (80, 86, 87, 89, 100)),
+    *(pytest.param(n, marks=pytest.mark.slow) for n in (75, 80, 86, 87, 89, 100, 120)),
 )
 
 REGISTERS = {"fp_project": 85}
