@@ -6,14 +6,15 @@ its seams   Seam, Role, SeamCall, RowTrace, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs, slice_at
 its script  CommandLine, ConfigFile, Photographs
 of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
-            share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages
+            share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages;
+            read_plain tells whether a PLY is plain 3DGS
 files       Door, for those that a host reads; Model, read_ply
 settings    parse_goal
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
 Importing this module imports no torch. Model, read_ply, slice_at and stand_ins load it when
-they are first used: import them inside functions, or under TYPE_CHECKING.
+they are first used: import them inside functions, or under TYPE_CHECKING; so is read_plain.
 """
 
 from __future__ import annotations
@@ -68,9 +69,11 @@ if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
     from fragprune_plugins.files.ply import read_ply
     from fragprune_plugins.hosts.graphdeco import stand_ins
+    from fragprune_plugins.hosts.plain import read_plain
 
-_WITH_TORCH = {
+_LATE = {
     "Model": "files.model",
+    "read_plain": "hosts.plain",
     "read_ply": "files.ply",
     "slice_at": "engines",
     "stand_ins": "hosts.graphdeco.stand_ins",
@@ -119,6 +122,7 @@ __all__ = [
     "graphdeco",
     "hookimpl",
     "parse_goal",
+    "read_plain",
     "read_ply",
     "revised",
     "slice_at",
@@ -127,7 +131,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _WITH_TORCH:
+    if name not in _LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = import_module(f"fragprune_plugins.{_WITH_TORCH[name]}")
+    home = import_module(f"fragprune_plugins.{_LATE[name]}")
     return getattr(home, name, home)  # a module stands for itself

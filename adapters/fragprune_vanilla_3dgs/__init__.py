@@ -40,6 +40,7 @@ class Vanilla3DGS(GraphdecoAdapter):
     """The adapter of vanilla 3DGS, in every public state."""
 
     name = "vanilla-3dgs"
+    descends_from = ("3dgs-fork",)
     info = HostInfo(
         "3D Gaussian Splatting",
         repo="graphdeco-inria/gaussian-splatting",

@@ -74,6 +74,13 @@ def read_kernels(repo: HostRepo, package: str, kernel: Kernel) -> list[Finding]:
     return found
 
 
+def normal_sources(repo: HostRepo, package: str) -> list[str]:
+    """The CUDA sources of a vendored rasterizer that draw, in one spelling; empty without any."""
+    return [
+        _normal(text) for project in _projects(repo, package) for text in project.texts.values()
+    ]
+
+
 _read: WeakKeyDictionary[HostRepo, dict[str, list[_Project]]] = WeakKeyDictionary()
 
 

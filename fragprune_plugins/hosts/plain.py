@@ -18,6 +18,7 @@ from fragprune_plugins.hosts.kernels import SPLAT, read_kernels
 from fragprune_plugins.hosts.source import Function, HostRepo
 
 _COLUMNS = ("f_dc", "f_rest", "opacity", "scale", "rot")
+_PLAIN = {"x", "y", "z", "nx", "ny", "nz", "l", *_COLUMNS}
 _OF_MODEL = re.compile(
     r"get_(xyz|opacity|scaling|rotation|features\w*|covariance)|_(xyz|opacity|scaling|rotation|"
     r"features_dc|features_rest)|\w+_activation|\w*sh_degree|screenspace_points"
@@ -31,7 +32,9 @@ _OF_CALL = re.compile(
 _ACTIVATIONS = {
     "scaling_activation": ("torch.exp",),
     "opacity_activation": ("torch.sigmoid",),
-    "rotation_activation": ("torch.nn.functional.normalize", "F.normalize"),
+    "rotation_activation": (
+        *("torch.nn.functional.normalize", "nn.functional.normalize", "F.normalize"),
+    ),
 }
 
 
@@ -98,13 +101,21 @@ def _of_others(repo: HostRepo, module: str) -> Iterator[str]:
     scripts = [each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier()]
     for other, name in _models(repo):
         if other != module and repo.mentions(scripts, [name]):
-            for reason in _of_columns(repo, other, name):
-                if "also holds" in reason:
-                    yield f"{name}, which a script here trains: {reason}"
+            at = repo.place(other, f"{name}.construct_list_of_attributes")
+            _, names = _columns(repo, other, name)
+            own = [each for each in names if each not in _PLAIN]
+            whole = all(any(each.startswith(column) for each in names) for column in _COLUMNS)
+            for each in own:
+                says = change_of(each)
+                if says or whole:  # if not whole, it is no model that makes a picture
+                    what = f"{each}, {says}" if says else each
+                    yield f"{name}, which a script here trains: its PLY also holds {what} ({at})"
+            for reason in _of_saving(repo, other, name) if whole else ():
+                yield f"{name}, which a script here trains: {reason}"
 
 
-def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
-    """Columns that are missing, or that plain 3DGS does not have."""
+def _columns(repo: HostRepo, module: str, name: str) -> tuple[Function | None, list[str]]:
+    """The function that lists a PLY's columns, and their names without numbers."""
     listed = repo.function(module, f"{name}.construct_list_of_attributes")
     listed = listed or repo.function(module, f"{name}.save_ply")
     names = dict.fromkeys(
@@ -112,7 +123,12 @@ def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
         for node in (ast.walk(listed) if listed else ())
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     )
-    names = {each: None for each in names if each.isidentifier()}
+    return listed, [each for each in names if each.isidentifier()]
+
+
+def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+    """Columns that are missing, or that plain 3DGS does not have."""
+    listed, names = _columns(repo, module, name)
     at = repo.place(module, f"{name}.construct_list_of_attributes")
     if missing := [each for each in _COLUMNS if not any(n.startswith(each) for n in names)]:
         yield f"its PLY lacks the columns {', '.join(missing)} ({at})"
@@ -145,10 +161,11 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
                 raw[kind] = False
                 if not re.search(r"inverse|log", value):
                     yield f"save_ply stores activated values, {target} = {value[:60]} ({at})"
-        if target in ("f_dc", "f_rest", "opacities", "scale", "rotation") and re.match(
-            r"np\.(zeros|ones)", value
-        ):
-            yield f"save_ply stores no {target}: {value[:60]} ({at})"
+        if target in ("f_dc", "f_rest", "opacities", "scale", "rotation"):
+            if re.match(r"np\.(zeros|ones)", value):
+                yield f"save_ply stores no {target}: {value[:60]} ({at})"
+            if re.search(r"self\.\w+ ?[*+/-] ?self\.\w+", value):
+                yield f"save_ply stores a product or sum, {target} = {value[:60]} ({at})"
     setup = repo.function(module, f"{name}.setup_functions")
     for node in ast.walk(setup) if setup else ():
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
@@ -297,6 +314,7 @@ class _Drawing:
     def reasons(self) -> Iterator[str]:
         """Inputs of the first call that a plain drawing does not have."""
         call = _call(self.function)
+        yield from self._cut()
         given = {each.arg: each.value for each in call.keywords if each.arg} if call else {}
         at = self.repo.at(self.module, self.function.lineno)
         for argument in ("means3D", "opacities", "scales", "rotations"):
@@ -314,6 +332,25 @@ class _Drawing:
             others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
             if others:
                 yield f"{self.function.name} makes colours from {', '.join(others[:4])} ({at})"
+
+    def _cut(self) -> Iterator[str]:
+        """A picture that is some channels of what the rasterizer returns."""
+        call = _call(self.function)
+        whole = {
+            getattr(target.elts[0] if isinstance(target, ast.Tuple) else target, "id", "")
+            for node in ast.walk(self.function)
+            if isinstance(node, ast.Assign) and node.value is call
+            for target in node.targets
+        } - {""}
+        for node in ast.walk(self.function):
+            if isinstance(node, ast.Attribute) and node.attr in ("split", "chunk", "unbind"):
+                inner = node.value
+                while isinstance(inner, ast.Subscript):
+                    inner = inner.value
+                if getattr(inner, "id", "") in whole:
+                    at = self.repo.at(self.module, node.lineno)
+                    yield f"its picture is cut out of a tensor with further channels ({at})"
+                    return
 
     def _plain(self, root: str) -> bool:
         _, dot, attribute = root.partition(".")

@@ -18,6 +18,8 @@ from fragprune_plugins.hosts.source import HostRepo
 _MODEL = "scene.gaussian_model"
 _PLY = "OUTPUT/point_cloud/iteration_30000/point_cloud.ply"
 _SHOWN = 8
+_DEEPEST = 3
+"""Folders below a checkout in which a host is looked for."""
 
 
 @dataclass(frozen=True)
@@ -146,14 +148,15 @@ def _line(repo: HostRepo, finding: Finding) -> str:
 
 
 def _inside(repo: HostRepo, adapters: Sequence[HostAdapter]) -> tuple[tuple[str, str], ...]:
-    """Folders right in a checkout that fit an adapter."""
+    """Folders in a checkout that fit an adapter."""
     found = []
     for folder in _hosts(repo.root):
         inner = HostRepo(folder)
         nearer = closest(
             [each.adapter for each in attempt(inner, adapters) if each.match.fits], adapters
         )
-        found += [(folder.name, each.name) for each in nearer[:1]]
+        name = folder.relative_to(repo.root).as_posix()
+        found += [(name, each.name) for each in nearer[:1]]
     return tuple(found)
 
 
@@ -165,10 +168,12 @@ def _within(folder: Path) -> Plain | None:
 
 
 def _hosts(root: Path) -> list[Path]:
-    """Folders right in a checkout that have a renderer of this family."""
-    try:
-        with os.scandir(root) as entries:
-            names = sorted(each.name for each in entries if each.is_dir(follow_symlinks=False))
-    except OSError:
-        return []
-    return [root / name for name in names if (root / name / "gaussian_renderer").is_dir()]
+    """Folders in a checkout that have a renderer of this family."""
+    found = []
+    for path, inside, _ in os.walk(root):
+        folder = Path(path)
+        if "gaussian_renderer" in inside and folder != root:
+            found.append(folder)
+        deep = len(folder.relative_to(root).parts) >= _DEEPEST
+        inside[:] = [] if deep else sorted(each for each in inside if not each.startswith("."))
+    return sorted(found)

@@ -315,7 +315,8 @@ class _Trial:
         theirs = [each.theirs[number] for each in both]
         ours = [dict(enumerate(each.ours)).get(number) for each in both]
         own, chart = both
-        unread = number in self.place.unread or (number < len(own.ours) and ours[0] is None)
+        known_unread = ours[0] is None or getattr(type(ours[0]), "unread", False)
+        unread = number in self.place.unread or (number < len(own.ours) and known_unread)
         is_picture = not likeness.difference(ours[1], chart.seen.image)
         name, new = likeness.meaning(ours[1], chart.seen) or "as the adapter answers", False
         if told := _first(both, map(likeness.difference, theirs, ours)):

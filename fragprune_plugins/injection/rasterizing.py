@@ -178,9 +178,28 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
         if thresholds is not None or inputs.stop is not None or presses:
             if thresholds is not None and rows is not None:
                 thresholds = thresholds[rows]
-            truncated = partial(rasterize, engine, state, rendering[1], thresholds)
+            view = rendering[1]
+
+            def truncated(each: RasterInputs, part: int = 0) -> RasterOutputs:
+                if further_picture(state, view, part):
+                    return engine.rasterize(each, thresholds)
+                return rasterize(engine, state, view, thresholds, each, part)
+
             return answer(session.dialect, drawn, inputs, truncated, proof)
     return by_host()
+
+
+def further_picture(state: ModelState, view: int, part: int) -> bool:
+    """Whether this was drawn before in this step: a host may also draw depth or normals of a view.
+
+    The first picture bears the pressure, and its fragments count.
+    """
+    if not torch.is_grad_enabled():
+        return False
+    drawn = {each for each in state.pictured if each[0] == state.steps}
+    picture = state.steps, view, part
+    state.pictured = drawn | {picture}
+    return picture in drawn
 
 
 def prove(

@@ -55,6 +55,7 @@ class ModelState:
         hooked: the optimizers that carry our hooks.
         hooks: handles that remove these hooks.
         stepped: value of ``steps`` at the last step of the store.
+        pictured: what was drawn to learn from in this step: (``steps``, view, part).
         lent: per running optimizer step, (param group, the host's options) to restore.
     """
 
@@ -70,6 +71,7 @@ class ModelState:
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
+    pictured: set[tuple[int, int, int]] = field(default_factory=set)
     lent: list[list[tuple[dict[str, Any], dict[str, Any]]]] = field(default_factory=list)
 
     __repr__ = one_line

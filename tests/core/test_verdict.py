@@ -96,14 +96,14 @@ def test_a_fork_with_a_plain_ply_is_told_the_command(fork):
     assert verdict.kind == "finetune"
     assert "fragprune finetune" in verdict.sentence
     assert "--data SCENE" in verdict.sentence
-    assert "groups beyond: exposure" in verdict.differs
-    assert verdict.adapter == "vanilla-3dgs"
+    assert verdict.differs == ("no script that trains a GaussianModel (scripts: train.py)",)
+    assert verdict.adapter == "3dgs-fork"
 
 
 def test_the_nearest_host_is_of_this_family(fork):
     adapters = load_plugins().adapters
     tried = attempt(fork(), adapters)
-    assert tried[0].adapter.name == "vanilla-3dgs"
+    assert [each.adapter.name for each in tried[:2]] == ["3dgs-fork", "vanilla-3dgs"]
     assert not any(each.held for each in tried[-2:])
 
 
@@ -163,6 +163,38 @@ def test_a_folder_that_fits_is_named_at_the_root(tmp_path):
     verdict = judged(HostRepo(tmp_path))
     assert verdict.kind == "inside"
     assert f"fragprune check {tmp_path / 'inner'}" in verdict.sentence
+
+
+def test_a_folder_deep_inside_that_fits_is_named_by_its_path(tmp_path):
+    skeleton(tmp_path / "a/b/inner")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.inside == (("a/b/inner", "vanilla-3dgs"),)
+
+
+def test_a_picture_cut_out_of_further_channels_is_not_the_plys(fork):
+    cut = "scales=scales, rotations=rotations\n    )\n"
+    verdict = judged(
+        fork(
+            ("image, radii, depth, used =", "out, radii ="),
+            (cut, f"{cut}    image, depth = out.split([3, 1], dim=0)\n"),
+        )
+    )
+    assert verdict.kind == "never"
+    assert "cut out of a tensor with further channels" in verdict.reason
+
+
+def test_another_model_that_a_script_trains_counts_if_it_stores_something_else(fork, tmp_path):
+    repo = fork()
+    text = (tmp_path / "scene/gaussian_model.py").read_text()
+    folded = text.replace("class GaussianModel", "class Folded").replace(
+        "= self._scaling.detach()", "= (self._scaling * self.get_shape).detach()"
+    )
+    (tmp_path / "scene/folded_model.py").write_text(folded)
+    assert read_plain(repo)
+    (tmp_path / "train_folded.py").write_text("from scene import Folded\n")
+    assert "Folded, which a script here trains: save_ply stores a product" in str(
+        read_plain(HostRepo(tmp_path)).reasons
+    )
 
 
 def test_a_folder_that_does_not_fit_gives_its_reason_at_the_root(fork, tmp_path):

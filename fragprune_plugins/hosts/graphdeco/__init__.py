@@ -14,22 +14,36 @@ from fragprune_plugins.hosts.graphdeco.adapter import (
     GraphdecoAdapter,
     GraphdecoDialect,
     default,
+    group_names,
 )
-from fragprune_plugins.hosts.graphdeco.call import RasterizerCall
+from fragprune_plugins.hosts.graphdeco.call import (
+    CallInSource,
+    RasterizerCall,
+    drawing_functions,
+    read_calls,
+)
 from fragprune_plugins.hosts.graphdeco.densifying import clones, needy, reaches, splits
-from fragprune_plugins.hosts.kernels import SURFEL
+from fragprune_plugins.hosts.graphdeco.reading import read_flags, read_getters
+from fragprune_plugins.hosts.kernels import SURFEL, normal_sources
 
 __all__ = [
     "CLONE",
     "MODEL",
     "SPLIT",
     "SURFEL",
+    "CallInSource",
     "GraphdecoAdapter",
     "GraphdecoDialect",
     "RasterizerCall",
     "clones",
     "default",
+    "drawing_functions",
+    "group_names",
     "needy",
+    "normal_sources",
     "reaches",
+    "read_calls",
+    "read_flags",
+    "read_getters",
     "splits",
 ]

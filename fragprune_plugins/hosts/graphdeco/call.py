@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 from fragprune_plugins.hosts.source import Function, HostRepo
 
@@ -64,13 +64,18 @@ class CallInSource:
 
     Attributes:
         call: the call, with its package filled in.
-        settings: names passed by keyword, in order.
+        settings: names of the settings, in order.
         line: where its result is assigned.
+        names: of the unpacked values, in order; "" where one is no plain name. Empty if the result
+            is not unpacked.
+        given: the arguments by name.
     """
 
     call: RasterizerCall
     settings: tuple[str, ...]
     line: int
+    names: tuple[str, ...] = ()
+    given: Mapping[str, ast.expr] = field(default_factory=dict, compare=False)
 
 
 def drawing_functions(repo: HostRepo, module: str) -> list[str]:
@@ -83,59 +88,109 @@ def drawing_functions(repo: HostRepo, module: str) -> list[str]:
     return [
         f"{within}{node.name}"
         for within, node in scopes
-        if isinstance(node, ast.FunctionDef)
-        and any(_calls(inner, SETTINGS) for inner in ast.walk(node))
+        if isinstance(node, ast.FunctionDef) and _makes_settings(repo, module, node)
     ]
+
+
+def _makes_settings(repo: HostRepo, module: str, function: Function) -> bool:
+    imported = _Imported(repo, module, function)
+    return any(imported.of(each, SETTINGS) for each in ast.walk(function))
 
 
 def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]:
     """How a function calls the rasterizer, once for each place that does.
 
-    Empty if the function is absent or passes no settings by keyword.
+    Empty if the function is absent or makes no settings.
     """
     body = repo.function(module, function)
-    made = (node for node in (ast.walk(body) if body else ()) if isinstance(node, ast.Call))
-    settings = [node.keywords for node in made if _calls(node, SETTINGS)]
-    names = tuple(k.arg for k in settings[0] if k.arg) if settings else ()
-    if body is None or not names:
+    if body is None:
         return []
-    besides, package = frozenset(names) - set(SHARED), _package(repo, module, body)
-    drawn = sorted(_drawn(body), key=lambda each: each[1])
+    imported = _Imported(repo, module, body)
+    made = [node for node in ast.walk(body) if imported.of(node, SETTINGS)]
+    names = _settings(made[0]) if made else ()  # type: ignore[arg-type]
+    if not names:
+        return []
+    besides = frozenset(names) - set(SHARED)
+    drawn = sorted(_drawn(imported, body), key=lambda each: each[1])
     return [
-        CallInSource(RasterizerCall(besides, outputs, function, given, package), names, line)
-        for outputs, line, given in drawn or [(None, body.lineno, frozenset())]
+        CallInSource(
+            RasterizerCall(besides, outputs, function, frozenset(given) - set(ARGUMENTS), package),
+            names,
+            line,
+            unpacked,
+            given,
+        )
+        for outputs, line, given, package, unpacked in drawn
+        or [(None, body.lineno, {}, imported.package(made[0]), ())]
     ]
 
 
-def _drawn(body: Function) -> Iterator[tuple[int | None, int, frozenset[str]]]:
-    """Values unpacked, line and further arguments of every call of the rasterizer."""
+def _settings(made: ast.Call) -> tuple[str, ...]:
+    """Names of the settings of a call: positions are those of the 3DGS rasterizer."""
+    unnamed = [SHARED[i] if i < len(SHARED) else f"number {i + 1}" for i in range(len(made.args))]
+    return (*unnamed, *(each.arg for each in made.keywords if each.arg))
+
+
+_Drawn = tuple[int | None, int, dict[str, ast.expr], str, tuple[str, ...]]
+
+
+def _drawn(imported: _Imported, body: Function) -> Iterator[_Drawn]:
+    """Values unpacked, line, arguments, package and names of every call of the rasterizer."""
     assigned = [node for node in ast.walk(body) if isinstance(node, ast.Assign)]
     targets = {id(node.value): node.targets[0] for node in assigned}
     rasterizers = {
-        node.targets[0].id
+        node.targets[0].id: imported.package(node.value)
         for node in assigned
-        if _calls(node.value, RASTERIZER) and isinstance(node.targets[0], ast.Name)
+        if imported.of(node.value, RASTERIZER) and isinstance(node.targets[0], ast.Name)
     }
     for node in (each for each in ast.walk(body) if isinstance(each, ast.Call)):
         called = node.func
         if isinstance(called, ast.Attribute) and called.attr != "markVisible":
             called = called.value  # another method that draws
-        if _calls(called, RASTERIZER) or getattr(called, "id", None) in rasterizers:
+        own = imported.of(called, RASTERIZER)
+        if own or getattr(called, "id", None) in rasterizers:
             target = targets.get(id(node), node)
-            outputs = len(target.elts) if isinstance(target, ast.Tuple) else None
-            given = frozenset(k.arg for k in node.keywords if k.arg) - set(ARGUMENTS)
-            yield outputs, target.lineno, given
+            values = target.elts if isinstance(target, ast.Tuple) else []
+            yield (
+                len(values) or None,
+                target.lineno,
+                {each.arg: each.value for each in node.keywords if each.arg},
+                imported.package(called) if own else rasterizers[called.id],  # type: ignore[attr-defined]
+                tuple(getattr(each, "id", "") for each in values),
+            )
 
 
-def _package(repo: HostRepo, module: str, body: Function) -> str:
-    """The package of the function's rasterizer, by the function's imports, then the module's."""
-    for scope in (body, repo.tree(module)):
-        for node in ast.walk(scope) if scope else ():
-            if isinstance(node, ast.ImportFrom) and any(RASTERIZER in a.name for a in node.names):
-                return repo.absolute(module, node)
-    return "an unknown package"
+class _Imported:
+    """Classes of rasterizers, by the names that a function has for them.
 
+    An import inside the function goes before one of its module.
+    """
 
-def _calls(node: ast.AST, name: str) -> bool:
-    """Whether a node calls a class of this name, or of one that a fork made of it."""
-    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and name in node.func.id
+    def __init__(self, repo: HostRepo, module: str, body: Function) -> None:
+        self.classes: dict[str, tuple[str, str]] = {}
+        self.modules: dict[str, str] = {}
+        for scope in (repo.tree(module), body):
+            for node in ast.walk(scope) if scope else ():
+                if isinstance(node, ast.ImportFrom):
+                    package = repo.absolute(module, node)
+                    for each in node.names:
+                        self.classes[each.asname or each.name] = package, each.name
+                elif isinstance(node, ast.Import):
+                    self.modules |= {each.asname or each.name: each.name for each in node.names}
+
+    def of(self, node: ast.AST | None, name: str) -> bool:
+        """Whether a node calls a class of this name, or of one that a fork made of it."""
+        return name in self._called(node)[1]
+
+    def package(self, node: ast.AST) -> str:
+        """The package of the class that a node calls."""
+        return self._called(node)[0]
+
+    def _called(self, node: ast.AST | None) -> tuple[str, str]:
+        function = node.func if isinstance(node, ast.Call) else None
+        if isinstance(function, ast.Name):
+            return self.classes.get(function.id, ("an unknown package", function.id))
+        if isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name):
+            module = self.modules.get(function.value.id)
+            return (module, function.attr) if module else ("", "")
+        return "", ""

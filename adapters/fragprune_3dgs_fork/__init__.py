@@ -1,0 +1,346 @@
+"""graphdeco-inria/gaussian-splatting and its forks: the adapter of forks that have no other one.
+
+What it needs it reads from the checkout (``fork``). It serves a fork whose model is plain 3DGS: the
+parameters' own activations are drawn, by the known kernel. Values that a rasterizer returns besides
+are made if their kernel was read; those that nobody reads raise if they are read after all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from fragprune_3dgs_fork.fork import (
+    CLASS,
+    MODEL,
+    Output,
+    plain_distances,
+    read_fork,
+    rests_after_densification,
+    steps_before_backward,
+)
+from fragprune_plugins.adapting import (
+    CommandLine,
+    EngineError,
+    Finding,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    HostAdapter,
+    HostCall,
+    HostInfo,
+    HostRepo,
+    RasterInputs,
+    RasterOutputs,
+    Role,
+    Seam,
+    SeamCall,
+    Splats,
+    UsageError,
+    graphdeco,
+    hookimpl,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+CHANNELS = 7
+"""That are blended beside the colours in one rasterization: engines blend 8, a proof adds one."""
+SCREEN = 3
+"""Columns of the tensor that gets the screen gradient."""
+
+
+def optimizers(call: SeamCall) -> list[Any]:
+    """All of the model's, the main one first."""
+    import torch
+
+    main = call.model.optimizer
+    others = [each for each in vars(call.model).values() if isinstance(each, torch.optim.Optimizer)]
+    return [main, *(each for each in others if each is not main)]
+
+
+class Unread:
+    """In place of a value that the host was seen not to read.
+
+    Args:
+        name: of the value.
+    """
+
+    unread = True
+    """A proof may let the value be, whatever it is."""
+
+    def __init__(self, name: str) -> None:
+        self.__dict__["name"] = name
+
+    def _raise(self, *_: Any, **__: Any) -> NoReturn:
+        raise EngineError(
+            f"the rasterizer's value {self.__dict__['name']}",
+            "read by the host, and its meaning is unknown",
+            "a picture, radii, and values whose kernel was read or whose numbers were proved",
+            "Train where the host's own rasterizer is compiled, or prune its PLY: "
+            "fragprune finetune.",
+        )
+
+    __getattr__ = __getitem__ = __len__ = __iter__ = __bool__ = __float__ = __array__ = _raise
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = _raise
+    __rtruediv__ = __lt__ = __le__ = __gt__ = __ge__ = __neg__ = __pow__ = __matmul__ = _raise
+
+    @classmethod
+    def __torch_function__(
+        cls, function: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> NoReturn:
+        named = (each for each in args if isinstance(each, cls))
+        next(named, cls("in a list of tensors"))._raise()
+
+
+class Unproved(Unread):
+    """In place of a value that a proof must tell."""
+
+    unread = False
+
+
+IN_PLACE: dict[str, type[Unread]] = {"unread": Unread, "unproved": Unproved}
+
+
+@dataclass(frozen=True)
+class ForkDialect(GraphdecoDialect):
+    """The calls of a fork, with the values back that its source names.
+
+    Attributes:
+        values: what each rasterizer returns, by its package.
+        fields: names of each rasterizer's settings, likewise.
+        own_distances: its simple_knn returns more than that of 3DGS, and has no stand-in.
+    """
+
+    values: Mapping[str, tuple[Output, ...]] = field(default_factory=dict)
+    fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    own_distances: bool = False
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Translate the call; depth and objects are further channels, with their gradients.
+
+        Raises:
+            EngineError: a setting is not neutral, or the host reads gradients that our engines do
+                not compute.
+        """
+        inputs = super().unpack(call)
+        confidence = getattr(call.settings, "confidence", None)
+        if confidence is not None and not bool((confidence == 1).all()):
+            self._refuse("confidence", "values other than 1", "1 everywhere, which changes nothing")
+        if not call.still and call["means2D"].shape[1] > SCREEN:
+            self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
+        roles = [each.role for each in self._values(call)]
+        planes = tuple(name for name in ("invdepth", "alpha") if name in roles)
+        inputs = replace(inputs, planes=planes)
+        return self._with(inputs, self._channels(call), 0)
+
+    def _channels(self, call: HostCall) -> Tensor | None:
+        """(N, F) what is blended beside the colours: depth, then objects; None if nothing is."""
+        import torch
+
+        roles = [each.role for each in self._values(call)]
+        channels = []
+        if "depth" in roles:
+            view = call.settings.viewmatrix
+            channels.append(call["means3D"] @ view[:3, 2:3] + view[3, 2])
+        if "objects" in roles:
+            channels.append(call["sh_objs"].flatten(1))
+        return torch.cat(channels, dim=1) if channels else None
+
+    def _with(self, inputs: RasterInputs, channels: Tensor | None, first: int) -> RasterInputs:
+        """The inputs with as many channels from ``first`` on as an engine blends at once."""
+        some = None if channels is None else channels[:, first : first + CHANNELS]
+        assert isinstance(inputs.splats, Splats)  # the base makes these
+        return replace(inputs, splats=replace(inputs.splats, features=some))
+
+    def answer(
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
+    ) -> Any:
+        """Draw and pack; several times if there are more channels than an engine blends."""
+        import torch
+
+        outputs, channels = draw(inputs), self._channels(call)
+        if channels is not None:
+            rest = range(CHANNELS, channels.shape[1], CHANNELS)
+            drawn = [outputs, *(draw(self._with(inputs, channels, first)) for first in rest)]
+            blended = [each.features for each in drawn if each.features is not None]
+            outputs = replace(outputs, features=torch.cat(blended))
+        return self.pack(outputs, call)
+
+    def _refuse(self, what: str, found: str, expected: str) -> NoReturn:
+        raise EngineError(
+            f"the rasterizer's {what}",
+            found,
+            expected,
+            "Train stage 1 with the host's own rasterizer, or prune its PLY: fragprune finetune.",
+        )
+
+    def _values(self, call: HostCall) -> tuple[Output, ...]:
+        package = call.entry.split(":")[0]
+        if package not in self.values:
+            self._refuse(package, "a function that no training script calls", "a known call")
+        return self.values[package]
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
+        """The host's values in its order: picture (3, H, W), radii (P,) int32, and others."""
+        values = self._values(call)
+        deep = any(each.role == "depth" for each in values)
+        made: dict[str, Any] = {
+            "image": outputs.image,
+            "radii": outputs.radii,
+            "invdepth": outputs.invdepth,
+            "alpha": outputs.alpha,
+        }
+        if outputs.features is not None:
+            made |= {"depth": outputs.features[:1], "objects": outputs.features[int(deep) :]}
+        return tuple(
+            IN_PLACE[each.role](each.name) if each.role in IN_PLACE else made[each.role]
+            for each in values
+        )
+
+    def names(self) -> frozenset[str]:
+        """The import names of the rasterizers and simple_knn."""
+        distances = {"simple_knn", "simple_knn._C"} if self.own_distances else frozenset()
+        return (super().names() | self.fields.keys()) - distances
+
+    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
+        """Stand-ins for the rasterizers and simple_knn."""
+        from fragprune_plugins.adapting import stand_ins
+
+        made = super().modules(draw)
+        for package, names in self.fields.items():
+            made[package] = stand_ins.rasterizer(package, names, self.sparse_adam, draw)
+        return {name: module for name, module in made.items() if name in self.names()}
+
+
+class ForkAdapter(GraphdecoAdapter):
+    """The adapter of forks that no other adapter knows."""
+
+    name = "3dgs-fork"
+    info = HostInfo(
+        "a fork of 3D Gaussian Splatting",
+        repo="graphdeco-inria/gaussian-splatting and its forks",
+        states="any whose model is plain 3DGS",
+        limits=(
+            "What reading cannot prove is named by fragprune check.",
+            "Stage 2 starts from a checkpoint, not from a PLY.",
+            "New Gaussians have neutral thresholds, not their parents'.",
+        ),
+    )
+    dialect_type = ForkDialect
+    steps_by_rendering = True
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Whether the model is plain, and what was read of its scripts, rows and calls."""
+        if repo.tree(MODEL) is None or repo.package:
+            return self.other_host(repo, [f"no {MODEL}"])
+        from fragprune_plugins.adapting import read_plain
+
+        plain = read_plain(repo)
+        if not plain:
+            why, plainly = plain.reasons[0], "a plain 3DGS model"
+            return [Finding("error", "not-plain", MODEL, why, plainly)]
+        fork = read_fork(repo)
+        return [
+            *fork.findings,
+            *graphdeco.read_getters(repo, MODEL),
+            *(graphdeco.read_flags(repo, self.command_line(repo)) if fork.scripts else ()),
+            *self._groups(repo),
+        ]
+
+    def _groups(self, repo: HostRepo) -> list[Finding]:
+        """An error if a group of 3DGS is missing; others are followed, and stand still."""
+        found = graphdeco.group_names(repo.function(MODEL, f"{CLASS}.training_setup"))
+        missing = [group.name for group in self.groups if group.name not in found]
+        at = repo.place(MODEL, f"{CLASS}.training_setup")
+        return [
+            Finding("error", "param-groups", at, f"no group {name}", "the groups of 3DGS")
+            for name in missing
+        ]
+
+    def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
+        """The seams at what the checkout has."""
+        fork = read_fork(repo)
+
+        def of(role: Role, method: str, how: Any = None) -> Seam:
+            named = (repo.parameters(MODEL, f"{CLASS}.{method}") or ())[:1]
+            return Seam(role, MODEL, f"{CLASS}.{method}", named, how=how)
+
+        steps = [of(Role.STEP, "update_learning_rate")] if steps_before_backward(fork) else []
+        setups = dict.fromkeys(["training_setup", *fork.setups])
+        return (
+            Seam(Role.SCENE, "scene", "Scene.__init__"),
+            *(of(Role.ATTACH, name, optimizers) for name in setups),
+            *steps,
+            of(Role.KEEP, "_prune_optimizer"),
+            of(Role.APPEND, "cat_tensors_to_optimizer"),
+            *(of(Role.STILL, name) for name in fork.still),
+            of(Role.SAVE, "save_ply"),
+            of(Role.LOAD, "load_ply"),
+            of(Role.CAPTURE, "capture"),
+            of(Role.RESTORE, "restore"),
+            Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
+            *(
+                Seam(Role.VIEW, draw.module, draw.function, (draw.camera, draw.model))
+                for draw in fork.draws
+            ),
+            *(
+                Seam(
+                    Role.RASTERIZE,
+                    package,
+                    "GaussianRasterizer.forward",
+                    ("means3D", "means2D", "opacities"),
+                    external=True,
+                )
+                for package in fork.packages
+            ),
+        )
+
+    def dialect(self, repo: HostRepo) -> ForkDialect:
+        """The dialect of the calls that were read."""
+        fork = read_fork(repo)
+        return ForkDialect(
+            package=next(iter(fork.packages), self.package),
+            settings=next(iter(fork.settings.values()), ()),
+            outputs=2,
+            sparse_adam=bool(repo.mentions(["train", MODEL], ["SparseGaussianAdam"])),
+            values=fork.outputs,
+            fields=fork.settings,
+            own_distances=not plain_distances(repo),
+        )
+
+    def command_line(self, repo: HostRepo) -> CommandLine:
+        """The flags of 3DGS, for the training scripts that were read."""
+        return replace(super().command_line(repo), scripts=read_fork(repo).scripts or self.scripts)
+
+    def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
+        """As 3DGS tells, if scripts change the model only until then; else unknown."""
+        known = rests_after_densification(read_fork(repo))
+        return super().densified(repo, script, arguments) if known else None
+
+    def model_file(self, output: Path, iteration: int) -> Path:
+        """As 3DGS names it, or the only PLY of a point cloud there: forks put words before."""
+        usual = super().model_file(output, iteration)
+        others = [] if usual.exists() else sorted(usual.parent.glob("*point_cloud*.ply"))
+        return others[0] if len(others) == 1 else usual
+
+    def captured(self, ply: Path) -> tuple[Any, ...]:
+        """Refused: a fork's checkpoint may hold more than its PLY.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(
+            str(ply),
+            "a PLY, from which no checkpoint of a fork can be made",
+            "a checkpoint of its own training",
+            "Name one with --start_checkpoint, or prune the PLY: fragprune finetune.",
+        )
+
+
+@hookimpl
+def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
+    """Register the adapter of forks."""
+    register(ForkAdapter())

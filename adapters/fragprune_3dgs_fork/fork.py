@@ -1,0 +1,608 @@
+"""Reads what a fork of the 3DGS training code does: its scripts, draws, values and rows."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Literal
+from weakref import WeakKeyDictionary
+
+from fragprune_plugins.adapting import Finding, HostRepo, graphdeco
+
+MODEL, CLASS, RENDERER = "scene.gaussian_model", "GaussianModel", "gaussian_renderer"
+PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
+PRIMITIVES = {"_prune_optimizer", "cat_tensors_to_optimizer", "replace_tensor_to_optimizer"}
+"""Methods that change rows or values of parameters inside the optimizer."""
+STATISTICS = {"oneupSHdegree", "add_densification_stats"}
+_MAKES = re.compile(r"__init__|capture\w*|(restore|create|load|init|set)_?\w*|\w*setup\w*")
+"""Methods that make a model, before it is trained."""
+_OF_MODELS = re.compile(r"^scene\.\w*model\w*$")
+_MODELS = re.compile(r"\b(gaussians?|pc|model)$")
+"""What scripts call a model."""
+_MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+Role = Literal["image", "radii", "depth", "invdepth", "alpha", "objects", "unproved", "unread"]
+
+NEUTRAL = {"antialiasing", "confidence"}
+"""Further settings that the engines know, or that are checked to be neutral at every call."""
+SERVED = {"dc", "sh_objs"}
+"""Further arguments that the engines know."""
+
+_DEPTH = re.compile(r"(\w+)\+=depths\[collected_id\[j\]\]\*alpha\*T;")
+_INVERSE = re.compile(r"(\w+)\+=\(1/depths\[collected_id\[j\]\]\)\*alpha\*T;")
+_WEIGHT = re.compile(r"(\w+)\+=alpha\*T;")
+_PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|opac)")
+"""Names of values that a proof can tell, if they are what they are called."""
+_OBJECTS = re.compile(r"(\w+)\[ch\]\+=obj_features\[[^;]*\]\*alpha\*T;")
+
+
+@dataclass(frozen=True)
+class Output:
+    """A value that a rasterizer returns.
+
+    Attributes:
+        name: that the source gives it.
+        role: what it is; "unread" for one that nobody reads, "unproved" for one that only the
+            numbers of the host's own rasterizer can tell.
+    """
+
+    name: str
+    role: Role
+
+
+@dataclass(frozen=True)
+class Draw:
+    """A drawing function that a training script reaches.
+
+    Attributes:
+        module: of the function.
+        function: its name.
+        camera: its parameter with the camera.
+        model: its parameter with the model.
+        calls: of a rasterizer, in source order.
+    """
+
+    module: str
+    function: str
+    camera: str
+    model: str
+    calls: tuple[graphdeco.CallInSource, ...]
+
+
+@dataclass
+class Fork:
+    """What was read of a checkout.
+
+    Attributes:
+        repo: the checkout.
+        findings: errors, why it cannot be served; warnings, what is not proved.
+        scripts: training scripts, the usual one first.
+        draws: the drawing functions that these reach.
+        outputs: by package, what its rasterizer returns.
+        still: methods of the model that scripts call, and that change it.
+        setups: methods that make the optimizer.
+    """
+
+    repo: HostRepo
+    findings: list[Finding] = field(default_factory=list)
+    scripts: tuple[str, ...] = ()
+    draws: tuple[Draw, ...] = ()
+    outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)
+    still: tuple[str, ...] = ()
+    setups: tuple[str, ...] = ()
+
+    def refuse(self, code: str, where: str, found: str, expected: str) -> None:
+        """Add an error."""
+        self.findings.append(Finding("error", code, where, found, expected))
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """The rasterizers, that of the first draw first."""
+        return tuple(self.outputs)
+
+    @cached_property
+    def settings(self) -> dict[str, tuple[str, ...]]:
+        """Names of the settings, by rasterizer, also of those that no script reaches."""
+        found: dict[str, tuple[str, ...]] = {}
+        for name in graphdeco.drawing_functions(self.repo, RENDERER):
+            for call in graphdeco.read_calls(self.repo, RENDERER, name):
+                found.setdefault(call.call.package, call.settings)
+        return found | {
+            call.call.package: call.settings for draw in self.draws for call in draw.calls
+        }
+
+    # -- modules ----------------------------------------------------------------------------------
+
+    @cached_property
+    def modules(self) -> tuple[str, ...]:
+        """The scripts and the checkout's own modules that they import, without model and draws."""
+        waiting = [script.removesuffix(".py").replace("/", ".") for script in self.scripts]
+        seen: dict[str, None] = {}
+        while waiting:
+            module = waiting.pop(0)
+            tree = self.repo.tree(module)
+            if module in seen or tree is None or module.split(".")[0] == RENDERER:
+                continue
+            seen[module] = None
+            for node in ast.walk(tree):
+                if isinstance(node, ast.Import):
+                    waiting += [each.name for each in node.names]
+                elif isinstance(node, ast.ImportFrom):
+                    base = self.repo.absolute(module, node)
+                    waiting += [base, *(f"{base}.{each.name}" for each in node.names)]
+        return tuple(each for each in seen if not _OF_MODELS.search(each))
+
+    def trees(self) -> Iterator[tuple[str, ast.Module]]:
+        """``modules`` with their trees."""
+        for module in self.modules:
+            tree = self.repo.tree(module)
+            if tree is not None:
+                yield module, tree
+
+
+_known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
+
+
+def read_fork(repo: HostRepo) -> Fork:
+    """Read a checkout, once."""
+    if repo not in _known:
+        fork = _known[repo] = Fork(repo)
+        _read_scripts(fork)
+        if fork.scripts:
+            _read_methods(fork)
+            _read_draws(fork)
+            _read_outputs(fork)
+            _read_changes(fork)
+    return _known[repo]
+
+
+# -- scripts ---------------------------------------------------------------------------------------
+
+
+def _read_scripts(fork: Fork) -> None:
+    """The training scripts of the model class: they make it, draw, and go backward."""
+    repo, others = fork.repo, []
+    files = sorted(repo.root.glob("*train*.py"), key=lambda each: (each.stem != "train", each.stem))
+    for file in files:
+        tree = repo.tree(file.stem) if file.stem.isidentifier() else None
+        if tree is None or not {"backward", "training_setup"} <= _mentioned(tree):
+            continue
+        made = [
+            name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Call)
+            and (name := getattr(node.func, "id", "")).endswith(("GaussianModel", "Model"))
+        ]
+        if made == [CLASS] and not _in_loop(tree, CLASS):
+            fork.scripts += (file.name,)
+        elif made:
+            others.append(f"{file.name} makes {', '.join(dict.fromkeys(made))}")
+        if made.count(CLASS) > 1 or _in_loop(tree, CLASS):
+            others[-1] += ", several at once"
+    if not fork.scripts:
+        found = "; ".join(others) or "no script that trains a GaussianModel"
+        fork.refuse("other-host", str(repo.root), found, "one *train*.py that makes one model")
+    for script in fork.scripts:
+        _check_script(fork, script)
+
+
+def _check_script(fork: Fork, script: str) -> None:
+    """A script must restore what it captures, under the name that we look for."""
+    tree = fork.repo.tree(script.removesuffix(".py"))
+    text = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)} if tree else set()
+    missing = [
+        name
+        for name in ("capture", "restore", "update_learning_rate")
+        if tree is None or name not in _mentioned(tree)
+    ]
+    if missing:
+        fork.refuse("script", script, f"no {', '.join(missing)}", "checkpoints, as 3DGS has them")
+    elif not any(isinstance(each, str) and "chkpnt" in each for each in text):
+        fork.refuse("script", script, "checkpoints of another name", "chkpnt and the iteration")
+
+
+def steps_before_backward(fork: Fork) -> bool:
+    """Whether every script sets learning rates, once an iteration, before it goes backward."""
+    for script in fork.scripts:
+        tree = fork.repo.tree(script.removesuffix(".py"))
+        calls = list(_method_calls(tree)) if tree else []
+        lines = {
+            name: [node.lineno for node, called in calls if called == name]
+            for name in ("update_learning_rate", "backward")
+        }
+        rates, backward = lines["update_learning_rate"], lines["backward"]
+        if len(rates) != 1 or not backward or rates[0] > min(backward):
+            return False
+    return True
+
+
+def rests_after_densification(fork: Fork) -> bool:
+    """Whether scripts change the model only where they ask for ``densify_until_iter``."""
+    for script in fork.scripts:
+        tree = fork.repo.tree(script.removesuffix(".py"))
+        inside = {
+            id(inner)
+            for node in (ast.walk(tree) if tree else ())
+            if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
+            for each in node.body
+            for inner in ast.walk(each)
+        }
+        for node, name in _method_calls(tree) if tree else ():
+            if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
+                return False
+    return True
+
+
+def _in_loop(tree: ast.AST, name: str, inside: bool = False) -> bool:
+    """Whether a class is called in a loop."""
+    if inside and isinstance(tree, ast.Call) and getattr(tree.func, "id", "") == name:
+        return True
+    loops = (ast.For, ast.While, ast.ListComp, ast.DictComp, ast.GeneratorExp)
+    inside |= isinstance(tree, loops)
+    return any(_in_loop(each, name, inside) for each in ast.iter_child_nodes(tree))
+
+
+@lru_cache(maxsize=256)
+def _mentioned(tree: ast.AST) -> frozenset[str]:
+    """Names, attributes and imports in a tree."""
+    return frozenset(
+        getattr(node, kind)
+        for node in ast.walk(tree)
+        for kind in ("id", "attr", "name")
+        if isinstance(getattr(node, kind, None), str)
+    )
+
+
+def _method_calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            yield node, node.func.attr
+
+
+# -- the model's methods ---------------------------------------------------------------------------
+
+
+def _methods(repo: HostRepo) -> dict[str, Function]:
+    for node in getattr(repo.tree(MODEL), "body", ()):
+        if isinstance(node, ast.ClassDef) and node.name == CLASS:
+            return {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
+    return {}
+
+
+def _read_methods(fork: Fork) -> None:
+    """Methods that change the model, and those of them that scripts call."""
+    methods = _methods(fork.repo)
+    changing = {
+        name for name, body in methods.items() if name in STATISTICS or any(_assigned(body, "self"))
+    } | (PRIMITIVES & methods.keys())
+    while True:
+        more = {
+            name
+            for name, body in methods.items()
+            if name not in changing and any(called in changing for _, called in _method_calls(body))
+        }
+        if not more:
+            break
+        changing |= more
+    changing -= {name for name in changing if _MAKES.fullmatch(name)}
+    fork.setups = tuple(
+        name
+        for name, body in methods.items()
+        if any(_target(node) == "optimizer" for node in ast.walk(body)) and name != "__init__"
+    )
+    called: dict[str, None] = {}
+    for module, tree in fork.trees():
+        statements = {id(each.value) for each in ast.walk(tree) if isinstance(each, ast.Expr)}
+        for node, name in _method_calls(tree):
+            if name in changing and _MODELS.search(ast.unparse(node.func.value)):  # type: ignore[attr-defined]
+                called[name] = None
+                if id(node) not in statements:
+                    at = fork.repo.at(module, node.lineno)
+                    fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
+    fork.still = tuple(name for name in methods if name in called)
+    for name in ("_prune_optimizer",):
+        body = methods.get(name)
+        if body is not None and "[mask]" not in ast.unparse(body):
+            place = fork.repo.place(MODEL, f"{CLASS}.{name}")
+            fork.refuse("row-change", place, f"{name} keeps other rows than its mask's", "[mask]")
+    capture = methods.get("capture")
+    if capture is not None and not _returns_state(capture):
+        place = fork.repo.place(MODEL, f"{CLASS}.capture")
+        fork.refuse("checkpoint", place, "no optimizer's state among what it returns", "one")
+
+
+def plain_distances(repo: HostRepo) -> bool:
+    """Whether ``distCUDA2`` gives one tensor, as that of 3DGS does; forks also get neighbours."""
+    tree = repo.tree(MODEL)
+    for node in ast.walk(tree) if tree else ():
+        several = isinstance(node, ast.Subscript) or (
+            isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple)
+        )
+        made = getattr(node, "value", None)
+        if several and getattr(getattr(made, "func", None), "id", "") == "distCUDA2":
+            return False
+    return True
+
+
+def _returns_state(capture: Function) -> bool:
+    return any(
+        isinstance(node, ast.Return)
+        and isinstance(node.value, ast.Tuple | ast.List)
+        and any("optimizer.state_dict()" in ast.unparse(each) for each in node.value.elts)
+        for node in ast.walk(capture)
+    )
+
+
+def _target(node: ast.AST) -> str:
+    """The attribute of ``self`` that a statement assigns; "" for others."""
+    for each in node.targets if isinstance(node, ast.Assign) else ():
+        if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
+            return each.attr
+    return ""
+
+
+def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
+    """Lines that assign a parameter of a model, or change its values in place."""
+    for node in ast.walk(body):
+        targets: list[ast.expr] = []
+        if isinstance(node, ast.Assign):
+            targets = node.targets
+        elif isinstance(node, ast.AugAssign | ast.AnnAssign):
+            targets = [node.target]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            name = node.func.attr
+            if name.endswith("_") and not name.startswith(("_", "requires_grad")):
+                targets = [node.func.value]
+        for target in targets:
+            for each in target.elts if isinstance(target, ast.Tuple) else [target]:
+                inner: ast.AST = each
+                while isinstance(inner, ast.Subscript | ast.Attribute):
+                    if isinstance(inner, ast.Attribute) and inner.attr in PARAMETERS:
+                        if not owner or ast.unparse(inner.value) == owner:
+                            yield node.lineno, inner.attr  # type: ignore[attr-defined]
+                        break
+                    inner = inner.value
+
+
+def _read_changes(fork: Fork) -> None:
+    """A script that changes parameters itself cannot be held still in stage 2."""
+    for module, tree in fork.trees():
+        for line, name in _assigned(tree):
+            at = fork.repo.at(module, line)
+            fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
+    for script in fork.scripts:
+        trained = fork.repo.tree(script.removesuffix(".py"))
+        for node in ast.walk(trained) if trained else ():
+            if isinstance(node, ast.Assign) and re.match(
+                r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(", ast.unparse(node.value)
+            ):
+                fork.findings.append(
+                    Finding(
+                        "warning",
+                        "optimizer",
+                        fork.repo.at(script.removesuffix(".py"), node.lineno),
+                        f"stage 2 does not freeze what {ast.unparse(node.targets[0])} of {script} "
+                        "trains",
+                    )
+                )
+
+
+# -- draws -----------------------------------------------------------------------------------------
+
+
+def _read_draws(fork: Fork) -> None:
+    """The drawing functions that a script names, and their calls."""
+    named: set[str] = set().union(*(_mentioned(tree) for _, tree in fork.trees()))
+    functions = graphdeco.drawing_functions(fork.repo, RENDERER)
+    while True:
+        reached = [name for name in functions if name in named]
+        bodies = [fork.repo.function(RENDERER, name) for name in reached]
+        more = set().union(named, *(_mentioned(body) for body in bodies if body))
+        if more == named:
+            break
+        named = more
+    for name in reached:
+        body = fork.repo.function(RENDERER, name)
+        parameters = fork.repo.parameters(RENDERER, name) or ()
+        model = next((each for each in _MODEL_ARGUMENTS if each in parameters), "")
+        at = f"{RENDERER}:{name} ({fork.repo.place(RENDERER, name)})"
+        calls = tuple(graphdeco.read_calls(fork.repo, RENDERER, name))
+        if not model or not parameters or parameters[0] == model:
+            fork.refuse(
+                "rasterizer-call", at, f"arguments {', '.join(parameters)}", "a camera and a model"
+            )
+            continue
+        if not calls or not all(call.names for call in calls):
+            fork.refuse("rasterizer-call", at, "a result that is not unpacked", "its values")
+            continue
+        fork.draws += (Draw(RENDERER, name, parameters[0], model, calls),)
+        for call in calls:
+            _check_call(fork, at, call)
+        if body is not None and (selected := _selected(body)):
+            fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
+    if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
+        at = f"{RENDERER} ({fork.repo.place(RENDERER, 'render')})"
+        fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
+
+
+def _check_call(fork: Fork, at: str, call: graphdeco.CallInSource) -> None:
+    unknown = [*(call.call.besides - NEUTRAL), *(call.call.arguments - SERVED)]
+    if unknown:
+        fork.refuse(
+            "rasterizer-call",
+            at,
+            f"{', '.join(sorted(unknown))}, unknown to fragprune",
+            "settings and arguments whose effect is known",
+        )
+
+
+def _selected(body: Function) -> str:
+    """The code that picks rows of what is drawn, such as ``means3D[mask]``; "" if none does."""
+    off = _off(body)
+    for statement in _statements(body.body, off):
+        for node in ast.walk(statement):
+            if isinstance(node, ast.Assign) and any(
+                getattr(each, "id", "") == "means3D" for each in node.targets
+            ):
+                for each in ast.walk(node.value):
+                    if isinstance(each, ast.Subscript) and _picks(each.slice):
+                        return ast.unparse(node)[:60]
+    return ""
+
+
+def _picks(index: ast.expr) -> bool:
+    first = index.elts[0] if isinstance(index, ast.Tuple) and index.elts else index
+    return not isinstance(first, ast.Slice | ast.Constant)
+
+
+def _off(body: Function) -> set[str]:
+    """Parameters that are None or False by default."""
+    arguments = body.args
+    plain = [*arguments.posonlyargs, *arguments.args]
+    pairs = [*zip(reversed(plain), reversed(arguments.defaults), strict=False)]
+    pairs += [(a, d) for a, d in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True) if d]
+    return {
+        each.arg
+        for each, value in pairs
+        if isinstance(value, ast.Constant) and value.value in (None, False)
+    }
+
+
+def _statements(body: list[ast.stmt], off: set[str]) -> Iterator[ast.stmt]:
+    """Simple statements, without those that need an argument that is off by default."""
+    for node in body:
+        if isinstance(node, ast.If):
+            test = ast.unparse(node.test)
+            if not any(re.fullmatch(rf"{each}( is not None)?", test) for each in off):
+                yield from _statements(node.body, off)
+            yield from _statements(node.orelse, off)
+        elif hasattr(node, "body"):
+            yield from _statements(node.body, off)
+        else:
+            yield node
+
+
+# -- outputs ---------------------------------------------------------------------------------------
+
+
+def _read_outputs(fork: Fork) -> None:
+    """What each rasterizer returns; refused where a value is read and its meaning is unknown."""
+    for draw in fork.draws:
+        for call in draw.calls:
+            package = call.call.package
+            roles = tuple(_output(fork, draw, call, number) for number in range(len(call.names)))
+            known = fork.outputs.get(package)
+            if known is not None and len(known) != len(roles):
+                at = fork.repo.at(draw.module, call.line)
+                fork.refuse(
+                    "rasterizer-call", at, f"{len(roles)} and {len(known)} values", "one form"
+                )
+                continue
+            fork.outputs[package] = tuple(
+                each if each.role != "unread" else former
+                for each, former in zip(roles, known or roles, strict=True)
+            )
+    for package, roles in fork.outputs.items():
+        names = [each.role for each in roles]
+        if names[:1] != ["image"] or names.count("radii") != 1:
+            fork.refuse(
+                "rasterizer-output",
+                package,
+                f"values {', '.join(each.name or '?' for each in roles)}",
+                "a picture, and the radii once",
+            )
+
+
+def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -> Output:
+    name, package = call.names[number], call.call.package
+    if number == 0:
+        return Output(name, "image")
+    if "radii" in name:
+        return Output(name, "radii")
+    role = _meaning(fork, call, name)
+    uses = _uses(fork, draw, name) if role == "unread" else []
+    if uses and _PROVABLE.search(name) and not graphdeco.normal_sources(fork.repo, package):
+        at = fork.repo.at(draw.module, call.line)
+        warning = Finding("warning", "rasterizer-output", at, f"what {package} returns as {name}")
+        fork.findings += [] if warning in fork.findings else [warning]
+        return Output(name, "unproved")
+    if uses:
+        fork.refuse(
+            "rasterizer-output",
+            f"{draw.module}:{draw.function} ({fork.repo.at(draw.module, call.line)})",
+            f"{name}, read in {uses[0]}, whose meaning is unknown",
+            "picture, radii, and sums along the ray whose kernel was read",
+        )
+    return Output(name, role)
+
+
+def _meaning(fork: Fork, call: graphdeco.CallInSource, name: str) -> Role:
+    """What a further output is, by its name and by the vendored kernel that makes it."""
+    late = "antialiasing" in call.settings and len(call.names) == 3
+    if late and call.call.package == "diff_gaussian_rasterization":
+        return "invdepth"  # the rasterizer since August 2024
+    text = "".join(graphdeco.normal_sources(fork.repo, call.call.package))
+    if "depth" in name:
+        for rule, role in ((_DEPTH, "depth"), (_INVERSE, "invdepth")):
+            if _written(text, rule, r"out_\w*depth\w*"):
+                return role  # type: ignore[return-value]
+    elif re.search(r"alpha|acc|opac", name) and _written(text, _WEIGHT, r"out_(alpha|opac)\w*"):
+        return "alpha"
+    elif "obj" in name and "sh_objs" in call.given and _OBJECTS.search(text):
+        return "objects"
+    return "unread"
+
+
+def _written(text: str, rule: re.Pattern[str], buffer: str) -> bool:
+    """Whether a sum goes into a buffer as it is, and nothing else does."""
+    found = rule.search(text)
+    stored = re.findall(rf"\b{buffer}\[pix_id\]=([^;]+);", text)
+    values = [each[-1] if isinstance(each, tuple) else each for each in stored]
+    return found is not None and bool(values) and set(values) == {found[1]}
+
+
+def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
+    """Places that read an output: in its function, or by its key where scripts draw."""
+    body = fork.repo.function(draw.module, draw.function)
+    if body is None or name in ("", "_"):
+        return []
+    keys: set[str] = set()
+    handed: set[int] = set()
+    for node in ast.walk(body):
+        if isinstance(node, ast.Dict):
+            for key, value in zip(node.keys, node.values, strict=True):
+                if isinstance(key, ast.Constant) and getattr(value, "id", "") == name:
+                    keys.add(str(key.value))
+                    handed.add(id(value))
+        elif isinstance(node, ast.Assign) and getattr(node.value, "id", "") == name:
+            target = node.targets[0]
+            if isinstance(target, ast.Subscript) and isinstance(target.slice, ast.Constant):
+                keys.add(str(target.slice.value))
+                handed.add(id(node.value))
+    places = [
+        fork.repo.at(draw.module, node.lineno)
+        for node in ast.walk(body)
+        if isinstance(node, ast.Name)
+        and node.id == name
+        and isinstance(node.ctx, ast.Load)
+        and id(node) not in handed
+    ]
+    for module, tree in fork.trees():
+        passed = {
+            id(inner)
+            for node, method in _method_calls(tree)
+            if method in fork.still
+            for inner in ast.walk(node)
+        }
+        for node in ast.walk(tree):
+            read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
+            index = node.slice if read else None  # type: ignore[attr-defined]
+            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":
+                index = node.args[0] if node.args else None
+            if getattr(index, "value", None) in keys and keys and id(node) not in passed:
+                places.append(fork.repo.at(module, node.lineno))  # type: ignore[attr-defined]
+    return places

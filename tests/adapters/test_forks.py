@@ -1,0 +1,161 @@
+"""The calls of forks: values besides the picture, and what must be neutral or stand still."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fragprune_3dgs_fork import ForkDialect
+from fragprune_3dgs_fork.fork import Output
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.hosts.adapter import HostCall
+from fragprune_plugins.injection import proof
+from fragprune_plugins.injection.rasterizing import further_picture
+from fragprune_plugins.injection.state import ModelState
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.testing import scenes
+
+ROLES = ("image", "radii", "objects", "alpha", "depth", "invdepth", "unread")
+DIALECT = ForkDialect("p", (), 2, values={"p": tuple(Output(each, each) for each in ROLES)})
+OBJECTS = 19
+
+
+def call_of(scene, objects, still=True, columns=3, **settings):
+    view, splats = scene.view, scene.splats
+    given = {
+        "image_height": view.height,
+        "image_width": view.width,
+        "tanfovx": view.tan_fov_x,
+        "tanfovy": view.tan_fov_y,
+        "bg": view.background,
+        "scale_modifier": 1.0,
+        "viewmatrix": view.viewmatrix,
+        "projmatrix": view.projmatrix,
+        "sh_degree": splats.sh_degree,
+        "campos": view.campos,
+    } | settings
+    arguments = {
+        "means3D": splats.means,
+        "means2D": torch.zeros(len(splats), columns),
+        "opacities": splats.opacities[:, None],
+        "shs": splats.sh,
+        "scales": splats.scales,
+        "rotations": splats.rotations,
+        "sh_objs": objects,
+    }
+    packed = namedtuple("Settings", given)(**given)
+    return HostCall(packed, arguments, "p:GaussianRasterizer.forward", still=still)
+
+
+@pytest.fixture
+def scene():
+    found = scenes.random_scene(0, 40)
+    found.splats.means.requires_grad_(True)
+    return found
+
+
+@pytest.fixture
+def objects():
+    return torch.rand(40, 1, OBJECTS, generator=torch.Generator().manual_seed(0))
+
+
+def blended(engine, scene, channel):
+    """One channel alone."""
+    splats = replace(scene.splats, features=channel)
+    return engine.rasterize(replace(scene, splats=splats), None).features
+
+
+def test_every_value_is_in_its_place_with_its_gradient(scene, objects):
+    engine, call = create_engine("reference"), call_of(scene, objects)
+    drawn = DIALECT.answer(call, DIALECT.unpack(call), lambda each: engine.rasterize(each, None))
+    values = dict(zip(ROLES, drawn, strict=True))
+    plain = engine.rasterize(scene, None)
+    for name in ("image", "radii", "alpha", "invdepth"):
+        assert torch.equal(values[name], getattr(plain, name)), name
+    for number in (0, 7, 8, OBJECTS - 1):
+        alone = blended(engine, scene, objects[:, 0, number : number + 1])
+        torch.testing.assert_close(values["objects"][number : number + 1], alone)
+    homogeneous = torch.cat([scene.splats.means, torch.ones(40, 1)], dim=1)
+    z = (homogeneous @ scene.view.viewmatrix)[:, 2:3]
+    alone = blended(engine, scene, z)
+    torch.testing.assert_close(values["depth"], alone)
+    (expected,) = torch.autograd.grad(alone.sum(), scene.splats.means, retain_graph=True)
+    (found,) = torch.autograd.grad(values["depth"].sum(), scene.splats.means)
+    assert expected.abs().max() > 0
+    torch.testing.assert_close(found, expected)
+
+
+READS = {
+    "a sum": lambda value: value + 1,
+    "a sum, turned round": lambda value: 1 + value,
+    "an entry": lambda value: value[0],
+    "a method": lambda value: value.mean(),
+    "a function": torch.sum,
+    "a comparison": lambda value: value > 0,
+    "a number": float,
+    "a stack": lambda value: torch.stack([torch.zeros(1), value]),
+}
+
+
+@pytest.mark.parametrize("how", READS)
+def test_a_value_that_was_seen_unread_may_be_handed_on_and_not_read(scene, objects, how):
+    engine, call = create_engine("reference"), call_of(scene, objects)
+    value = DIALECT.answer(call, DIALECT.unpack(call), lambda each: engine.rasterize(each, None))
+    package = {"touched": value[-1]}
+    with pytest.raises(EngineError, match=r"the rasterizer's value (unread|in a list)"):
+        READS[how](package["touched"])
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ({"confidence": torch.full((40, 1), 0.5)}, "confidence"),
+        ({"still": False, "columns": 4}, "means2D"),
+    ],
+)
+def test_what_our_engines_would_leave_out_is_refused(scene, objects, given, what):
+    with pytest.raises(EngineError, match=what):
+        DIALECT.unpack(call_of(scene, objects, **given))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"confidence": torch.ones(40, 1)},
+        {"columns": 4},
+    ],
+)
+def test_what_changes_nothing_is_served(scene, objects, given):
+    assert DIALECT.unpack(call_of(scene, objects, **given)).splats.features is not None
+
+
+def test_a_rasterizer_that_no_script_reaches_is_refused(scene, objects):
+    call = replace(call_of(scene, objects), entry="q:GaussianRasterizer.forward")
+    with pytest.raises(EngineError, match="q: a function that no training script calls"):
+        DIALECT.unpack(call)
+
+
+def test_a_proof_sees_every_value_beside_its_own_channel(scene, objects):
+    engine, call = create_engine("reference"), call_of(scene, objects)
+    inputs = DIALECT.unpack(call)
+    values, seen = proof._packed(DIALECT, call, inputs, lambda each: engine.rasterize(each, None))
+    assert len(values[2]) == OBJECTS
+    torch.testing.assert_close(seen.features[-1:], values[4])
+
+
+def test_only_the_first_picture_of_a_view_in_a_step_is_pressed():
+    state = ModelState(ThresholdStore(3))
+    state.steps = 1
+    assert not further_picture(state, 5, 0)
+    assert further_picture(state, 5, 0)
+    assert not further_picture(state, 6, 0)
+    assert not further_picture(state, 5, 1)
+    assert further_picture(state, 6, 0)
+    with torch.no_grad():
+        assert not further_picture(state, 5, 0)
+    state.steps = 2
+    assert not further_picture(state, 5, 0)

@@ -1,0 +1,190 @@
+"""A fork is served if reading shows that its model is plain, and refused by name if not."""
+
+from __future__ import annotations
+
+import pytest
+from miniatures.forks import fork
+
+from fragprune_3dgs_fork import ForkAdapter
+from fragprune_plugins.adapting import Role, UsageError
+from fragprune_plugins.hosts.choosing import attempt, choose
+from fragprune_plugins.hosts.verdict import judge
+from fragprune_plugins.plugins.loading import load_plugins
+
+
+def errors(repo):
+    return [str(each) for each in ForkAdapter().match(repo).findings if each.level == "error"]
+
+
+DEPTH = "D += depths[collected_id[j]] * alpha * T; out_depth[pix_id] = D;"
+WEIGHT = "weight += alpha * T; out_alpha[pix_id] = weight;"
+INVERSE = "E += (1 / depths[collected_id[j]]) * alpha * T; out_invdepth[pix_id] = E;"
+OBJECTS = "O[ch] += obj_features[collected_id[j] * OBJECTS + ch] * alpha * T;"
+USED = ('package["render"]', 'package["render"] + package["{}"]')
+
+SERVED = {
+    "an extra group": {},
+    "another script": {"script": "train_scene.py"},
+    "another package": {"package": "a_rasterizer"},
+    "a value that nobody reads": {"values": "image, radii, touched"},
+    "a value without a name": {"values": "image, radii, _"},
+    "confidence": {"settings": ", confidence=pc.confidence"},
+}
+
+
+@pytest.mark.parametrize("what", SERVED)
+def test_a_plain_fork_fits_and_is_to_be_proved(tmp_path, what):
+    repo = fork(tmp_path, **SERVED[what])
+    assert errors(repo) == []
+    adapters = load_plugins().adapters
+    assert choose(repo, adapters).name == "3dgs-fork"
+    verdict = judge(repo, attempt(repo, adapters), adapters)
+    assert verdict.kind == "fits"
+    assert "Not proved" in verdict.sentence
+
+
+MEANINGS = {"depth": DEPTH, "alpha": WEIGHT, "invdepth": INVERSE}
+
+
+@pytest.mark.parametrize("value", MEANINGS)
+def test_a_value_that_is_read_needs_a_kernel_that_tells_what_it_is(tmp_path, value):
+    used = (USED[0], USED[1].format(value))
+    known = fork(tmp_path / "known", used, values=f"image, radii, {value}", kernel=MEANINGS[value])
+    assert errors(known) == []
+    (roles,) = ForkAdapter().dialect(known).values.values()
+    assert [each.role for each in roles] == ["image", "radii", value]
+    absent = fork(tmp_path / "absent", used, values=f"image, radii, {value}")
+    assert errors(absent) == []
+    warned = [each for each in ForkAdapter().match(absent).findings if each.level == "warning"]
+    assert f"what diff_gaussian_rasterization returns as {value}" in str(warned)
+    (roles,) = ForkAdapter().dialect(absent).values.values()
+    assert roles[2].role == "unproved"
+    other = MEANINGS[value].replace("] = ", "] = 2 * ")
+    scaled = fork(tmp_path / "scaled", used, values=f"image, radii, {value}", kernel=other)
+    assert "whose meaning is unknown" in errors(scaled)[0]
+
+
+def test_a_value_that_no_proof_can_tell_is_refused(tmp_path):
+    used = (USED[0], USED[1].format("median_depth"))
+    repo = fork(tmp_path, used, values="image, radii, median_depth")
+    assert "median_depth, read in train.py:" in errors(repo)[0]
+
+
+def test_objects_are_known_by_argument_and_kernel(tmp_path):
+    used, values = (USED[0], USED[1].format("objects")), "image, radii, objects"
+    given = {"values": values, "arguments": ", sh_objs=pc.get_objects"}
+    assert errors(fork(tmp_path / "known", used, **given, kernel=OBJECTS)) == []
+    assert errors(fork(tmp_path / "unknown", used, **given))
+
+
+STATEMENT = "gaussians.thin_out(mask)"
+REFUSED = {
+    "a setting": ({"settings": ", mult=0.5"}, [], "mult, unknown"),
+    "a factor on gradients": ({"settings": ", depth_threshold=1"}, [], "depth_threshold, unknown"),
+    "an argument": ({"arguments": ", theta=pose"}, [], "theta, unknown"),
+    "a value used in the renderer": (
+        {"values": "image, radii, more"},
+        [("    return {", "    image = image + more\n    return {")],
+        "more, read in gaussian_renderer",
+    ),
+    "radii twice": ({"values": "image, radii, radii"}, [], "the radii once"),
+    "a selection": (
+        {},
+        [("    if chosen is not None:\n        means3D", "    means3D")],
+        "draws a selection",
+    ),
+    "several models": (
+        {},
+        [("    gaussians = GaussianModel(3)", "    for _ in range(2):\n        GaussianModel(3)")],
+        "several at once",
+    ),
+    "another model": ({}, [("GaussianModel(3)", "DeformModel(3)")], "makes DeformModel"),
+    "no checkpoints": ({}, [("gaussians.restore(", "gaussians.load(")], "no restore"),
+    "other checkpoints": ({}, [("chkpnt", "state")], "checkpoints of another name"),
+    "a lost state": ({}, [("self.optimizer.state_dict()", "None")], "no optimizer's state"),
+    "values changed by the script": (
+        {},
+        [(STATEMENT, "gaussians._opacity.data.clamp_(0)")],
+        "changes _opacity outside",
+    ),
+    "rows changed and read": ({}, [(STATEMENT, f"rows = {STATEMENT}")], "reads what thin_out"),
+    "a missing group": ({}, [('"name": "scaling"', '"name": "size"')], "no group scaling"),
+    "tensors in place of a model": (
+        {},
+        [("def render(viewpoint_camera, pc,", "def render(viewpoint_camera, xyz,")],
+        "a camera and a model",
+    ),
+    "a whole result": (
+        {},
+        [("image, radii = rasterizer(", "both = rasterizer(")],
+        "not unpacked",
+    ),
+    "computed positions": ({}, [("return self._xyz\n", "return self.net()\n")], "computed"),
+    "a picture from a network": (
+        {},
+        [("means3D = pc.get_xyz", "means3D = pc.get_xyz + pc.net(t)")],
+        "means3D from pc.net",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_reading_cannot_follow_is_refused_by_name(tmp_path, what):
+    given, changes, expected = REFUSED[what]
+    repo = fork(tmp_path, *changes, **given)
+    assert expected in "; ".join(errors(repo))
+
+
+def test_rows_and_values_stand_still_by_what_methods_do_not_by_their_names(tmp_path):
+    seams = ForkAdapter().seams_for(fork(tmp_path))
+    still = [each.attribute.split(".")[1] for each in seams if each.role is Role.STILL]
+    assert still == ["oneupSHdegree", "thin_out", "spread"]
+
+
+def test_a_step_begins_with_the_rates_only_if_they_come_before_the_loss(tmp_path):
+    adapter = ForkAdapter()
+    late = (
+        (
+            "        gaussians.update_learning_rate(iteration)\n",
+            "",
+        ),
+        ("        gaussians.optimizer.step()\n", "        gaussians.update_learning_rate(0)\n"),
+    )
+    for name, changes, steps in (("early", (), 1), ("late", late, 0)):
+        seams = adapter.seams_for(fork(tmp_path / name, *changes))
+        assert sum(each.role is Role.STEP for each in seams) == steps
+
+
+def test_joint_learning_needs_to_know_where_the_model_comes_to_rest(tmp_path):
+    repo = fork(tmp_path / "known")
+    (tmp_path / "known/arguments/__init__.py").write_text(
+        "class OptimizationParams:\n    def __init__(self):\n        self.densify_until_iter = 15\n"
+    )
+    assert ForkAdapter().densified(repo, tmp_path / "known/train.py", []) == 15
+    later = fork(tmp_path / "later", ("if iteration < opt.densify_until_iter:", "if True:"))
+    assert ForkAdapter().densified(later, tmp_path / "later/train.py", []) is None
+
+
+@pytest.mark.parametrize("taken", ["distCUDA2(points)", "distCUDA2(points)[0]"])
+def test_neighbours_of_its_own_have_no_stand_in(tmp_path, taken):
+    scales = f"    def create_from_pcd(self, pcd):\n        scales = {taken}\n\n    def capture"
+    dialect = ForkAdapter().dialect(fork(tmp_path, ("    def capture", scales)))
+    assert ("simple_knn" in dialect.names()) == (not taken.endswith("]"))
+    assert dialect.modules(lambda call: None).keys() == dialect.names()
+
+
+def test_no_checkpoint_is_made_from_a_forks_ply(tmp_path):
+    with pytest.raises(UsageError, match="no checkpoint of a fork"):
+        ForkAdapter().checkpoint_from_ply(tmp_path / "a.ply", 7, tmp_path / "made.pth")
+    assert not (tmp_path / "made.pth").exists()
+
+
+def test_a_model_is_found_under_another_name_if_it_is_the_only_one(tmp_path):
+    usual = ForkAdapter().model_file(tmp_path, 7)
+    assert usual == tmp_path / "point_cloud/iteration_7/point_cloud.ply"
+    usual.parent.mkdir(parents=True)
+    scene = usual.with_name("scene_point_cloud.ply")
+    scene.touch()
+    assert ForkAdapter().model_file(tmp_path, 7) == scene
+    usual.with_name("part_point_cloud.ply").touch()
+    assert ForkAdapter().model_file(tmp_path, 7) == usual
