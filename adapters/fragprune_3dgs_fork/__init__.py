@@ -315,6 +315,20 @@ class ForkAdapter(GraphdecoAdapter):
         """The flags of 3DGS, for the training scripts that were read."""
         return replace(super().command_line(repo), scripts=read_fork(repo).scripts or self.scripts)
 
+    def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
+        """Refuse trained exposures, which checkpoints of 3DGS lack.
+
+        Raises:
+            UsageError: ``--train_test_exp``.
+        """
+        if "--train_test_exp" in arguments:
+            raise UsageError(
+                "--train_test_exp",
+                "exposures, which a resumed fork would begin anew",
+                "a training without them",
+                "Leave it out, or prune its PLY: fragprune finetune.",
+            )
+
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """As 3DGS tells, if scripts change the model only until then; else unknown."""
         known = rests_after_densification(read_fork(repo))

@@ -201,6 +201,9 @@ def _check_script(fork: Fork, script: str) -> None:
     ]
     if missing:
         fork.refuse("script", script, f"no {', '.join(missing)}", "checkpoints, as 3DGS has them")
+    elif (backward := sum(name == "backward" for _, name in _method_calls(tree))) > 1:  # type: ignore[arg-type]
+        found = f"{backward} places that go backward, perhaps in one iteration"
+        fork.refuse("script", script, found, "one, by which steps are counted")
     elif not any(isinstance(each, str) and "chkpnt" in each for each in text):
         fork.refuse("script", script, "checkpoints of another name", "chkpnt and the iteration")
 

@@ -8,6 +8,7 @@ from miniatures.forks import fork
 from fragprune_3dgs_fork import ForkAdapter
 from fragprune_plugins.adapting import Role, UsageError
 from fragprune_plugins.hosts.choosing import attempt, choose
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.hosts.verdict import judge
 from fragprune_plugins.plugins.loading import load_plugins
 
@@ -101,6 +102,11 @@ REFUSED = {
     "another model": ({}, [("GaussianModel(3)", "DeformModel(3)")], "makes DeformModel"),
     "no checkpoints": ({}, [("gaussians.restore(", "gaussians.load(")], "no restore"),
     "other checkpoints": ({}, [("chkpnt", "state")], "checkpoints of another name"),
+    "two ways back": (
+        {},
+        [("        loss.backward()\n", "        loss.backward()\n        depth_loss.backward()\n")],
+        "2 places that go backward",
+    ),
     "a lost state": ({}, [("self.optimizer.state_dict()", "None")], "no optimizer's state"),
     "values changed by the script": (
         {},
@@ -188,3 +194,9 @@ def test_a_model_is_found_under_another_name_if_it_is_the_only_one(tmp_path):
     assert ForkAdapter().model_file(tmp_path, 7) == scene
     usual.with_name("part_point_cloud.ply").touch()
     assert ForkAdapter().model_file(tmp_path, 7) == usual
+
+
+def test_exposures_that_a_resumed_fork_would_lose_are_refused(tmp_path):
+    with pytest.raises(UsageError, match="exposures"):
+        ForkAdapter().refuse(fork(tmp_path), ["--train_test_exp"], stage="auto", device="cuda")
+    ForkAdapter().refuse(HostRepo(tmp_path), ["--eval"], stage="auto", device="cuda")
