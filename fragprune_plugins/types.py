@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 Compensation = Literal["none", "antialiasing", "mip"]
 """What keeps a dilated Gaussian's weight, by name; ``RasterInputs`` has the formulas."""
 
+Rim = Literal["hard", "soft"]
+"""How thresholds cut, by name; ``RasterInputs`` has the formula."""
+
 Plane = Literal["invdepth", "alpha", "surface"]
 """What is drawn beside the image, by its name in ``RasterOutputs``."""
 
@@ -603,6 +606,11 @@ class Footprints:
         return self.means2d.device
 
 
+def is_rim(value: object) -> bool:
+    """Whether a value can be the ``rim`` of ``RasterInputs``."""
+    return value in get_args(Rim)
+
+
 def is_stop(value: object) -> bool:
     """Whether a value can be the ``stop`` of ``RasterInputs``."""
     return value is None or (isinstance(value, float | int) and TRANSMITTANCE_MIN <= value <= 1)
@@ -638,6 +646,10 @@ class RasterInputs:
         stop: a share of a pixel's light, 1e-4 to 1; ``alpha_max`` is then at most 0.999. The pixel
             draws the fragment that leaves less of its light, and stops behind it. None for the
             hosts' rule: it stops before the fragment that would leave less than 1e-4.
+        rim: how a threshold cuts. "hard": a pixel whose centre lies outside draws no fragment, and
+            the threshold's gradient is a surrogate. "soft": alpha is times the share of the pixel
+            that is covered, clamp(1/2 + d, 0, 1), d being the distance of its centre to the rim
+            in pixels, to first order; every gradient is the true one. Surfels have a hard rim.
         planes: those beside the image that somebody will look at, by their names in
             ``RasterOutputs``. An engine may spare itself the others, or draw them all the same.
     """
@@ -656,6 +668,7 @@ class RasterInputs:
     alpha_max: float = ALPHA_MAX
     cap_gradient: bool = True
     stop: float | None = None
+    rim: Rim = "hard"
     planes: tuple[Plane, ...] = get_args(Plane)
 
     __repr__ = one_line
@@ -669,6 +682,7 @@ class RasterInputs:
             ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),
             ("near", self.near >= 0, "0 or more"),
             ("stop", is_stop(stop), "None, or 1e-4 to 1"),
+            ("rim", self.rim in get_args(Rim), get_args(Rim)),
             ("alpha_max", ALPHA_MIN <= self.alpha_max <= highest, f"1/255 to {highest}"),
             ("planes", set(self.planes) <= set(get_args(Plane)), f"of {get_args(Plane)}"),
         )
@@ -700,6 +714,7 @@ class RasterInputs:
             "compensation": self.compensation != "none",
             "sample_offsets": self.sample_offsets is not None,
             "absolute_gradient": self.absolute_gradient,
+            "a soft rim": self.rim != "hard",
         }
         if any(given.values()):
             raise InputError(
@@ -734,8 +749,8 @@ class RasterOutputs:
             did not ask for it. z is that of the mean, also of a surfel.
         alpha: (1, H, W) 1 - final transmittance; likewise.
         fragments_per_pixel: scalar, drawn fragments over pixels; differentiable in the thresholds
-            through the rim surrogate, so ``loss + pressure * fragments_per_pixel`` is the fragment
-            pressure.
+            through the rim surrogate, or the covered area of soft rims, so
+            ``loss + pressure * fragments_per_pixel`` is the fragment pressure.
         evaluated_per_pixel: (Gaussian, pixel) pairs that the engine tested, per pixel.
         fragments: (H, W) int32 drawn fragments per pixel, when counts were asked for.
         fragments_per_gaussian: (N,) int32 drawn fragments, when counts were asked for.

@@ -109,8 +109,9 @@ class Options:
         sample_offsets: (H, W, 2) pixels, added to where each pixel is sampled; or None.
         absolute_gradient: the hook's third column receives the sum over pixels of the absolute
             values of their contributions to the first two; else 0.
-        truncation: "hard" cuts at the threshold, with the surrogate's gradient; "soft" multiplies
-            alpha by the surrogate itself, everywhere, and so has true derivatives.
+        rim: "hard" cuts at the threshold, with the surrogate's gradient; "soft" multiplies alpha by
+            the share of the pixel that is covered, with true derivatives; "surrogate" by the
+            surrogate itself, everywhere. Surfels know no soft rim.
     """
 
     scale_modifier: float = 1.0
@@ -125,7 +126,7 @@ class Options:
     tiles: bool = True
     sample_offsets: Tensor | None = None
     absolute_gradient: bool = False
-    truncation: Literal["hard", "soft"] = "hard"
+    rim: Literal["hard", "soft", "surrogate"] = "hard"
 
 
 @dataclass(frozen=True)

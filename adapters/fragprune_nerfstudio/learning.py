@@ -25,6 +25,8 @@ class Learning:
     """Initial learning rate of opacity logits."""
     stop: float | None = None
     """Share of a pixel's light at which it stops; None keeps what the model has."""
+    rim: Literal["hard", "soft"] | None = None
+    """How thresholds cut; None keeps what the model has."""
     nonfinite: Literal["stop", "skip"] = Settings.nonfinite
     """What to do with a step whose gradients are NaN or infinite."""
 

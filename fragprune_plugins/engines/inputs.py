@@ -75,6 +75,7 @@ def native_inputs(
         feature_count=_second_length(arrays.get("features")),
         widen=widen,
         flat=isinstance(splats, Splats) and splats.flat,
+        soft=inputs.rim == "soft",
         count=len(splats),
         lengths=native_lengths(arrays),
         workspace=workspace,

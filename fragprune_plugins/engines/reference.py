@@ -155,6 +155,7 @@ def options_of(inputs: RasterInputs) -> Options:
         near=inputs.near,
         alpha_max=inputs.alpha_max,
         stop=inputs.stop,
+        rim=inputs.rim,
         cap_gradient=inputs.cap_gradient,
         sample_offsets=inputs.sample_offsets,
         absolute_gradient=inputs.absolute_gradient,

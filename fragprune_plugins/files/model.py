@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError, InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import Splats, one_line
+from fragprune_plugins.types import Rim, Splats, one_line
 
 REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
 """The SH degree by the number of values in a row of ``f_rest``."""
@@ -27,7 +27,7 @@ class Model:
         opacity: (N, 1) logits.
         scaling: (N, 3) logarithms of standard deviations; (N, 2) of surfels.
         rotation: (N, 4) quaternions w, x, y, z of any length.
-        thresholds: N truncation thresholds, and the stop; None for a model that has neither.
+        thresholds: N truncation thresholds, and the ``rules``; None for a model that has neither.
         filter_3d: (N, 1) Mip-Splatting's 3D filter, a standard deviation in world units. It widens
             every axis and lowers the opacity accordingly.
 
@@ -111,6 +111,16 @@ class Model:
         return None if self.thresholds is None else self.thresholds.stop
 
     @property
+    def rim(self) -> Rim:
+        """How its thresholds cut, see ``RasterInputs``."""
+        return "hard" if self.thresholds is None else self.thresholds.rim
+
+    @property
+    def rules(self) -> dict[str, Any]:
+        """Stop and rim for its drawing: ``RasterInputs(view, model.splats(), **model.rules)``."""
+        return {"stop": self.stop, "rim": self.rim}
+
+    @property
     def pruned(self) -> bool:
         """Whether thresholds or a stop decide anything: others draw another picture of it."""
         return self.thresholds is not None and self.thresholds.cuts
@@ -121,10 +131,13 @@ class Model:
 
     def with_stop(self, stop: float) -> Model:
         """The same model with another stop, from 1e-4 to 1."""
+        return self.with_rules(stop=float(stop))
+
+    def with_rules(self, **rules: Any) -> Model:
+        """The same model with other ``rules``: a stop, a rim."""
         known = self.thresholds
         store = ThresholdStore(len(self), self.device) if known is None else known.clone()
-        store.stop = float(stop)
-        return replace(self, thresholds=store)
+        return replace(self, thresholds=store.ruled(**rules))
 
     def to(self, device: torch.device | str) -> Model:
         """The same model on a device; tensors that are there already are not copied."""

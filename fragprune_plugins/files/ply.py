@@ -4,10 +4,10 @@ One ``vertex`` element of float32 columns, values before activation: x y z, nx n
 f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
 (logit), scale_0..2 (log), rot_0..3 (w x y z, any length). A model with thresholds has one column
 more, ``trunc_threshold``: the threshold itself, in falloff, in (0, 1). A model's stop is a comment
-of the header, ``fragprune stop 0.01``. Other columns are ignored, and named in the log. A model
-with a column that changes its picture is refused (``columns``); with Mip-Splatting's ``filter_3D``,
-unless the caller draws by the rules of Mip-Splatting. So is one without scale_2: 2D Gaussian
-Splatting's, whose Gaussians are flat.
+of the header, ``fragprune stop 0.01``, and so is a soft rim, ``fragprune rim soft``. Other columns
+are ignored, and named in the log. A model with a column that changes its picture is refused
+(``columns``); with Mip-Splatting's ``filter_3D``, unless the caller draws by the rules of
+Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaussians are flat.
 """
 
 from __future__ import annotations
@@ -29,12 +29,15 @@ from fragprune_plugins.files.model import REST_COUNTS, Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
 from fragprune_plugins.files.reading import Door, Reading
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import is_stop
+from fragprune_plugins.types import is_rim, is_stop
 
 THRESHOLD_COLUMN = "trunc_threshold"
 
 STOP = "fragprune stop"
 """Begins the comment that holds a model's stop."""
+
+RIM = "fragprune rim"
+"""Begins the comment that says how a model's thresholds cut, if not hard."""
 
 _XYZ = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -84,7 +87,7 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
             "script, with fragprune run.",
         )
     with _DOOR.reading(path) as reading:
-        stop = _stop_in(reading)
+        rules = _rules_in(reading)
         reading.file.seek(0)
         try:
             columns = read_vertices(reading)
@@ -92,19 +95,23 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
             found = "a PLY without a vertex element"
             raise ModelFileError(str(path), found, "a Gaussian splat", _REMEDY) from error
         model = _splat(path, columns, filtered)
-        return model if stop is None else model.with_stop(stop)
+        return model.with_rules(**rules) if rules else model
 
 
-def _stop_in(reading: Reading) -> float | None:
-    """The stop that a PLY's header names; None if it names none."""
-    words = f"comment {STOP} ".encode()
+def _rules_in(reading: Reading) -> dict[str, Any]:
+    """The stop and the rim that a PLY's header names, by these names."""
+    rules: dict[str, Any] = {}
     for line in header_lines(reading.file.read(HEADER_MAX))[0]:
-        if line.startswith(words):
-            stop = float(line.removeprefix(words))
-            if not is_stop(stop):
-                raise ValueError(f"a stop of {stop:g}, which is 1e-4 to 1")
-            return stop
-    return None
+        for name, words in (("stop", STOP), ("rim", RIM)):
+            if line.startswith(begin := f"comment {words} ".encode()) and name not in rules:
+                rules[name] = line.removeprefix(begin).strip().decode()
+    if "stop" in rules:
+        rules["stop"] = float(rules["stop"])
+        if not is_stop(rules["stop"]):
+            raise ValueError(f"a stop of {rules['stop']:g}, which is 1e-4 to 1")
+    if "rim" in rules and not is_rim(rules["rim"]):
+        raise ValueError(f"a rim {rules['rim']!r:.40}, which is hard or soft")
+    return rules
 
 
 def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
@@ -209,7 +216,7 @@ def write_ply(path: Path, model: Model) -> None:
     Args:
         path: the file; an existing one is replaced only when the new one is complete.
         model: the Gaussians; thresholds that cut become the last column, ``trunc_threshold``, and
-            a stop a comment.
+            a stop and a soft rim comments.
 
     Raises:
         OutputError: the file cannot be written.
@@ -237,13 +244,15 @@ def write_ply(path: Path, model: Model) -> None:
     # An element's comments come after its line: some viewers read the number of Gaussians off the
     # header's third line, whatever it says.
     comments = [] if model.stop is None else [f"{STOP} {model.stop!r}"]
+    if model.rim != "hard":
+        comments.append(f"{RIM} {model.rim}")
     vertices = PlyElement.describe(rows, "vertex", comments=comments)
     with replacing(path) as temporary:
         PlyData([vertices], byte_order="<").write(str(temporary))
 
 
 def read_thresholds(path: Path) -> ThresholdStore | None:
-    """The thresholds and the stop that a PLY itself holds; None if it has neither, or is no PLY.
+    """The thresholds and the rules that a PLY itself holds; None if it has neither, or is no PLY.
 
     Raises:
         ModelFileError: the file is truncated, or a threshold is outside (0, 1).
@@ -257,15 +266,14 @@ def read_thresholds(path: Path) -> ThresholdStore | None:
     if not any(each.endswith(column) or each.startswith(comment) for each in lines):
         return None
     with _DOOR.reading(path) as reading:
-        stop = _stop_in(reading)
+        rules = _rules_in(reading)
         reading.file.seek(0)
         columns = read_vertices(reading)
     if (values := columns.get(THRESHOLD_COLUMN)) is None:
         store = ThresholdStore(len(next(iter(columns.values()))))
     else:
         store = _store_of(path, torch.from_numpy(values.astype(np.float32)))
-    store.stop = stop
-    return store
+    return store.ruled(**rules)
 
 
 def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, Any]) -> None:

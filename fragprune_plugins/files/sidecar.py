@@ -35,7 +35,7 @@ from fragprune_plugins.files.ply import read_thresholds
 from fragprune_plugins.files.reading import Door, parse_json
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import is_stop
+from fragprune_plugins.types import is_rim, is_stop
 
 SUFFIX = ".fragprune.safetensors"
 FORMAT = "fragprune-thresholds-1"
@@ -204,6 +204,8 @@ def _write(path: Path, store: ThresholdStore, info: SidecarInfo) -> None:
     }
     if store.stop is not None:
         metadata["stop"] = repr(store.stop)
+    if store.rim != "hard":
+        metadata["rim"] = store.rim
     try:
         save_file(tensors, path, metadata=metadata)
     except SafetensorError as error:  # that is how it says that the disk is full
@@ -276,6 +278,9 @@ def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
             stop = float(metadata["stop"]) if "stop" in metadata else None
             if not is_stop(stop):
                 raise ValueError(f"a stop of {stop}")
+            rim = metadata.get("rim", "hard")
+            if not is_rim(rim):
+                raise ValueError(f"a rim {rim!r:.40}")
             if not (0 <= state["adam_step"] < math.inf and 0 <= state["steps"] < 1 << 63):
                 raise ValueError(f"{state['adam_step']:g} and {state['steps']} steps")
             tensors: dict[str, torch.Tensor] = {}
@@ -284,4 +289,4 @@ def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
                 tensors[name] = file.get_tensor(name)
                 if tensors[name].dtype != torch.float32:
                     raise ValueError(f"{tensors[name].dtype}, not torch.float32")
-    return tensors | state | {"stop": stop}, info
+    return tensors | state | {"stop": stop, "rim": rim}, info

@@ -170,7 +170,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
         return by_host()
     with directly():
         inputs, engine = unpack(session, drawn)
-        inputs = replace(inputs, stop=state.store.stop)
+        inputs = replace(inputs, **state.store.rules)
         if stage is None:
             thresholds = thresholds_for(inputs, state.store, session.plugins)
         else:

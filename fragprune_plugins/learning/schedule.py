@@ -11,7 +11,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.goals import Goal, Pressure
 from fragprune_plugins.learning.plain import numbers_of
 from fragprune_plugins.learning.pressure import ELASTICITY, PressureRule
-from fragprune_plugins.types import is_stop
+from fragprune_plugins.types import Rim, is_stop
 
 Train = Literal["opacity", "appearance", "all"]
 
@@ -59,6 +59,8 @@ class Settings:
             ``OWN_PRESSURE`` then, and no warm-up comes first, for it would have nothing to learn.
         stop: the share of a pixel's light at which the model is drawn and trained from the first
             step on that counts, see ``RasterInputs``; None keeps what the model has.
+        rim: how thresholds cut, "hard" or "soft", see ``RasterInputs``; None keeps what the model
+            has.
         seed: of the order of views in ``finetune``; hosts have their own.
         views_per_step: that ``finetune`` draws in each step, whose loss is their mean; hosts have
             their own.
@@ -76,6 +78,7 @@ class Settings:
     opacity_lr: float = 0.01
     itself: bool = False
     stop: float | None = None
+    rim: Rim | None = None
     seed: int = 0
     views_per_step: int = 1
     nonfinite: Literal["stop", "skip"] = "stop"
@@ -95,6 +98,7 @@ class Settings:
             ("opacity_lr", rate, "a number, 0 or more"),
             ("itself", lambda value: isinstance(value, bool), "True or False"),
             ("stop", _is_stop, "1e-4 to 1, a share of a pixel's light (0.01 is usual), or None"),
+            ("rim", (None, *get_args(Rim)).__contains__, "hard, soft or None"),
             ("seed", lambda value: type(value) is int, "a whole number"),
             ("views_per_step", whole(1, ITERATIONS_MAX), "a whole number, 1 or more"),
             ("nonfinite", ("stop", "skip").__contains__, "stop or skip"),
@@ -103,13 +107,14 @@ class Settings:
             if not fits(value := getattr(self, name)):
                 where = name.replace("_", " ")
                 raise UsageError(where, repr(value)[:80], expected, "Correct it.")
-        if self.goal.on_area and self.stop is not None:
-            raise UsageError(
-                "options",
-                f"a {self.goal.name} model with a stop",
-                "one of the two: viewers that ignore thresholds ignore a stop",
-                "Drop one of the two.",
-            )
+        for name in ("stop", "rim"):
+            if self.goal.on_area and getattr(self, name) is not None:
+                raise UsageError(
+                    "options",
+                    f"a {self.goal.name} model with a {name}",
+                    f"one of the two: viewers that ignore thresholds ignore a {name}",
+                    "Drop one of the two.",
+                )
         if self.goal.on_area and self.train != "all":
             raise UsageError(
                 "options",

@@ -56,6 +56,7 @@ CURVE_POINTS = 100
 SKIPS_MOST = 100
 """Steps with gradients that are not finite which a run leaves out at most."""
 
+_STORED = ("adam_step", "steps", "stop", "rim")
 _COUNTED = ("steps", "taken", "skipped", "_open", "_held", "_median")
 
 View = TypeVar("View")
@@ -193,8 +194,8 @@ class Stage2:
         self._views.begin()
         self._pictures, self._visited = [], (len(self._before), len(self._after))
         self._open |= self.plan.learn
-        if self.plan.counted and self.settings.stop is not None:
-            self.store.stop = self.settings.stop
+        if self.plan.counted:
+            self.store.ruled(stop=self.settings.stop, rim=self.settings.rim)
         if self.plan.learn and self.settings.goal.learns:
             if not self.store.opened:
                 known = opacities()
@@ -227,7 +228,7 @@ class Stage2:
     def thresholds(self, inputs: RasterInputs) -> Tensor | None:
         """(N,) to draw a rasterization with, or None; with gradients where they will be used.
 
-        The driver draws it with the store's ``stop``, too.
+        The driver draws it with the store's ``rules``, too.
         """
         if not self.settings.goal.learns:
             return None
@@ -427,9 +428,7 @@ class Stage2:
         self.close()
         number = {view: index for index, view in enumerate(self._ordered(order))}
         tensors = self.store.state_dict()
-        plain: dict[str, Any] = {
-            "store": [tensors.pop(name, None) for name in ("adam_step", "steps", "stop")]
-        }
+        plain: dict[str, Any] = {"store": [tensors.pop(name, None) for name in _STORED]}
         for name, figures in (("before", self._before), ("after", self._after)):
             known = {(number[v], part): each for (v, part), each in figures.items() if v in number}
             plain[name] = list(known)
@@ -455,9 +454,9 @@ class Stage2:
             SidecarError: the thresholds' parts do not fit together, or are not finite.
             ValueError: a plain value is none that ``state_dict`` gives.
         """
-        adam_step, steps, stop = plain["store"]
-        state = {**tensors, "adam_step": adam_step, "steps": steps, "stop": stop}
-        self.store.load_state_dict(state)
+        state = dict(zip(_STORED, plain["store"], strict=True))
+        state["rim"] = state["rim"] or "hard"
+        self.store.load_state_dict({**tensors, **state})
         views = self._ordered(order)
         for name, figures in (("before", self._before), ("after", self._after)):
             for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):

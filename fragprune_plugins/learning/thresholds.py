@@ -1,4 +1,4 @@
-"""The threshold store: one truncation threshold per Gaussian of one model, its optimizer, the stop.
+"""The threshold store: one truncation threshold per Gaussian of one model, and its optimizer.
 
 Hosts index their optimizer's groups by name and fail on a foreign one, so the store owns its own
 Adam. Row operations mirror what hosts do to theirs, moments included.
@@ -14,7 +14,7 @@ from torch import Tensor
 from fragprune_plugins.constants import ALPHA_MIN, LOGIT_MAX, LOGIT_MIN, NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError, InputError, SidecarError
 from fragprune_plugins.learning.adam import make_adam
-from fragprune_plugins.types import is_stop, short
+from fragprune_plugins.types import Rim, is_rim, is_stop, short
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99
@@ -35,11 +35,13 @@ class ThresholdStore:
 
     Attributes:
         stop: the model's, as ``RasterInputs`` has it; None for the hosts' rule. It is not learned.
+        rim: the model's, as ``RasterInputs`` has it. It is not learned.
     """
 
     def __init__(self, count: int, device: torch.device | str = "cpu", lr: float = 0.05) -> None:
         self.steps = 0
         self.stop: float | None = None
+        self.rim: Rim = "hard"
         self._bind(torch.full((count,), NEUTRAL_LOGIT, device=device), lr)
 
     def _bind(self, logits: Tensor, lr: float) -> None:
@@ -54,7 +56,8 @@ class ThresholdStore:
 
     def __repr__(self) -> str:
         stop = "" if self.stop is None else f", stop={self.stop:g}"
-        return f"ThresholdStore(logits={short(self.logits)}, steps={self.steps}{stop})"
+        rim = "" if self.rim == "hard" else f", rim={self.rim!r}"
+        return f"ThresholdStore(logits={short(self.logits)}, steps={self.steps}{stop}{rim})"
 
     @classmethod
     def from_falloff(cls, thresholds: Tensor, lr: float = 0.05) -> ThresholdStore:
@@ -138,6 +141,17 @@ class ThresholdStore:
         return self._neutral
 
     @property
+    def rules(self) -> dict[str, Any]:
+        """The model's words for drawing beside its thresholds, as ``RasterInputs`` takes them."""
+        return {"stop": self.stop, "rim": self.rim}
+
+    def ruled(self, *, stop: float | None = None, rim: Rim | None = None) -> ThresholdStore:
+        """This store, with those of the ``rules`` that are given."""
+        self.stop = self.stop if stop is None else stop
+        self.rim = rim or self.rim
+        return self
+
+    @property
     def cuts(self) -> bool:
         """True if thresholds or the stop decide anything."""
         return self.stop is not None or not self.neutral
@@ -165,7 +179,8 @@ class ThresholdStore:
     def open(self, opacities: Tensor) -> None:
         """Start learning: neutral rows move to just below the skip limit 1/(255 o).
 
-        There the image is still the host's, and the rim's gradient reaches the threshold.
+        There the image is still the host's, and the rim's gradient reaches the threshold. A soft
+        rim covers the outermost pixels in part at once.
 
         Args:
             opacities: (N,) or (N, 1), activated.
@@ -287,7 +302,7 @@ class ThresholdStore:
         return {"thresholds": self.logits.detach(), **named}
 
     def state_dict(self) -> dict[str, Any]:
-        """Copies of logits, moments and counters, and the stop, for ``load_state_dict``."""
+        """Copies of logits, moments and counters, and the ``rules``, for ``load_state_dict``."""
         state = self.optimizer.state.get(self.logits, {})
         zeros = torch.zeros_like(self.logits)
         return {
@@ -297,6 +312,7 @@ class ThresholdStore:
             "adam_step": float(state.get("step", 0.0)),
             "steps": self.steps,
             **({} if self.stop is None else {"stop": self.stop}),
+            **({} if self.rim == "hard" else {"rim": self.rim}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -325,7 +341,10 @@ class ThresholdStore:
         stop = state.get("stop")  # absent from those of earlier versions
         if not is_stop(stop):
             raise SidecarError("threshold state", f"a stop of {stop}", "1e-4 to 1", remedy)
-        self.stop = stop
+        rim = state.get("rim", "hard")
+        if not is_rim(rim):
+            raise SidecarError("threshold state", f"a rim {rim!r:.40}", "hard or soft", remedy)
+        self.stop, self.rim = stop, rim
         device, lr = self.logits.device, self.optimizer.param_groups[0]["lr"]
         self._bind(rows["logits"].to(device), lr)
         self.steps = int(state["steps"])

@@ -132,13 +132,13 @@ def rasterize(
 
     A fragment of Gaussian i is drawn if and only if q <= min(-2 ln tau_i, 2 ln(255 o_i)), where q
     is its squared Mahalanobis distance. The gradient of tau comes from a logistic surrogate at the
-    rim.
+    rim. With a soft rim alpha is times the covered share of the pixel, and gradients are true ones.
 
     Args:
         inputs: camera and Gaussians; or a model, which has its thresholds.
         thresholds: (N,) falloff in (0, 1), used as they are; a store, for which plugins are asked,
-            and whose stop holds where the inputs have none; or None for no truncation. For a model,
-            the view: ``rasterize(model, view)``.
+            and whose stop and soft rim hold where the inputs have none; or None for no truncation.
+            For a model, the view: ``rasterize(model, view)``.
         engine: a name ("auto", "reference", "cpu", "cuda", a plugin's) or an engine object.
 
     Raises:
@@ -148,8 +148,10 @@ def rasterize(
     """
     if isinstance(inputs, Model) or isinstance(thresholds, View):
         inputs, thresholds = _of_model(inputs, thresholds)
-    if isinstance(thresholds, ThresholdStore) and inputs.stop is None:
-        inputs = replace(inputs, stop=thresholds.stop)
+    if isinstance(thresholds, ThresholdStore):
+        stop = thresholds.stop if inputs.stop is None else inputs.stop
+        rim = thresholds.rim if inputs.rim == "hard" else inputs.rim
+        inputs = replace(inputs, stop=stop, rim=rim)
     thresholds = thresholds_for(inputs, thresholds)
     inputs.check_thresholds(thresholds)  # also for engines that are not ours
     if isinstance(engine, str):

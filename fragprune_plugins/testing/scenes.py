@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
-from fragprune_plugins.types import Compensation, Footprints, RasterInputs, Splats, View
+from fragprune_plugins.types import Compensation, Footprints, RasterInputs, Rim, Splats, View
 
 AnySplats = Splats | Footprints
 
@@ -37,6 +37,7 @@ def random_scene(
     compensation: Compensation = "none",
     scale_modifier: float = 1.0,
     stop: float | None = None,
+    rim: Rim = "hard",
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> RasterInputs:
@@ -60,6 +61,7 @@ def random_scene(
         compensation: as in ``RasterInputs``.
         scale_modifier: as in ``RasterInputs``.
         stop: as in ``RasterInputs``.
+        rim: as in ``RasterInputs``.
         dtype: of every tensor.
         device: of every tensor.
     """
@@ -91,6 +93,7 @@ def random_scene(
         compensation=compensation,
         scale_modifier=scale_modifier,
         stop=stop,
+        rim=rim,
         sample_offsets=_uniform(generator, -0.5, 0.5, height, width, 2) if offsets else None,
     )
     return cast(inputs, dtype, device)

@@ -31,9 +31,9 @@ def model(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("stop", [None, 0.01])
-def test_what_is_saved_is_loaded_bit_for_bit(model, trained, stop):
-    before, trained.stop = model.read_bytes(), stop
+@pytest.mark.parametrize(("stop", "rim"), [(None, "hard"), (0.01, "hard"), (0.01, "soft")])
+def test_what_is_saved_is_loaded_bit_for_bit(model, trained, stop, rim):
+    before, trained.stop, trained.rim = model.read_bytes(), stop, rim
     path = sidecar.save(
         model, trained, adapter="a-host", host_commit="c0ffee", settings={"iterations": 3}
     )
@@ -41,6 +41,7 @@ def test_what_is_saved_is_loaded_bit_for_bit(model, trained, stop):
     assert model.read_bytes() == before
     for rows in (None, 6):
         loaded, info = sidecar.load(model, rows)
+        assert loaded.rules == {"stop": stop, "rim": rim}
         for key, value in trained.state_dict().items():
             again = loaded.state_dict()[key]
             assert torch.equal(value, again) if torch.is_tensor(value) else value == again

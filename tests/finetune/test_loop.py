@@ -102,7 +102,7 @@ def test_same_seed_same_result_and_global_streams_untouched(default, model, data
 
 
 class Noting:
-    """The engine of this machine, which notes the stop of each picture and whether it was cut."""
+    """The engine of this machine, which notes the rules of each picture and whether it was cut."""
 
     name = "noting"
 
@@ -110,25 +110,24 @@ class Noting:
         self.engine, self.seen = create_engine("auto"), []
 
     def rasterize(self, inputs, thresholds):
-        self.seen.append((inputs.stop, thresholds is not None))
+        self.seen.append((inputs.stop, inputs.rim, thresholds is not None))
         return self.engine.rasterize(inputs, thresholds)
 
 
 @pytest.mark.parametrize("truncate", [True, False], ids=["thresholds", "control"])
-def test_a_stop_is_trained_with_from_the_first_step_and_kept(model, dataset, truncate):
-    engine, settings = (
-        Noting(),
-        Settings(iterations=3, stop=0.2, goal=Pressure() if truncate else Control()),
-    )
+def test_rules_are_trained_with_from_the_first_step_and_kept(model, dataset, truncate):
+    goal = Pressure() if truncate else Control()
+    engine, settings = Noting(), Settings(iterations=3, stop=0.2, rim="soft", goal=goal)
     result = finetune(model, dataset, settings, engine=engine)
-    before = [(None, False)]  # fragments before are those of the model as it came
-    assert engine.seen == 3 * [(0.2, truncate), *before]
-    assert result.model.stop == 0.2
+    seen = [(stop, cut) for stop, _, cut in engine.seen]
+    assert seen == 3 * [(0.2, truncate), (None, False)]  # before: the model as it came
+    assert {rim for _, rim, cut in engine.seen if cut} <= {"soft"}
+    assert result.model.rules == {"stop": 0.2, "rim": "soft"}
     assert result.progress.speedup > 1.05
     engine = Noting()
     again = finetune(result, dataset, Settings(iterations=1), engine=engine)
-    assert engine.seen[0] == (0.2, True)
-    assert again.model.stop == 0.2
+    assert engine.seen[0] == (0.2, "soft", True)
+    assert again.model.rules == {"stop": 0.2, "rim": "soft"}
 
 
 @pytest.mark.parametrize("target", [1.4, 2.0])

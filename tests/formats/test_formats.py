@@ -164,7 +164,29 @@ def test_a_stop_comes_back(suffix, truncated, tmp_path):
         again = load(path)
         assert again.stop == stop
         assert (again.falloff is not None) == truncated
+        assert again.rim == "hard"
     assert load(path, truncation=False).stop is None
+
+
+@pytest.mark.parametrize("stop", [None, 0.01])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb"])
+def test_a_soft_rim_comes_back(suffix, stop, tmp_path):
+    splat = tiny.cut(random_splat(50, 1, 0), 0.3).with_rules(rim="soft", stop=stop)
+    formats.write(formats.named(path := tmp_path / f"model{suffix}"), path, splat)
+    again = load(path)
+    assert again.rules == {"stop": stop, "rim": "soft"}
+    assert again.falloff is not None
+    assert load(path, truncation=False).rim == "hard"
+
+
+def test_a_rim_that_cannot_be_is_refused(tmp_path):
+    splat = tiny.cut(random_splat(5, 1, 0), 0.3).with_rules(rim="soft")
+    write_ply(path := tmp_path / "model.ply", splat)
+    content = path.read_bytes()
+    assert content.count(b"comment fragprune rim soft\n") == 1
+    path.write_bytes(content.replace(b"rim soft", b"rim wet!"))
+    with pytest.raises(ModelFileError, match=r"rim 'wet!', which is hard or soft"):
+        load(path)
 
 
 @pytest.mark.parametrize("stop", ["0", "2", "nan", "much"])

@@ -45,6 +45,9 @@ def test_ply_column(model, tmp_path):
     assert rows[:, -1].tolist() == model.thresholds.values.tolist()
     (comment,) = re.findall(r"^    (comment .*)", PAGE, re.M)
     assert head.decode().splitlines()[3] == comment
+    write_ply(tmp_path / "a.ply", model.with_rules(rim="soft"))
+    (comment,) = re.findall(r"`(comment .*)`", PAGE)
+    assert (tmp_path / "a.ply").read_bytes().splitlines()[4].decode() == comment
 
 
 def test_spz_record(model, codes, tmp_path):
@@ -57,6 +60,10 @@ def test_spz_record(model, codes, tmp_path):
     kind = int(re.search(r"type (0x\w+), length 4", PAGE)[1], 16)
     assert struct.unpack_from("<IIf", content, 40 + COUNT) == (kind, 4, pytest.approx(0.01))
     assert struct.unpack_from("<I", content, 16)[0] == 40 + COUNT + 12
+    save(tmp_path / "soft.spz", model.with_rules(rim="soft"))
+    kind = int(re.search(r"type (0x\w+), length 0", PAGE)[1], 16)
+    content = (tmp_path / "soft.spz").read_bytes()
+    assert struct.unpack_from("<II", content, 40 + COUNT + 12) == (kind, 0)
 
 
 def test_sog_image(model, tmp_path):

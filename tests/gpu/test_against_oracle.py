@@ -63,6 +63,11 @@ def test_footprints_equal_the_oracle(engine: CudaEngine, kind: str) -> None:
     check_gradients(engine, inputs, thresholds, same)
 
 
+def test_a_soft_rim_is_refused(engine: CudaEngine) -> None:
+    with pytest.raises(InputError, match=r"soft rim.*--device cpu"):
+        engine.rasterize(scenes.random_scene(0, 4, rim="soft"), torch.full((4,), 0.5))
+
+
 def test_surfels_are_refused(engine: CudaEngine) -> None:
     with pytest.raises(EngineError, match=r"surfels.*--device cpu"):
         engine.rasterize(scenes.random_scene(5, 20, flat=True), None)

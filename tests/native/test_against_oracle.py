@@ -9,6 +9,7 @@ comparison and of the loss, and must be few. What is left differs by accumulated
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.testing import scenes
-from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Rim, Splats
 
 IMAGE_TOLERANCE = 2e-5
 """About 2^-23 times the fragments of a pixel, twice over; 2e-6 is what most scenes show."""
@@ -34,6 +35,13 @@ KINDS = {
     "colours, modifier": {"colors": True, "scale_modifier": 0.7},
     "odd size, sh 2": {"width": 33, "height": 17, "sh_degree": 2},
     "stopped": {"stop": 0.3},
+    "soft rim": {"rim": "soft"},
+    "soft rim, antialiasing, cov3d, stopped": {
+        "rim": "soft",
+        "compensation": "antialiasing",
+        "cov3d": True,
+        "stop": 0.3,
+    },
     "surfels": {"flat": True},
     "surfels, stopped": {"flat": True, "stop": 0.3},
     "surfels, sh 3, modifier": {"flat": True, "sh_degree": 3, "scale_modifier": 0.7, "width": 33},
@@ -191,7 +199,10 @@ def awkward_scenes(draw: st.DrawFn) -> tuple[RasterInputs, torch.Tensor | None]:
         splats = scenes.with_cov3d(splats)
     thresholds = scenes.random_thresholds(n, n) if draw(st.booleans()) else None
     inputs = RasterInputs(
-        view, splats, compensation=draw(st.sampled_from(["none", "antialiasing"]))
+        view,
+        splats,
+        compensation=draw(st.sampled_from(["none", "antialiasing"])),
+        rim=draw(st.sampled_from(get_args(Rim))),
     )
     return scenes.cast(inputs, torch.float32), thresholds
 

@@ -20,7 +20,7 @@ from native.test_against_oracle import check_gradients, check_images, draw_pair,
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.testing import scenes
-from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs
+from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs, Rim
 
 ALONE = {
     "mip": {"compensation": "mip", "dilation": 0.1},
@@ -34,13 +34,24 @@ ALONE = {
     "1 feature": {"features": 1},
     "8 features": {"features": 8},
     "stopped, with features and scores": {"stop": 0.2, "features": 2, "scores": True},
+    "soft rim": {"rim": "soft", "offsets": True, "absolute_gradient": True},
+    "soft rim, with a capped gradient": {"rim": "soft", "alpha_max": 0.6, "cap_gradient": False},
     "features, colours, offsets": {"features": 3, "colors": True, "offsets": True},
 }
 
 
 def dialect(seed: int, n: int = 60, width: int = 41, height: int = 29, **kind) -> RasterInputs:
     """A random scene; what is not one of its own options is set on the inputs."""
-    of_scene = {"features", "offsets", "compensation", "colors", "cov3d", "sh_degree", "stop"}
+    of_scene = {
+        "features",
+        "offsets",
+        "compensation",
+        "colors",
+        "cov3d",
+        "sh_degree",
+        "stop",
+        "rim",
+    }
     made = scenes.random_scene(
         seed, n, width, height, **{k: v for k, v in kind.items() if k in of_scene}
     )
@@ -76,6 +87,7 @@ def dialects(draw: st.DrawFn) -> Case:
         "near": one_of(0.05, 0.2, 2.0),
         "alpha_max": one_of(0.7, 0.99, 0.999),
         "stop": one_of(None, 0.01, 0.5),
+        "rim": one_of(*get_args(Rim)),
     }
     switches = ("offsets", "cap_gradient", "absolute_gradient", "scores", "colors", "cov3d")
     return draw(cases(kind | {name: draw(st.booleans()) for name in switches}))

@@ -53,6 +53,8 @@ def other(name: str, value: Any) -> Any:
     """A value that differs."""
     if name == "compensation":
         return "mip"
+    if name == "rim":
+        return "soft"
     if isinstance(value, bool):
         return not value
     return value / 2 if isinstance(value, float) else value + 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.testing import scenes
-from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs
+from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs, Rim
 
 # Enough Gaussians and tiles for several pieces of work per thread, in sorting and binning too.
 LARGE = {"n": 20_000, "width": 150, "height": 100, "scale_modifier": 0.3}
@@ -46,11 +47,15 @@ def assert_identical(first: dict[str, torch.Tensor], second: dict[str, torch.Ten
         assert torch.equal(tensor, second[name]), name
 
 
-@pytest.mark.parametrize("kind", [{}, {"features": 2, "offsets": True}], ids=["plain", "extras"])
+@pytest.mark.parametrize(
+    "kind",
+    [{}, {"features": 2, "offsets": True}, {"rim": "soft"}],
+    ids=["plain", "extras", "soft rim"],
+)
 def test_threads_and_runs_do_not_change_a_bit(
     engine: CpuEngine, single_thread: None, kind: dict
 ) -> None:
-    inputs = replace(scenes.random_scene(3, **LARGE, **kind), absolute_gradient=bool(kind))
+    inputs = replace(scenes.random_scene(3, **LARGE, **kind), absolute_gradient="features" in kind)
     thresholds = scenes.random_thresholds(3, LARGE["n"])
     alone = everything(engine, inputs, thresholds)
     assert_identical(alone, everything(engine, inputs, thresholds))
@@ -68,21 +73,24 @@ def test_two_python_threads_at_once(engine: CpuEngine) -> None:
         assert_identical(expected[i % len(cases)], result)
 
 
+@pytest.mark.parametrize("rim", get_args(Rim))
 @pytest.mark.parametrize("compensation", ["none", "antialiasing"])
 def test_neutral_thresholds_are_no_thresholds(
-    engine: CpuEngine, compensation: Compensation
+    engine: CpuEngine, compensation: Compensation, rim: Rim
 ) -> None:
     inputs = scenes.random_scene(5, 200, 70, 50, sh_degree=3, compensation=compensation)
     neutral = torch.sigmoid(torch.full((200,), NEUTRAL_LOGIT))
-    assert_identical(everything(engine, inputs, None), everything(engine, inputs, neutral))
+    found = everything(engine, replace(inputs, rim=rim), neutral)
+    assert_identical(everything(engine, inputs, None), found)
+    assert not found["grad thresholds"].any() or rim == "hard"
 
 
-@given(seed=st.integers(0, 10_000), factor=st.floats(1.0, 3.0))
+@given(seed=st.integers(0, 10_000), factor=st.floats(1.0, 3.0), rim=st.sampled_from(get_args(Rim)))
 def test_raising_a_threshold_never_adds_an_eligible_fragment(
-    engine: CpuEngine, seed: int, factor: float
+    engine: CpuEngine, seed: int, factor: float, rim: Rim
 ) -> None:
     # Opacities too low for any pixel to stop, so that eligible fragments are the drawn ones.
-    inputs = scenes.random_scene(seed, 12, 21, 19)
+    inputs = scenes.random_scene(seed, 12, 21, 19, rim=rim)
     faint = inputs.splats.opacities * 0.2
     inputs = replace(inputs, splats=replace(inputs.splats, opacities=faint)).with_counts()
     low = scenes.random_thresholds(seed, 12)

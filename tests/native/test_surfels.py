@@ -162,7 +162,7 @@ def test_a_surface_is_drawn_where_it_is_asked_for(engine: CpuEngine) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"features": 2}, {"offsets": True}, {"compensation": "mip"}, {"cov3d": True}],
+    [{"features": 2}, {"offsets": True}, {"compensation": "mip"}, {"cov3d": True}, {"rim": "soft"}],
     ids=lambda change: next(iter(change)),
 )
 def test_what_surfels_do_not_have_is_refused_by_compiled_code(change: dict) -> None:

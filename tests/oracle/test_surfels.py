@@ -234,7 +234,7 @@ def smooth(**kind):
 
 def uncut(inputs):
     options = options_of(inputs)
-    return replace(options, alpha_min=0, transmittance_min=0, tiles=False, truncation="soft")
+    return replace(options, alpha_min=0, transmittance_min=0, tiles=False, rim="surrogate")
 
 
 @pytest.mark.parametrize("truncated", [True, False], ids=["thresholds", "none"])

@@ -40,9 +40,9 @@ def loss_of(drawn):
     return (torch.cat([drawn.image, drawn.invdepth]) * weights()).sum()
 
 
-def eligible(inputs, thresholds):
+def eligible(inputs, thresholds, options):
     """(K, H W) bool: the pairs that thresholds and the 1/255 skip let through, tiles aside."""
-    camera, gaussians, options = camera_of(inputs), gaussians_of(inputs.splats), Options()
+    camera, gaussians = camera_of(inputs), gaussians_of(inputs.splats)
     rows = project.rows_in_front(camera, gaussians.means, options.near)
     prints = project.project(camera, gaussians.take(rows), options)
     ys, xs = torch.arange(HEIGHT, dtype=F64), torch.arange(WIDTH, dtype=F64)
@@ -54,13 +54,13 @@ raises = st.lists(st.floats(0, 0.9), min_size=N, max_size=N)
 
 
 @few
-@given(seed=st.integers(0, 2**31), rise=raises)
-def test_raising_thresholds_never_makes_a_pair_eligible(seed, rise):
+@given(seed=st.integers(0, 2**31), rise=raises, rim=st.sampled_from(["hard", "soft"]))
+def test_raising_thresholds_never_makes_a_pair_eligible(seed, rise, rim):
     inputs, low = scene_of(seed), scenes.random_thresholds(seed, N, dtype=F64)
     high = low + (1 - low) * torch.tensor(rise, dtype=F64)
-    assert not (eligible(inputs, high) & ~eligible(inputs, low)).any()
+    options = Options(transmittance_min=0, rim=rim)
+    assert not (eligible(inputs, high, options) & ~eligible(inputs, low, options)).any()
     # With the pixel's stop out of the way, drawn is eligible in the host's tiles.
-    options = Options(transmittance_min=0)
     gaussians = gaussians_of(inputs.splats)
     counts = [
         render(camera_of(inputs), gaussians, tau, options=options).fragments_per_gaussian
@@ -70,12 +70,13 @@ def test_raising_thresholds_never_makes_a_pair_eligible(seed, rise):
 
 
 @few
-@given(seed=st.integers(0, 2**31))
-def test_neutral_thresholds_change_no_bit_of_image_or_gradient(seed):
+@given(seed=st.integers(0, 2**31), rim=st.sampled_from(["hard", "soft"]))
+def test_neutral_thresholds_change_no_bit_of_image_or_gradient(seed, rim):
     results = []
     neutral = torch.sigmoid(torch.full((N,), -30.0))
     for tau in (None, neutral):
-        inputs, leaves = scenes.leaves(scenes.random_scene(seed, N, WIDTH, HEIGHT))
+        made = scenes.random_scene(seed, N, WIDTH, HEIGHT, rim="hard" if tau is None else rim)
+        inputs, leaves = scenes.leaves(made)
         drawn = draw(inputs, tau)
         (drawn.image.square().sum() + drawn.invdepth.sum() + drawn.alpha.sum()).backward()
         tensors = [drawn.image, drawn.invdepth, drawn.alpha, drawn.radii, drawn.fragments]

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from fragprune_plugins import native
 
-API_VERSION: Final = 9
+API_VERSION: Final = 10
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -97,6 +97,7 @@ class Inputs(_Sized):
         ("feature_count", ctypes.c_int32),
         ("widen", ctypes.c_int32),
         ("flat", ctypes.c_int32),
+        ("soft", ctypes.c_int32),
         ("count", ctypes.c_int64),
         ("lengths", Lengths),
         *_pointers("viewmatrix projmatrix campos background means opacities scales rotations"),

@@ -105,7 +105,8 @@ class CudaEngine:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
 
         Raises:
-            InputError: the Gaussians are not on a GPU, or there is not one threshold for each.
+            InputError: the Gaussians are not on a GPU, there is not one threshold for each, or the
+                rim is soft.
             EngineError: they are surfels, for which there are no kernels.
         """
         inputs.check_thresholds(thresholds)
@@ -115,6 +116,13 @@ class CudaEngine:
                 "surfels (2 scales each)",
                 "3D Gaussians: there are no kernels for surfels",
                 "Run on the CPU (--device cpu), or draw small pictures with --engine reference.",
+            )
+        if inputs.rim != "hard" and thresholds is not None:
+            raise InputError(
+                "engine 'cuda'",
+                f"a {inputs.rim} rim",
+                "a hard rim: there are no kernels for another",
+                "Run on the CPU (--device cpu), or draw it hard: replace(inputs, rim='hard').",
             )
         self._on_device(inputs.splats)
         drawing = Drawing(self._device, inputs, thresholds)

@@ -246,7 +246,7 @@ struct ExtraTile {
 // from `first` to `end`. Each is handed to `also(j, weight, drawn)`, too. Returns how many it met.
 // (Local copies of the pixels, one by one: a struct would be copied in small pieces, which stalls
 // the loads that follow.)
-template <bool kKeep, bool kDepth, bool kStop, class Also>
+template <bool kKeep, bool kDepth, bool kStop, bool kSoft, class Also>
 inline int blend_block(const Batch& batch, const int32_t* which, int count, int first, int end,
                        Lanes px, Lanes py, float alpha_max, float line, const BlockPixels& before,
                        BlockPixels& pixels, Also also) {
@@ -258,14 +258,28 @@ inline int blend_block(const Batch& batch, const int32_t* which, int count, int 
   const auto blend = [&](const int32_t* who, auto some) {
     constexpr int kSome = decltype(some)::value;
     Lanes alpha[kSome];
-    Mask inside[kSome];
+    Mask inside[kSome], partly[kSome];
+    Nearness<Lanes> near[kSome];
     for (int k = 0; k < kSome; k++) {
       const int j = who[k];
-      alpha[k] = meet(batch[j], px, py).exponent;
-      inside[k] = ge(alpha[k], broadcast<Lanes>(batch.cut[j]));
+      const Meeting<Lanes> m = meet(batch[j], px, py);
+      alpha[k] = m.exponent;
+      if constexpr (kSoft) {
+        near[k] = nearness_of(batch[j], m);
+        const Mask visible = ge(m.exponent, broadcast<Lanes>(kFaintest));
+        partly[k] = both(visible, gt(near[k].square, near[k].inwards * near[k].inwards));
+        inside[k] = either(partly[k], both(visible, gt(near[k].inwards, broadcast<Lanes>(0.f))));
+      } else {
+        inside[k] = ge(m.exponent, broadcast<Lanes>(batch.cut[j]));
+      }
     }
-    for (int k = 0; k < kSome; k++)
-      alpha[k] = where(inside[k], capped(exp2(alpha[k]), alpha_max));
+    for (int k = 0; k < kSome; k++) {
+      alpha[k] = capped(exp2(alpha[k]), alpha_max);
+      if constexpr (kSoft)
+        if (bits(partly[k]))
+          alpha[k] = select(partly[k], alpha[k] * coverage_of(near[k]).share, alpha[k]);
+      alpha[k] = where(inside[k], alpha[k]);
+    }
     for (int k = 0; k < kSome; k++) {
       const int j = who[k];
       const Lanes after = fnma(light, alpha[k], light);
@@ -301,6 +315,7 @@ struct Canvas {
   int width, height;
   float background[3];
   float spread, alpha_max, stop;
+  bool soft;
   float *image, *invdepth, *alpha, *features;
   int32_t *fragments, *winners;
 };
@@ -416,7 +431,7 @@ struct OpenTile {
 };
 
 // Blends what waits; returns lanes spent. A `list` grows by it; `extra` is NULL, unless kExtra.
-template <bool kKeep, bool kExtra, bool kDepth, bool kStop>
+template <bool kKeep, bool kExtra, bool kDepth, bool kStop, bool kSoft>
 inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const Canvas& canvas,
                              OpenTile& tile, TileList* list, ExtraTile* extra) {
   const int count = tile.waiting, first = tile.blended, end = first + count;
@@ -457,11 +472,11 @@ inline int64_t blend_waiting(const Splat* splats, const Colours& colours, const 
         const float* row = extra->row(splats[tile.splat[j]]);
         extra->blocks[b].blend(extra->extras, row, first + j, weight, drawn, extra->each);
       };
-      met += blend_block<kKeep, true, kStop>(batch, which, reached, first, end,
+      met += blend_block<kKeep, true, kStop, kSoft>(batch, which, reached, first, end,
                                              extra->samples.x[b], extra->samples.y[b],
                                              canvas.alpha_max, canvas.stop, before, pixels, also);
     } else {
-      met += blend_block<kKeep, kDepth, kStop>(batch, which, reached, first, end, centres.x(b),
+      met += blend_block<kKeep, kDepth, kStop, kSoft>(batch, which, reached, first, end, centres.x(b),
                                                centres.y(b), canvas.alpha_max, canvas.stop, before,
                                                pixels, [](int, Lanes, Mask) {});
     }
@@ -526,9 +541,10 @@ inline int64_t close_tile(const Splat* splats, const Canvas& c, OpenTile& tile,
 // ---- backward --------------------------------------------------------------------------------
 
 // What is wanted of the backward pass; each part that is not costs nothing. kExtra, what some
-// dialects want, comes with all others but kThreshold.
-enum Want { kGeometry = 1, kColour = 2, kThreshold = 4, kDepth = 8, kExtra = 16 };
+// dialects want, comes with all others but kThreshold, and a soft rim with all but kDepth.
+enum Want { kGeometry = 1, kColour = 2, kThreshold = 4, kDepth = 8, kExtra = 16, kSoft = 32 };
 constexpr int kWholeExtra = kExtra | kGeometry | kColour | kDepth;
+constexpr int kWholeSoft = kSoft | kGeometry | kColour | kThreshold;
 
 // Sums written per list entry, in this order, those that are wanted only; features come after them.
 constexpr int sums_of(int want) {
@@ -571,15 +587,31 @@ template <int kWant>
 inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const Asked& asked,
                           const Beyond& beyond, int position, Lanes px, Lanes py,
                           const int32_t* stops, int at, LossPixels& loss, Lanes* sums) {
+  constexpr bool soft = kWant & kSoft;
   const Meeting<Lanes> m = meet(brush, px, py);
-  const Mask reached = both(ge(m.exponent, broadcast<Lanes>(rim.list_cut)),
-                            gt(load(stops + at), broadcast_int(position)));
+  Mask reached = both(ge(m.exponent, broadcast<Lanes>(soft ? kFaintest : rim.list_cut)),
+                      gt(load(stops + at), broadcast_int(position)));
+  Nearness<Lanes> near;
+  Mask partly;
+  if constexpr (soft) {
+    near = nearness_of(brush, m);
+    partly = both(reached, gt(near.square, near.inwards * near.inwards));
+    reached = either(partly, both(reached, gt(near.inwards, broadcast<Lanes>(0.f))));
+  }
   if (!bits(reached)) return;
-  const Mask drawn =
-      kWant & kThreshold ? both(reached, ge(m.exponent, broadcast<Lanes>(brush.cut))) : reached;
+  const Mask drawn = kWant & kThreshold && !soft
+                         ? both(reached, ge(m.exponent, broadcast<Lanes>(brush.cut)))
+                         : reached;
   const Lanes one = broadcast<Lanes>(1.f);
   const Lanes uncapped = exp2(m.exponent), full = capped(uncapped, rim.alpha_max);
-  const Lanes alpha = where(drawn, full);
+  Coverage<Lanes> cover;
+  const bool rims = soft && bits(partly);
+  Lanes alpha = where(drawn, full);
+  if (rims) {
+    cover = coverage_of(near);
+    cover.share = select(partly, cover.share, one);
+    alpha = where(drawn, full * cover.share);
+  }
   const Lanes inv = reciprocal(one - alpha);
   const Lanes light = load(loss.light + at) * inv;
   const Lanes behind = load(loss.behind + at);
@@ -598,12 +630,35 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const 
   const Lanes by_alpha = fnma(behind, inv, light * shade);
   store(loss.light + at, light);
   store(loss.behind + at, fma(weight, shade, behind));
-  Lanes w = where(drawn, uncapped * by_alpha);  // straight through the cap
+  Lanes w = uncapped * by_alpha;  // straight through the cap
+  if (rims) w = w * cover.share;
+  w = where(drawn, w);
   if (kWant & kExtra && !asked.cap_gradient)
     w = where(ge(broadcast<Lanes>(rim.alpha_max), uncapped), w);
   int k = 0;
   sums[k] = sums[k] + w, k++;
-  if (kWant & kThreshold) {
+  // At a soft rim w gets the exponent's gradient through the share, and `bend` its slope's. The square
+  // of the slope is 4 (u, v) M (u, v), M being (scale skew; 0 down) times its transpose, so that goes
+  // along M (u, v).
+  Lanes bend_u, bend_v;
+  if constexpr (soft) {
+    bend_u = bend_v = broadcast<Lanes>(0.f);
+    if (rims) {
+      const Lanes by_share = full * by_alpha;
+      if (rim.threshold > 0) {
+        const Lanes gain = (by_share + broadcast<Lanes>(rim.per_fragment)) * cover.per_pixel;
+        sums[k] = sums[k] - where(partly, gain * broadcast<Lanes>(kLog2E / rim.threshold));
+      }
+      const Lanes edge = where(partly, by_share * cover.per_pixel * broadcast<Lanes>(kLog2E));
+      const Lanes away = cover.share - broadcast<Lanes>(0.5f);
+      const Lanes bend = where(partly, (edge + edge) * away * cover.per_pixel);
+      const Lanes along = where(partly, near.along), down = where(partly, near.down);
+      bend_u = bend * fma(along, broadcast<Lanes>(brush.scale), down * broadcast<Lanes>(brush.skew));
+      bend_v = bend * down * broadcast<Lanes>(brush.down);
+      w = w + edge;
+    }
+    k++;
+  } else if (kWant & kThreshold) {
     const Lanes falloff = uncapped * broadcast<Lanes>(rim.inv_opacity);
     const Lanes away = abs(falloff - broadcast<Lanes>(rim.threshold));
     const Mask near = both(reached, ge(broadcast<Lanes>(kRimHorizon), away));
@@ -614,12 +669,19 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const 
     k++;
   }
   if (kWant & kGeometry) {
-    const Lanes wu = w * m.u, wv = w * m.v;
+    Lanes wu = w * m.u, wv = w * m.v;
+    if constexpr (soft) wu = wu + bend_u, wv = wv + bend_v;
     sums[k] = sums[k] + wu, k++;
     sums[k] = sums[k] + wv, k++;
-    sums[k] = fma(wu, m.u, sums[k]), k++;
-    sums[k] = fma(wu, m.v, sums[k]), k++;
-    sums[k] = fma(wv, m.v, sums[k]), k++;
+    if constexpr (soft) {  // M moves with the shape, as (u, v) do: once more
+      sums[k] = fma(wu + bend_u, m.u, sums[k]), k++;
+      sums[k] = fma(wu, m.v, fma(bend_v, m.u, sums[k])), k++;
+      sums[k] = fma(wv + bend_v, m.v, sums[k]), k++;
+    } else {
+      sums[k] = fma(wu, m.u, sums[k]), k++;
+      sums[k] = fma(wu, m.v, sums[k]), k++;
+      sums[k] = fma(wv, m.v, sums[k]), k++;
+    }
   }
   if (kWant & kColour) {
     sums[k] = fma(weight, gr, sums[k]), k++;
@@ -628,7 +690,8 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const 
   }
   if (kWant & kDepth && kWant & kGeometry) sums[k] = fma(weight, gz, sums[k]), k++;
   if (kWant & kExtra) {
-    const Lanes wu = w * m.u, wv = w * m.v;
+    Lanes wu = w * m.u, wv = w * m.v;
+    if constexpr (soft) wu = wu + bend_u, wv = wv + bend_v;
     const Lanes gx = broadcast<Lanes>(beyond.along) * wu;
     const Lanes gy = fma(broadcast<Lanes>(beyond.across), wu, broadcast<Lanes>(beyond.down) * wv);
     sums[k] = sums[k] + abs(gx) + abs(gy), k++;

@@ -170,11 +170,14 @@ class Cell {
   }
 
  private:
-  template <bool kStop>
-  static constexpr decltype(&fp::blend_waiting<false, false, false, kStop>) kBlend[] = {
-      fp::blend_waiting<false, false, false, kStop>, fp::blend_waiting<false, false, true, kStop>,
-      fp::blend_waiting<true, false, false, kStop>,  fp::blend_waiting<true, false, true, kStop>,
-      fp::blend_waiting<false, true, true, kStop>,   fp::blend_waiting<true, true, true, kStop>};
+  template <bool... kRules>
+  static constexpr decltype(&fp::blend_waiting<false, false, false, kRules...>) kBlend[] = {
+      fp::blend_waiting<false, false, false, kRules...>,
+      fp::blend_waiting<false, false, true, kRules...>,
+      fp::blend_waiting<true, false, false, kRules...>,
+      fp::blend_waiting<true, false, true, kRules...>,
+      fp::blend_waiting<false, true, true, kRules...>,
+      fp::blend_waiting<true, true, true, kRules...>};
 
   void hand_out(const CellEntry* entry, const CellEntry* end) {
     constexpr int kSome = 4 * kLanes;
@@ -214,7 +217,9 @@ class Cell {
 
   void blend_waiting(int x) {
     const bool keep = p_.keep != nullptr, depth = p_.canvas.invdepth != nullptr;
-    const auto& kinds = p_.canvas.stop > 0 ? kBlend<true> : kBlend<false>;
+    const bool stops = p_.canvas.stop > 0;
+    const auto* const kinds = p_.canvas.soft ? (stops ? kBlend<true, true> : kBlend<false, true>)
+                                             : (stops ? kBlend<true, false> : kBlend<false, false>);
     const auto blend = kinds[p_.extras.any() ? 4 + keep : 2 * keep + depth];
     spent_.entries += tiles_[x].waiting;
     spent_.evaluated += blend(splats_, p_.colours, p_.canvas, tiles_[x],
@@ -255,8 +260,9 @@ FP_STAGE void draw(Team& team, const Memory& memory, const Camera<float>& c, con
   const float* back = in.background;
   const Canvas canvas{in.width,     in.height,    {back[0], back[1], back[2]},
                       c.spread,     in.alpha_max, in.stop,
-                      out.image,    out.invdepth, out.alpha,
-                      out.features, out.fragments, out.winners};
+                      softens(in),  out.image,    out.invdepth,
+                      out.alpha,    out.features, out.fragments,
+                      out.winners};
   const size_t n = static_cast<size_t>(in.count);
   std::optional<Weights> weights;
   if (out.weights_per_gaussian) weights.emplace(memory, in);
@@ -304,7 +310,7 @@ FP_STAGE void forward(const fragprune_inputs& in, float spread, fragprune_output
     return;
   }
   Team team(in.threads);
-  const Camera<float> camera = unpack_camera(in, spread);
+  const Camera<float> camera = unpack_camera(in, spread + (softens(in) ? kHalfPixel : 0.f));
   // A state holds on to its memory until the backward pass is done, which then wants more: what the
   // forward pass alone needed goes back to the system first, lest both lie idle in turns.
   const Memory scratch = keep ? std::make_shared<Pool>() : memory;
@@ -395,6 +401,10 @@ constexpr std::array<UnblendTile, sizeof...(kWants)> unblenders(std::index_seque
 
 UnblendTile unblender(int want) {
   static constexpr auto table = unblenders(std::make_index_sequence<16>());
+  if (want & kSoft) {
+    if (want & kExtra) return unblend_tile<kWholeSoft | kWholeExtra>;
+    return want & kDepth ? unblend_tile<kWholeSoft | kDepth> : unblend_tile<kWholeSoft>;
+  }
   if (!(want & kExtra)) return table[want];
   return want & kThreshold ? unblend_tile<kWholeExtra | kThreshold> : unblend_tile<kWholeExtra>;
 }
@@ -561,6 +571,7 @@ FP_STAGE void backward(const fragprune_state& state, const fragprune_output_grad
   if (extras.feature_count || extras.offsets || !in.cap_gradient ||
       (to.hook && in.absolute_gradient))
     want |= kWholeExtra;
+  if (softens(in)) want |= kWholeSoft;
   const size_t n = static_cast<size_t>(in.count), sh_size = 3 * size_t(in.sh_coefficients);
   const GradientRows arrays[] = {
       {to.means, 3},      {to.hook, 3},       {to.opacities, 1},
@@ -739,9 +750,9 @@ const char* splats_fault_of(const fragprune_inputs* in) {
 const char* surfels_fault_of(const fragprune_inputs* in) {
   if (in->count && !in->scales) return "flat Gaussians need scales and rotations";
   if (in->means2d || in->cov3d || in->features || in->sample_offsets || in->absolute_gradient ||
-      in->compensation != FRAGPRUNE_NO_COMPENSATION)
-    return "flat Gaussians take no means2d, cov3d, features, sample_offsets, absolute_gradient or "
-           "compensation";
+      in->compensation != FRAGPRUNE_NO_COMPENSATION || in->soft)
+    return "flat Gaussians take no means2d, cov3d, features, sample_offsets, absolute_gradient, "
+           "compensation or soft rim";
   return splats_fault_of(in);
 }
 

@@ -11,6 +11,7 @@ namespace fp {
 
 constexpr float kLog2E = 1.44269504088896341f;
 constexpr float kTransmittanceMin = static_cast<float>(FRAGPRUNE_TRANSMITTANCE_MIN);
+constexpr float kFaintest = -7.99435343685885793f;  // log2(1/255): no fragment has less
 
 // What blending reads of one Gaussian in one view, and nothing else.
 //
@@ -26,8 +27,8 @@ struct Brush {
   V skew;                 // -scale * slope
   V down;                 // sqrt(log2(e) / 2 / var_down)
   V log_opacity;          // log2 of the compensated opacity
-  V cut;                  // drawn iff the exponent is at least this
-  V list_cut;             // lists reach to here: cut, or farther when the rim wants gradients
+  V cut;                  // drawn iff the exponent is at least this; with a soft rim, the rim's
+  V list_cut;             // lists reach to here: cut, or farther for the rim's sake
   V r, g, b, inv_z;
 };
 
@@ -65,6 +66,40 @@ FP_HD inline Meeting<V> meet(const LocalBrush<float>& b, V px, V py) {
 template <class V>
 FP_HD inline V capped(V alpha, float alpha_max) {
   return min(alpha, broadcast<V>(alpha_max));
+}
+
+// Where a pixel's centre lies to a soft rim.
+template <class V>
+struct Nearness {
+  V inwards;      // how far the exponent is above the rim's
+  V along, down;  // half the exponent's gradient on the image, with the sign turned
+  V square;       // of its length: the rim is within half a pixel where it is above inwards^2
+};
+
+template <class V>
+FP_HD inline Nearness<V> nearness_of(const LocalBrush<float>& b, const Meeting<V>& m) {
+  Nearness<V> n;
+  n.inwards = m.exponent - broadcast<V>(b.cut);
+  n.along = m.u * broadcast<V>(b.scale);
+  n.down = fma(m.u, broadcast<V>(b.skew), m.v * broadcast<V>(b.down));
+  n.square = fma(n.along, n.along, n.down * n.down);
+  return n;
+}
+
+// How far a rim within half a pixel covers the pixel: its distance, to first order.
+template <class V>
+struct Coverage {
+  V per_pixel;  // 1 / the length of the exponent's gradient
+  V share;      // of the pixel, 0 to 1
+};
+
+template <class V>
+FP_HD inline Coverage<V> coverage_of(const Nearness<V>& n) {
+  Coverage<V> c;
+  c.per_pixel = 0.5f * inverse_root(max(n.square, broadcast<V>(1e-12f)));
+  c.share = fma(n.inwards, c.per_pixel, broadcast<V>(0.5f));
+  c.share = min(max(c.share, broadcast<V>(0.f)), broadcast<V>(1.f));
+  return c;
 }
 
 // Density of the logistic at the rim, s(1-s)/w with s = sigmoid(away/w), away = |falloff - tau|.

@@ -315,8 +315,7 @@ FP_HD inline V compensation(const Camera<V>& c, const Projection<V>& p) {
 // is, iff alpha >= 1/255 and falloff >= threshold (the truncation's falloff, 0 for none).
 template <class V>
 FP_HD inline V cut_of(V log_opacity, V threshold) {
-  constexpr float host = static_cast<float>(-7.99435343685885793);  // log2(1/255)
-  return max(log_opacity + log2(threshold), broadcast<V>(host));
+  return max(log_opacity + log2(threshold), broadcast<V>(kFaintest));
 }
 
 // The falloff down to which the backward pass visits the rim of a threshold.

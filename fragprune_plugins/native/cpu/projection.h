@@ -214,6 +214,11 @@ class Colours {
   const Triples means_, colors_;
 };
 
+// Whether thresholds cut with a soft rim.
+inline bool softens(const fragprune_inputs& in) { return in.soft && in.thresholds; }
+
+constexpr float kHalfPixel = 0.5f;  // that a soft rim is wide, outwards
+
 // Projects one piece.
 class Projector {
  public:
@@ -287,6 +292,7 @@ class Projector {
     b.scale = sqrt(0.5f * kLog2E * (p.var_y / p.det));
     b.skew = -b.scale * (p.cov / p.var_y);
     b.down = sqrt(0.5f * kLog2E / p.var_y);
+    if (softens(in_)) soften(b, threshold);
     const Bounds<Lanes> bounds = bounds_of(c_, p, b);
     pack(i, living, b, threshold, 1.f / opacity, p.view.z, bounds, to);
   }
@@ -321,6 +327,7 @@ class Projector {
     const Mask has_tiles = both(gt(p.tile_x1, p.tile_x0), gt(p.tile_y1, p.tile_y0));
     const Mask seen = both(both(near_image, square.exists), both(has_depth, has_tiles));
     const uint32_t living = bits(both(seen, cut(opacity, threshold, b))) & first_lanes(count);
+    if (softens(in_)) soften(b, threshold);
     if (living)
       pack(i, living, b, threshold, 1.f / opacity, z, bounds_of(c_, p, b), to);
   }
@@ -337,6 +344,17 @@ class Projector {
     b.list_cut = in_.widen ? cut_of(b.log_opacity, rim_reach(threshold)) : b.cut;
     return both(both(gt(opacity, none), gt(broadcast<Lanes>(1e30f), opacity)),
                 both(ge(threshold, none), ge(b.log_opacity, b.list_cut)));
+  }
+
+  // Where a soft rim lies, and how far out pixels feel it. With q = d A d and the cutoff Q, those are
+  // pixels with q - |A d| < Q. For some n of length 1 that is (d - n/2) A (d - n/2) < Q + n A n / 4: they
+  // lie within half a pixel, which is the spread's, of the ellipse q < Q + (A's largest eigenvalue) / 4.
+  static void soften(Brush<Lanes>& b, Lanes threshold) {
+    b.cut = b.log_opacity + log2(threshold);
+    const Lanes both = fma(b.scale, b.scale, fma(b.skew, b.skew, b.down * b.down));
+    const Lanes area = 2.f * b.scale * b.down;  // twice the root of the determinant
+    const Lanes largest = 0.5f * (both + sqrt(max((both - area) * (both + area), 0.f * both)));
+    b.list_cut = max(b.cut - 0.25f * largest, broadcast<Lanes>(kFaintest));
   }
 
   void write_radii(Lanes radius, size_t i, size_t count) const {

@@ -163,12 +163,18 @@ inline Lanes root(Lanes a) {
   const __m512 s = a * x;
   return _mm512_fmadd_ps(_mm512_fnmadd_ps(s, s, a), x * 0.5f, s);
 }
+// 1 / the square root within rounding, likewise; a is above 0.
+inline Lanes inverse_root(Lanes a) {
+  const __m512 x = _mm512_rsqrt14_ps(a);
+  return x * _mm512_fnmadd_ps(a * x, x * 0.5f, _mm512_set1_ps(1.5f));
+}
 inline Mask ge(Lanes a, Lanes b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
 inline Mask gt(Lanes a, Lanes b) { return _mm512_cmp_ps_mask(a, b, _CMP_GT_OQ); }
 inline Mask gt(IntLanes a, IntLanes b) {
   return _mm512_cmpgt_epi32_mask((__m512i)a, (__m512i)b);
 }
 inline Mask both(Mask a, Mask b) { return (Mask)(a & b); }
+inline Mask either(Mask a, Mask b) { return (Mask)(a | b); }
 inline Lanes select(Mask m, Lanes a, Lanes b) { return _mm512_mask_blend_ps(m, b, a); }
 inline IntLanes select(Mask m, IntLanes a, IntLanes b) {
   return (IntLanes)_mm512_mask_blend_epi32(m, (__m512i)b, (__m512i)a);
@@ -240,8 +246,17 @@ inline Lanes abs(Lanes a) {
 inline IntLanes to_int(Lanes a) { return __builtin_convertvector(a, IntLanes); }
 inline Lanes reciprocal(Lanes a) { return broadcast<Lanes>(1.f) / a; }
 inline Lanes root(Lanes a) { return sqrt(a); }
+inline Lanes inverse_root(Lanes a) {
+#if FP_LANES == 8
+  const Lanes x = _mm256_rsqrt_ps(a);
+  return x * fnma(a * x, x * 0.5f, broadcast<Lanes>(1.5f));
+#else
+  return broadcast<Lanes>(1.f) / sqrt(a);
+#endif
+}
 inline Mask gt(IntLanes a, IntLanes b) { return (Mask)(a > b); }
 inline Mask both(Mask a, Mask b) { return a & b; }
+inline Mask either(Mask a, Mask b) { return a | b; }
 inline Lanes where(Mask m, Lanes a) { return bits_as<Lanes>(bits_as<IntLanes>(a) & m); }
 #if FP_LANES == 8
 inline Lanes floor(Lanes a) { return _mm256_floor_ps(a); }

@@ -33,6 +33,7 @@ FP_HD inline float max(float a, float b) { return a > b ? a : b; }
 FP_HD inline float abs(float a) { return fabsf(a); }
 FP_HD inline float sqrt(float a) { return sqrtf(a); }
 FP_HD inline float root(float a) { return sqrtf(a); }
+FP_HD inline float inverse_root(float a) { return 1.f / sqrtf(a); }
 FP_HD inline float floor(float a) { return floorf(a); }
 FP_HD inline float ceil(float a) { return ceilf(a); }
 FP_HD inline float log2(float a) { return log2f(a); }

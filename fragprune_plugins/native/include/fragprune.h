@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 9
+#define FRAGPRUNE_API_VERSION 10
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
@@ -100,6 +100,11 @@ typedef struct fragprune_lengths {
  * nor what belongs to projection is read, and one draws nothing that has no tiles, a depth that is not
  * positive or a conic that is not positive definite.
  *
+ * A Gaussian with a threshold ends hard: a pixel's centre is inside or not. With `soft`, alpha is times
+ * clamp(1/2 + d, 0, 1), d = (e - e_rim) / |gradient of e on the image|, e = ln(falloff), e_rim =
+ * ln(threshold): the distance of the pixel's centre to the rim, pixels. A fragment is drawn where that
+ * is above 0.
+ *
  * With `flat` they are surfels, flat Gaussians in the plane of their first two axes, drawn by the rules
  * of 2D Gaussian Splatting: given in the world by scales and rotations, without dilation, compensation,
  * features, sample_offsets and absolute_gradient. */
@@ -124,6 +129,7 @@ typedef struct fragprune_inputs {
   int32_t feature_count;   /* F, 0 to 8 */
   int32_t widen;           /* keep rim fragments: thresholds will want a gradient */
   int32_t flat;            /* surfels: scales are (N, 2), see below; the cpu engine's alone */
+  int32_t soft;            /* rims cover pixels in part, see below; the cpu engine's alone */
   int64_t count;           /* N */
   fragprune_lengths lengths;
   const float *viewmatrix; /* (4, 4) */

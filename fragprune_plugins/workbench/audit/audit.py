@@ -327,7 +327,7 @@ class _Survey:
         return {
             "gaussians": len(self._model),
             "truncated": self._model.falloff is not None,
-            "stop": self._model.stop,
+            **self._model.rules,
             "views": len(self._overdraw),
             "overdraw": statistics.fmean(self._overdraw),
             **{name: cuts[0][name] for name in same},

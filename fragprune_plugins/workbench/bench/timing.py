@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ class Case:
         splats: activated Gaussians; their device does the work.
         kind: forward only, or with every gradient.
         thresholds: (N,) or None.
-        stop: as in ``RasterInputs``.
+        rules: ``Model.rules`` to draw by.
     """
 
     scene: str
@@ -36,7 +36,7 @@ class Case:
     splats: Splats
     kind: Pass
     thresholds: Tensor | None = None
-    stop: float | None = None
+    rules: Mapping[str, Any] = field(default_factory=dict)
 
     __repr__ = one_line
 
@@ -169,7 +169,7 @@ def scaling(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float] 
 
 def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     """Make a function that draws once, optionally with gradients of a fixed random loss."""
-    inputs = RasterInputs(case.view, case.splats, planes=(), stop=case.stop)
+    inputs = RasterInputs(case.view, case.splats, planes=(), **case.rules)
     if case.kind == "forward":
 
         @torch.no_grad()
@@ -185,7 +185,7 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     if case.thresholds is not None:
         thresholds = case.thresholds.clone().requires_grad_(True)
     splats = replace(case.splats, **leaves)
-    inputs = RasterInputs(case.view, splats, hook, planes=(), stop=case.stop)
+    inputs = RasterInputs(case.view, splats, hook, planes=(), **case.rules)
     stream = torch.Generator().manual_seed(0)
     weight = torch.randn(3, case.view.height, case.view.width, generator=stream).to(case.device)
 

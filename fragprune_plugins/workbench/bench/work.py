@@ -34,8 +34,8 @@ _KINDS: tuple[Pass, ...] = ("forward", "forward_backward")
 
 Size = tuple[int, int]
 
-Scene = tuple[str, Splats, View, Tensor, float | None]
-"""Name, activated Gaussians, camera, and the thresholds (N,) and the stop of truncated rows."""
+Scene = tuple[str, Splats, View, Tensor, dict[str, Any]]
+"""Name, activated Gaussians, camera, and the thresholds (N,) and the rules of truncated rows."""
 
 
 def bench(
@@ -61,11 +61,11 @@ def bench(
     )
     cases = [
         case
-        for name, splats, view, cut, stop in scenes
+        for name, splats, view, cut, rules in scenes
         for kind in _KINDS
         for case in (
             Case(name, view, splats, kind),
-            Case(name, view, splats, kind, cut, stop),
+            Case(name, view, splats, kind, cut, rules),
         )
     ]
     results = measure(cases, [rasterizer], repeats=REPEATS, say=_say)
@@ -110,7 +110,7 @@ def _generated(gaussians: tuple[int, ...], sizes: list[Size], device: torch.devi
         for size in sizes:
             splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
             cut = torch.full_like(splats.opacities, TRUNCATION)
-            scenes.append((f"bench-{count}", splats, view, cut, None))
+            scenes.append((f"bench-{count}", splats, view, cut, {}))
     return scenes
 
 
@@ -133,7 +133,7 @@ def _of_model(
         view = replace(first, width=width, height=height)
         cut = thresholds_for(RasterInputs(view, splats), loaded.thresholds)
         cut = torch.full_like(splats.opacities, TRUNCATION) if cut is None else cut.detach()
-        scenes.append((model.stem, splats, view, cut, loaded.stop))
+        scenes.append((model.stem, splats, view, cut, loaded.rules))
     return scenes
 
 

@@ -6,7 +6,7 @@ import contextlib
 import functools
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import click
 
@@ -32,6 +32,7 @@ from fragprune_plugins.learning.schedule import (
     Settings,
     steps_of,
 )
+from fragprune_plugins.types import Rim
 from fragprune_plugins.workbench.commands.options import Number, together
 
 _OPTIONS = (
@@ -77,6 +78,12 @@ _OPTIONS = (
         help="Draw and train with a stop: a pixel draws the fragment that leaves less than this "
         "share of its light, and ends there. 0.01 is usual. Without it, the model's own; else the "
         "rule of 3DGS. Works with --control, too.",
+    ),
+    click.option(
+        "--rim",
+        type=click.Choice(get_args(Rim)),
+        help="How thresholds cut: hard between two pixels, or soft across one, without aliasing. "
+        "Without it, as the model has it; else hard. A soft rim is drawn by the cpu engine.",
     ),
     click.option(
         "--control",
@@ -137,6 +144,7 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
             target_speedup: float | None,
             portable: bool,
             stop: float | None,
+            rim: Rim | None,
             control: bool,
             nonfinite: Any,
             target_time: float | None = None,
@@ -155,6 +163,7 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
                     goal=_goal(pressure, target_speedup, target_time, max_drop, portable, control),
                     itself=itself,
                     stop=stop,
+                    rim=rim,
                     seed=kwargs.get("seed", 0),
                     views_per_step=views,
                     nonfinite=nonfinite,

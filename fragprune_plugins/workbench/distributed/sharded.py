@@ -227,7 +227,7 @@ def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) ->
     x, y, depth = (means @ rotation + view.viewmatrix[3, :3]).unbind(1)
     clip = means @ view.projmatrix[:3] + view.projmatrix[3]
     q = 2 * (splats.opacities / ALPHA_MIN).log()
-    if thresholds is not None:
+    if thresholds is not None and inputs.rim == "hard":  # a soft one reaches farther
         rim = (thresholds - RIM_REACH * RIM_WIDTH).clamp_min(FALLOFF_MIN)
         q = torch.minimum(q, -2 * torch.minimum(rim, thresholds).log())
     kept = (depth > inputs.near) & (q > 1 - _WIDER)

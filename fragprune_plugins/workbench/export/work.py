@@ -37,6 +37,7 @@ def export(
     truncated = splat.falloff is not None
     column = THRESHOLD_COLUMN if form.paired and truncated else None
     held = column or ("thresholds" if truncated else "no thresholds")
+    held += "" if splat.rim == "hard" else f" and a {splat.rim} rim"
     held += "" if splat.stop is None else f" and a stop at {splat.stop:g}"
     lines.append(
         describe_written(out, f": {len(splat)} Gaussians with {held}", pruned=splat.pruned)
@@ -49,7 +50,7 @@ def export(
             "keeps": form.keeps or None,
             "gaussians": len(splat),
             "thresholds": truncated,
-            "stop": splat.stop,
+            **splat.rules,
             "column": column,
             "dropped": dropped,
         },

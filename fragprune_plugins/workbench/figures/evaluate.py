@@ -50,7 +50,7 @@ class Candidate:
 
     def inputs(self, view: View, splats: Splats) -> RasterInputs:
         """The inputs of one view with the activated model; only the image is asked for."""
-        return RasterInputs(view, splats, planes=(), **{"stop": self.model.stop, **self.drawing})
+        return RasterInputs(view, splats, planes=(), **{**self.model.rules, **self.drawing})
 
     def draw(
         self, engine: Engine, view: View, splats: Splats, *, counts: bool = False

@@ -101,7 +101,8 @@ def covered(engine: Engine, inputs: RasterInputs, squared: Tensor) -> RasterOutp
     # Alpha capped at its least hides nothing; see ``visible``. A threshold then ends each ellipse.
     assert isinstance(inputs.splats, Splats)
     opaque = replace(inputs.splats, opacities=torch.ones_like(inputs.splats.opacities))
-    inputs = replace(inputs, splats=opaque, compensation="none", alpha_max=ALPHA_MIN, stop=None)
+    inputs = replace(inputs, splats=opaque, compensation="none", alpha_max=ALPHA_MIN)
+    inputs = replace(inputs, stop=None, rim="hard")
     return engine.rasterize(inputs, (-squared / 2).exp().clamp(max=1.0))
 
 

@@ -276,8 +276,8 @@ class Training:
 
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
         """Draw a view with its thresholds; also return the pressure."""
-        stop = self.stage.store.stop
-        inputs = RasterInputs(shot.view, self.model.splats(), planes=(), stop=stop)
+        rules = self.stage.store.rules
+        inputs = RasterInputs(shot.view, self.model.splats(), planes=(), **rules)
         thresholds = self.stage.thresholds(inputs)
 
         outputs, plain = self.engine.rasterize(inputs, thresholds), None
@@ -285,7 +285,7 @@ class Training:
             plain = self._plain(inputs)
 
         def untruncated() -> RasterOutputs:
-            whole = thresholds is None and stop is None
+            whole = thresholds is None and inputs.stop is None
             return outputs if whole else plain or self._plain(inputs)
 
         area = area_per_pixel(inputs) if self.settings.goal.on_area else None

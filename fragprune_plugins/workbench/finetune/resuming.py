@@ -252,6 +252,8 @@ def configuration(
     known: list[Tensor | str] = [] if store is None or store.neutral else [*store.numbers.values()]
     if model.stop is not None:
         known.append(f"stop {model.stop}")
+    if model.rim != "hard":
+        known.append(f"rim {model.rim}")
     return {
         "version": VERSION,
         "model": _digest(model.tensors.values()),

@@ -255,8 +255,8 @@ def times_faster(
         turn += 1
         for index, shot in enumerate(shots):
             for first in (True, False) if turn % 2 else (False, True):
-                splats, stop = (old, None) if first else (new, now.stop)
-                inputs = RasterInputs(shot.view, splats, planes=(), stop=stop)
+                splats, rules = (old, {}) if first else (new, now.rules)
+                inputs = RasterInputs(shot.view, splats, planes=(), **rules)
                 cut = None if first else thresholds(inputs)
                 spent = timed(partial(engine.rasterize, inputs, cut), before.xyz.device)[1]
                 least[first][index] = min(least[first][index], spent)

@@ -94,7 +94,7 @@ def keep_needed(
     drawer, splats, error = _drawer(engine, model), model.splats(), 0.0
     with torch.no_grad():
         for shot in shots:
-            inputs = RasterInputs(shot.view, splats, planes=(), stop=model.stop)
+            inputs = RasterInputs(shot.view, splats, planes=(), **model.rules)
             image = drawer.rasterize(inputs, thresholds).image
             error += float((shot.looked_at(image).clamp(0, 1) - shot.image).square().sum())
     views = _bar([shot.view for shot in shots], progress)
@@ -227,7 +227,7 @@ def removal_error(
     stream = torch.Generator().manual_seed(0)
     scores = torch.zeros_like(opacities)
     for view in views:
-        inputs = RasterInputs(view, splats, planes=(), stop=model.stop)
+        inputs = RasterInputs(view, splats, planes=(), **model.rules)
         image = engine.rasterize(inputs, thresholds).image
         for probe in range(PROBES):
             signs = torch.randint(0, 2, image.shape, generator=stream).mul(2).sub(1).to(image)
@@ -282,7 +282,7 @@ def _inputs(model: Model, views: Iterable[View]) -> Iterator[RasterInputs]:
     """The inputs of every view, with counts and weights."""
     splats = model.splats()
     for view in views:
-        yield RasterInputs(view, splats, planes=(), counts=True, scores=True, stop=model.stop)
+        yield RasterInputs(view, splats, planes=(), counts=True, scores=True, **model.rules)
 
 
 @torch.no_grad()

@@ -205,8 +205,8 @@ class _Drawing:
     @torch.no_grad()
     def draw(self, index: int) -> RasterOutputs:
         view = self._named[index][1].to(self._device)
-        stop = self._model.stop
-        inputs = RasterInputs(view, self._splats, counts=self._heatmap, planes=(), stop=stop)
+        rules = self._model.rules
+        inputs = RasterInputs(view, self._splats, counts=self._heatmap, planes=(), **rules)
         thresholds = thresholds_for(inputs, self._model.thresholds)
         outputs = self._engine.rasterize(inputs, thresholds)
         self.fragments[index] = float(outputs.fragments_per_pixel)

@@ -70,7 +70,7 @@ def own_pictures(
 
     @torch.no_grad()
     def draw(view: View) -> Tensor:
-        inputs = RasterInputs(view, splats, planes=(), stop=model.stop)
+        inputs = RasterInputs(view, splats, planes=(), **model.rules)
         return drawer.rasterize(inputs, thresholds).image
 
     views = around(model, seed=seed) if cameras is None else cameras

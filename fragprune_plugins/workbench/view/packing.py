@@ -47,7 +47,8 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
 
     Returns:
         The bytes, and: ``gaussians``, ``degree``, ``truncated`` (has thresholds), ``stop`` (which
-        quads cannot draw with; None for none), ``scales`` (least and largest logarithm of a scale).
+        quads cannot draw with; None for none), ``rim`` (which is always hard there), ``scales``
+        (least and largest logarithm of a scale).
     """
     drawn, falloff = model.splats(), model.falloff
     count, degree = len(model), model.sh_degree
@@ -75,7 +76,7 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
         "gaussians": count,
         "degree": degree,
         "truncated": falloff is not None,
-        "stop": model.stop,
+        **model.rules,
         "scales": [low, max(high, low + 1e-6)],
     }
     return geometry.tobytes() + harmonics.tobytes(), facts

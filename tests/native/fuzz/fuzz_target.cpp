@@ -53,6 +53,7 @@ calls::Scene scene_of(calls::Source& from) {
   in.scale_modifier = numbers[2], in.dilation = numbers[3];
   in.near = numbers[4] >= 0 ? numbers[4] : 0.2f;
   in.alpha_max = numbers[5] >= 0.01f && numbers[5] <= 1 ? numbers[5] : 0.99f;
+  in.soft = options >> 24 & 1;
   in.stop = options >> 23 & 1 ? 0.3f : 0;
   if (in.stop > 0) in.alpha_max = std::min(in.alpha_max, (float)FRAGPRUNE_STOPPED_ALPHA_MAX);
   take(s.viewmatrix, 16, from, raw);
@@ -85,7 +86,7 @@ calls::Scene scene_of(calls::Source& from) {
       take(s.sh, 3 * n * in.sh_coefficients, from, raw);
   }
   if (options >> 11 & 1) take(s.thresholds, n, from, raw);
-  if (in.flat) in.feature_count = in.compensation = in.absolute_gradient = 0;
+  if (in.flat) in.feature_count = in.compensation = in.absolute_gradient = in.soft = 0;
   if (in.feature_count) take(s.features, n * in.feature_count, from, raw);
   if (options >> 21 & 1 && !in.flat) {
     take(s.offsets, 2 * s.pixels(), from, raw);

@@ -326,6 +326,7 @@ inline Scene make_scene(Source& from, Limits limits) {
   in.compensation = from.below(3);
   in.near = from.one_in(3) ? from.uniform(0, 2) : 0.2f;
   in.alpha_max = from.one_in(3) ? from.uniform(0.1f, 1) : 0.99f;
+  in.soft = from.one_in(3);
   in.stop = from.one_in(3) ? from.log_uniform(1e-4f, 1) : 0;
   if (in.stop > 0) in.alpha_max = std::min(in.alpha_max, (float)FRAGPRUNE_STOPPED_ALPHA_MAX);
   in.cap_gradient = from.below(2);
@@ -345,7 +346,7 @@ inline Scene make_scene(Source& from, Limits limits) {
   in.feature_count = from.one_in(2) || in.flat ? 0 : 1 + from.below(FRAGPRUNE_FEATURES_MAX);
   if (in.feature_count) fill(s.features, n * in.feature_count, from, -1, 2);
   if (from.one_in(3) && !in.flat) fill(s.offsets, 2 * s.pixels(), from, -0.5f, 0.5f);
-  if (in.flat) in.compensation = FRAGPRUNE_NO_COMPENSATION, in.absolute_gradient = 0;
+  if (in.flat) in.compensation = FRAGPRUNE_NO_COMPENSATION, in.absolute_gradient = in.soft = 0;
   if (!from.one_in(3)) {
     s.thresholds.make(n);
     for (size_t i = 0; i < n; i++) s.thresholds[i] = threshold(from);

@@ -24,6 +24,7 @@ from fragprune_plugins.workbench.models.formats.values import (
     byte,
     opacities_of,
     quaternions_of,
+    rules_of,
     splat_of,
     turned,
 )
@@ -87,6 +88,7 @@ def read(reading: Reading) -> Model:
         rotations=rotation[:, [3, 0, 1, 2]],
         thresholds=None if cutoff is None else torch.from_numpy(cutoff.copy()),
         stop=None if extension is None else extension.get("stop"),
+        rim="hard" if extension is None else extension.get("rim", "hard"),
     )
     return turned(splat, _AXES)
 
@@ -166,8 +168,7 @@ def write(file: BinaryIO, splat: Model) -> None:
     if (falloff := splat.falloff) is not None:
         columns[_THRESHOLD] = array(falloff)[:, None]
     if splat.pruned:
-        stop = {} if splat.stop is None else {"stop": splat.stop}
-        extension["extensions"] = {CUTOFF: stop}
+        extension["extensions"] = {CUTOFF: rules_of(splat)}
         used.append(CUTOFF)
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []

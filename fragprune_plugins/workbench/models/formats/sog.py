@@ -36,6 +36,7 @@ from fragprune_plugins.workbench.models.formats.values import (
     of_codes,
     opacities_of,
     quaternions_of,
+    rules_of,
     splat_of,
     take,
 )
@@ -121,6 +122,7 @@ def _read(meta: dict[str, Any], load: Load) -> Model:
         rotations=_rotations(image(meta["quats"])),
         thresholds=of_codes(image(extra)[:, 0]) if "files" in extra else None,
         stop=extra.get("stop"),
+        rim=extra.get("rim", "hard"),
     )
 
 
@@ -178,7 +180,7 @@ def _rotations(texels: Bytes) -> npt.NDArray[Any]:
 
 def write(file: BinaryIO, splat: Model) -> None:
     """Write a bundle along a Z-order curve; the extra image is there only if it cuts something."""
-    order, codes, stop = morton_order(splat), codes_of(splat), splat.stop
+    order, codes, extra = morton_order(splat), codes_of(splat), rules_of(splat)
     splat = splat.untruncated().keep(order)
     count = len(splat)
     width = 4 * math.ceil(count**0.5 / 4)
@@ -235,7 +237,6 @@ def write(file: BinaryIO, splat: Model) -> None:
             "codebook": book.tolist(),
             "files": ["shN_centroids.webp", *plane("shN_labels.webp", two)],
         }
-    extra: dict[str, Any] = {} if stop is None else {"stop": stop}
     if codes is not None:
         grey = np.repeat(codes[order.numpy(), None], 3, axis=1)
         extra["files"] = plane(f"{EXTRA}.webp", grey)

@@ -48,6 +48,9 @@ Gaussian."""
 STOP = 0x46500002
 """Likewise, extension 2. Its payload is the stop, float32."""
 
+SOFT = 0x46500003
+"""Likewise, extension 3, of a model with a soft rim. It has no payload."""
+
 _COORDINATES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 _RDF = 6  # the PLY's axes among those that it names
 _MAGIC = 0x5053474E
@@ -87,10 +90,11 @@ def read(reading: Reading) -> Model:
         parts = _streams(reading, header)
     if header.antialiased:
         log.warning("SPZ: it was trained with antialiasing, and is drawn as 3DGS draws, without")
-    if unknown := records.keys() - {CUTOFFS, STOP, _COORDINATES}:
+    if unknown := records.keys() - {CUTOFFS, STOP, SOFT, _COORDINATES}:
         named = ", ".join(f"{each:#010x}" for each in sorted(unknown)[:_NAMED])
         log.warning("SPZ: skipped %d extension(s): %s", len(unknown), named)
     splat = _splat(header, parts, records.get(CUTOFFS), records.get(STOP))
+    splat = splat.with_rules(rim="soft") if SOFT in records else splat
     return turned(splat, _axes(records.get(_COORDINATES)))
 
 
@@ -200,7 +204,7 @@ def _smallest_three(data: Bytes) -> npt.NDArray[Any]:
 
 
 def write(file: BinaryIO, splat: Model) -> None:
-    """Write version 4; extension records are there only for thresholds that cut, and for a stop."""
+    """Write version 4; extension records are there only for thresholds that cut, and for rules."""
     xyz, sh, bits = array(splat.xyz), array(splat.f_rest), _FRACTION_BITS
     while bits and np.abs(xyz).max() * (1 << bits) >= (1 << 23) - 1:
         bits -= 1  # a scene wider than 2048 units
@@ -223,6 +227,8 @@ def write(file: BinaryIO, splat: Model) -> None:
     zone = b"" if codes is None else _RECORD.pack(CUTOFFS, len(codes)) + codes.tobytes()
     if splat.stop is not None:
         zone += _RECORD.pack(STOP, 4) + struct.pack("<f", splat.stop)
+    if splat.rim == "soft":
+        zone += _RECORD.pack(SOFT, 0)
     flags = _EXTENDED if zone else 0
     header = _HEADER.pack(_MAGIC, 4, len(splat), splat.sh_degree, bits, flags, len(streams))
     file.write(header + struct.pack("<I", 32 + len(zone)) + bytes(12) + zone)

@@ -14,7 +14,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import is_stop
+from fragprune_plugins.types import Rim, is_rim, is_stop
 from fragprune_plugins.workbench.models import cutoffs
 
 Floats = npt.NDArray[np.float32]
@@ -41,6 +41,7 @@ def splat_of(
     rotations: npt.NDArray[Any],
     thresholds: Tensor | None = None,
     stop: float | None = None,
+    rim: Rim = "hard",
 ) -> Model:
     """A splat of arrays.
 
@@ -53,9 +54,10 @@ def splat_of(
         rotations: (N, 4) quaternions w, x, y, z; one of length 0 becomes no rotation.
         thresholds: (N,) in (0, 1), or None.
         stop: as in ``RasterInputs``.
+        rim: as in ``RasterInputs``.
 
     Raises:
-        ValueError: there are no Gaussians, or thresholds or the stop are out of range.
+        ValueError: there are no Gaussians, or thresholds, the stop or the rim are out of range.
     """
     if not len(xyz):
         raise ValueError("0 Gaussians")
@@ -63,6 +65,8 @@ def splat_of(
         raise ValueError("thresholds outside (0, 1)")
     if not is_stop(stop):
         raise ValueError(f"a stop of {stop}, which is 1e-4 to 1")
+    if not is_rim(rim):
+        raise ValueError(f"a rim {rim!r:.40}, which is hard or soft")
     inside = np.clip(np.asarray(opacities, np.float64), _ALPHA_EDGE, 1 - _ALPHA_EDGE)
     rotations = np.array(rotations, np.float32)
     rotations[(rotations == 0).all(axis=1), 0] = 1
@@ -80,7 +84,13 @@ def splat_of(
         rotation=torch.from_numpy(rotations),
         thresholds=None if thresholds is None else ThresholdStore.from_falloff(thresholds),
     )
-    return model if stop is None else model.with_stop(stop)
+    return model if stop is None and rim == "hard" else model.with_rules(stop=stop, rim=rim)
+
+
+def rules_of(splat: Model) -> dict[str, Any]:
+    """A model's stop and rim by name, those of them that differ from the hosts' rules."""
+    hosts = {"stop": None, "rim": "hard"}
+    return {name: rule for name, rule in splat.rules.items() if rule != hosts[name]}
 
 
 def of_codes(codes: Bytes) -> Tensor | None:

@@ -522,6 +522,8 @@ async function start() {
     if (stop > 0)  // quads go on where a pixel of the model's would end
         $("#about").textContent += `. Its pixels stop at ${+(100 * stop).toPrecision(3)} % of their light; `
             + "here they go on, which shows as little more and costs more fragments";
+    if (scene.models.some(({ rim }) => rim === "soft"))
+        $("#about").textContent += ". Its rims are soft, across a pixel; here they are hard";
 }
 
 function failed(error) {
