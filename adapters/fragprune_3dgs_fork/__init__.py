@@ -20,7 +20,6 @@ from fragprune_3dgs_fork.fork import (
     plain_distances,
     read_fork,
     rests_after_densification,
-    steps_before_backward,
 )
 from fragprune_plugins.adapting import (
     CommandLine,
@@ -268,12 +267,11 @@ class ForkAdapter(GraphdecoAdapter):
             named = (repo.parameters(MODEL, f"{CLASS}.{method}") or ())[:1]
             return Seam(role, MODEL, f"{CLASS}.{method}", named, how=how)
 
-        steps = [of(Role.STEP, "update_learning_rate")] if steps_before_backward(fork) else []
         setups = dict.fromkeys(["training_setup", *fork.setups])
         return (
             Seam(Role.SCENE, "scene", "Scene.__init__"),
             *(of(Role.ATTACH, name, optimizers) for name in setups),
-            *steps,
+            of(Role.STEP, "update_learning_rate"),
             of(Role.KEEP, "_prune_optimizer"),
             of(Role.APPEND, "cat_tensors_to_optimizer"),
             *(of(Role.STILL, name) for name in fork.still),

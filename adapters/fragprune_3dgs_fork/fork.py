@@ -208,21 +208,6 @@ def _check_script(fork: Fork, script: str) -> None:
         fork.refuse("script", script, "checkpoints of another name", "chkpnt and the iteration")
 
 
-def steps_before_backward(fork: Fork) -> bool:
-    """Whether every script sets learning rates, once an iteration, before it goes backward."""
-    for script in fork.scripts:
-        tree = fork.repo.tree(script.removesuffix(".py"))
-        calls = list(_method_calls(tree)) if tree else []
-        lines = {
-            name: [node.lineno for node, called in calls if called == name]
-            for name in ("update_learning_rate", "backward")
-        }
-        rates, backward = lines["update_learning_rate"], lines["backward"]
-        if len(rates) != 1 or not backward or rates[0] > min(backward):
-            return False
-    return True
-
-
 def rests_after_densification(fork: Fork) -> bool:
     """Whether scripts change the model only where they ask for ``densify_until_iter``."""
     for script in fork.scripts:

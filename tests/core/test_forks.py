@@ -147,20 +147,6 @@ def test_rows_and_values_stand_still_by_what_methods_do_not_by_their_names(tmp_p
     assert still == ["oneupSHdegree", "thin_out", "spread"]
 
 
-def test_a_step_begins_with_the_rates_only_if_they_come_before_the_loss(tmp_path):
-    adapter = ForkAdapter()
-    late = (
-        (
-            "        gaussians.update_learning_rate(iteration)\n",
-            "",
-        ),
-        ("        gaussians.optimizer.step()\n", "        gaussians.update_learning_rate(0)\n"),
-    )
-    for name, changes, steps in (("early", (), 1), ("late", late, 0)):
-        seams = adapter.seams_for(fork(tmp_path / name, *changes))
-        assert sum(each.role is Role.STEP for each in seams) == steps
-
-
 def test_joint_learning_needs_to_know_where_the_model_comes_to_rest(tmp_path):
     repo = fork(tmp_path / "known")
     (tmp_path / "known/arguments/__init__.py").write_text(
