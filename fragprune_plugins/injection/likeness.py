@@ -53,7 +53,7 @@ def gradient_differences(
             torch.zeros_like(leaf) if each is None else each
             for each in (found[name], expected[name])
         ]
-        theirs, right = (each.double().reshape(len(leaf), -1).T for each in rows)
+        theirs, right = (each.float().reshape(len(leaf), -1).T for each in rows)
         away, usual = (theirs - right).abs(), float(_usual(right.abs().amax(0)[None]))
         stretch = expected.get("scales")
         if name == "rotations" and stretch is not None:

@@ -11,7 +11,7 @@ import hashlib
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -68,8 +68,9 @@ def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bo
     Raises:
         ProofError: it draws otherwise, or returns something that the host uses and we do not know.
     """
-    place = _place(session)
-    shape = (str(call.seam), place, *_shape(drawn))
+    place, joint = _place(session), session.learn and not session.freeze
+    drawn = replace(drawn, still=not joint)
+    shape = (str(call.seam), place, joint, *_shape(drawn))
     if shape not in session.proofs:
         session.proofs[shape] = None
         try:
@@ -253,6 +254,7 @@ class _Trial:
         self.dialect = session.dialect
         self.engine = session.engine(drawn[self.dialect.means].device)
         self.where = f"{call.seam} in {place.name}"
+        self.unfelt = {"means2D"} if drawn.still else set()  # only densification reads it
 
     def prove(self) -> Proof:
         """Compare every output and every gradient.
@@ -330,13 +332,17 @@ class _Trial:
             ours = [_made(name, each.seen) for each in both]
         if unread and not is_picture:
             return name, new
-        wrong = _first(both, map(_gradient_difference, both, theirs, ours))
+        differ = partial(_gradient_difference, chart.leaves.keys() - self.unfelt)
+        wrong = _first(both, map(differ, both, theirs, ours))
         if wrong and new:
             name += _DETACHED
             ours = [_made(name, each.seen) for each in both]
-            wrong = _first(both, map(_gradient_difference, both, theirs, ours)) and wrong
+            wrong = _first(both, map(differ, both, theirs, ours)) and wrong
         if wrong:
             self._refuse(f"another backward pass from {self._called(number)}: {wrong}")
+        differ = partial(_gradient_difference, self.unfelt)
+        if is_picture and _first(both, map(differ, both, theirs, ours)):
+            name += ", with another gradient on the screen, which stage 2 does not read"
         return name, new
 
     def _called(self, number: int) -> str:
@@ -359,15 +365,16 @@ def _first(both: list[_Both], told: Iterable[str]) -> str:
     return next(found, "")
 
 
-def _gradient_difference(both: _Both, theirs: Any, ours: Any) -> str:
-    """The first difference between the gradients of two outputs; "" without one."""
-    found, expected = (_gradient(each, both.leaves) for each in (theirs, ours))
-    return next(likeness.gradient_differences(found, expected, both.leaves), "")
+def _gradient_difference(names: Collection[str], both: _Both, theirs: Any, ours: Any) -> str:
+    """The first difference between the gradients of two outputs in some arguments, or ""."""
+    leaves = {name: leaf for name, leaf in both.leaves.items() if name in names}
+    found, expected = (_gradient(each, leaves) for each in (theirs, ours))
+    return next(likeness.gradient_differences(found, expected, leaves), "")
 
 
 def _gradient(output: Any, leaves: dict[str, Tensor]) -> dict[str, Tensor | None]:
     """Gradients of an output's numbers, weighed at random; None for zero."""
-    if not isinstance(output, Tensor) or not output.requires_grad:
+    if not leaves or not isinstance(output, Tensor) or not output.requires_grad:
         return dict.fromkeys(leaves)
     weights = torch.rand(output.numel(), generator=torch.Generator().manual_seed(0)) - 0.3
     found = torch.autograd.grad(

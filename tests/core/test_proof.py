@@ -95,9 +95,17 @@ def test_outputs_are_told_by_their_numbers(host, difference):
 @pytest.mark.parametrize("difference", OTHERWISE)
 def test_a_rasterizer_that_draws_otherwise_is_refused(host, difference):
     with pytest.raises(ProofError) as refused:
-        draw(host(difference))
+        draw(host(difference), learn=True, freeze=False)
     assert OTHERWISE[difference] in refused.value.found
     assert "fragprune finetune" in refused.value.remedy
+
+
+@pytest.mark.parametrize("difference", ["absolute gradient", "gradient by pixels"])
+def test_the_gradient_on_the_screen_matters_only_where_ours_draws_for_densification(
+    host, difference
+):
+    (proved,) = draw(host(difference))
+    assert proved.outputs[0].startswith("the picture, with another gradient on the screen")
 
 
 def test_every_difference_is_tried():
