@@ -55,15 +55,13 @@ once more. Ours is the derivative, so antialiased calls are not compared in them
 def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bool) -> Proof | None:
     """The proof of a call of the host's own rasterizer, made now if there is none yet.
 
+    None where it failed and may fail, and where our engines do not draw such a call.
+
     Args:
         session: the state of the session.
         call: at the seam.
         drawn: the same as data.
         strict: False warns where the proof fails.
-
-    Returns:
-        None where there is no proof: our engines do not draw such a call, or the proof failed and
-        may fail.
 
     Raises:
         ProofError: it draws otherwise, or returns something that the host uses and we do not know.
@@ -317,8 +315,8 @@ class _Trial:
         theirs = [each.theirs[number] for each in both]
         ours = [dict(enumerate(each.ours)).get(number) for each in both]
         own, chart = both
-        known_unread = ours[0] is None or getattr(type(ours[0]), "unread", False)
-        unread = number in self.place.unread or (number < len(own.ours) and known_unread)
+        said = ours[0] is None or getattr(type(ours[0]), "unread", False)
+        unread = number in self.place.unread or (number < len(own.ours) and said)
         is_picture = not likeness.difference(ours[1], chart.seen.image)
         name, new = likeness.meaning(ours[1], chart.seen) or "as the adapter answers", False
         if told := _first(both, map(likeness.difference, theirs, ours)):
