@@ -59,9 +59,9 @@ def straight(camera: Camera, points: Tensor) -> Tensor:
     return _jacobians(camera, points) / distance
 
 
-def steeper(footprints: Any, pixels: Tensor) -> Tensor:
+def steeper(*given: Tensor) -> Tensor:
     """Distances for a falloff with another exponent."""
-    return _squared_distances(footprints, pixels) ** 1.1
+    return _squared_distances(*given) ** 1.1
 
 
 def unclamped(means: Tensor, campos: Tensor, sh: Tensor, degree: int) -> Tensor:
