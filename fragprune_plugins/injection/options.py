@@ -31,6 +31,7 @@ class RunOptions:
         again: False leaves finished stages alone. If the stage 2 that "finetune" asks for has its
             result already, nothing runs. If an earlier run of the same command finished stage 1
             and not stage 2, "auto" begins with stage 2.
+        trust: go on where the host's own rasterizer draws otherwise than our engine.
     """
 
     adapter: str | None = None
@@ -40,6 +41,7 @@ class RunOptions:
     engine: str = "auto"
     device: str = "auto"
     again: bool = True
+    trust: bool = False
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bo
             session.proofs[shape] = _read_or_prove(session, call, drawn, place, shape)
         except ProofError as error:
             known = getattr(session.dialect, "otherwise", "")
-            if strict and not known:
+            if strict and not (known or session.trust):
                 del session.proofs[shape]
                 raise
             log.warning("%s", f"not proved: {error.found}; as known: {known}" if known else error)
@@ -353,7 +353,8 @@ class _Trial:
             found,
             f"what {self.session.adapter.name} draws, forward and backward",
             "Thresholds would learn from other pictures than its own. fragprune check says whether "
-            "its PLY is plain 3DGS, which fragprune finetune prunes; --stage off trains without.",
+            "its PLY is plain 3DGS, which fragprune finetune prunes; --stage off trains without "
+            "thresholds, and --trust with them all the same.",
         )
 
 

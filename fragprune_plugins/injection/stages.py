@@ -202,6 +202,7 @@ class Stages:
             engine=self.options.engine,
             drop_in=True if self.device == "cpu" else None,
             prove=self.options.stage != "off",
+            trust=self.options.trust,
             output=self.output,
             origin=self.around,
             **options,

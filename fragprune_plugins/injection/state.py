@@ -96,6 +96,7 @@ class SessionState:
             cannot be imported.
         prove: whether to prove each call of the host's own rasterizer before it draws; None does
             so if thresholds learn. One that would draw with thresholds is always proved.
+        trust: a proof that fails warns, and the host goes on.
         output: the host's output folder, if it is known.
         origin: stage 1's output folder, if stage 2 has its own.
     """
@@ -117,6 +118,7 @@ class SessionState:
         engine: str = "auto",
         drop_in: bool | None = None,
         prove: bool | None = None,
+        trust: bool = False,
         output: Path | None = None,
         origin: Path | None = None,
     ) -> None:
@@ -130,7 +132,7 @@ class SessionState:
         self.engine_name = engine
         self.engines: dict[torch.device, Engine] = {}
         self.drop_in = drop_in
-        self.prove = learn if prove is None else prove
+        self.prove, self.trust = learn if prove is None else prove, trust
         self.proofs: dict[tuple[Any, ...], Proof | None] = {}  # by the shape of the call
         self.dialect = adapter.dialect(repo)
         self.trained = trained_groups(adapter.groups, self.settings.train)  # names; None for all

@@ -179,6 +179,11 @@ def adapted(**members):
     return type("Adapter", (Vanilla3DGS,), {"dialect_type": dialect})()
 
 
+def test_whoever_trusts_it_is_told_and_goes_on(host, caplog):
+    assert draw(host("dilation"), learn=True, trust=True) == [None]
+    assert "another picture" in caplog.text
+
+
 def test_an_adapter_can_say_that_its_host_draws_otherwise(host, caplog):
     adapter = adapted(otherwise="it widens more")
     assert draw(host("dilation"), adapter=adapter, learn=True) == [None]

@@ -43,6 +43,12 @@ from fragprune_plugins.workbench.commands.options import engine_options
     show_default=True,
     help="Compare before and after on the views that the host holds out (--eval).",
 )
+@click.option(
+    "--trust",
+    is_flag=True,
+    help="Go on where the host's own rasterizer draws otherwise than ours. What nobody proved is "
+    "named on stderr.",
+)
 @again_option("Train, or learn, anew, though that is finished.")
 def command(**options: Any) -> Report:
     """Train with a host's own command, then learn truncation thresholds.

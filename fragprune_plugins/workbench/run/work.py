@@ -43,6 +43,7 @@ def run(
     engine: EngineOptions,
     evaluate: bool,
     again: bool,
+    trust: bool,
 ) -> Report:
     """Do what ``fragprune run`` promises; its options are the arguments."""
     _expect_possible(stage, from_iter)
@@ -56,6 +57,7 @@ def run(
         engine=engine.name,
         device=engine.device,
         again=again,
+        trust=trust,
     )
     before = after = None
     # A host prints to stdout; with --json, stdout gets only our object.
