@@ -12,6 +12,7 @@ from finetune import tiny
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
+from fragprune_plugins.testing.fresh import fresh
 from fragprune_plugins.workbench.finetune.api import finetune
 
 PAGE = 4096
@@ -70,8 +71,8 @@ def require_calm(steps: int, folder: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc")
-def test_memory_is_flat_and_thresholds_do_not_drift(tmp_path, single_thread):
-    require_calm(240, tmp_path)
+def test_memory_is_flat_and_thresholds_do_not_drift(tmp_path):
+    fresh(require_calm, 240, tmp_path)  # where no other test has left holes in the heap
 
 
 @pytest.mark.slow
