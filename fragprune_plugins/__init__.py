@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.constants import VERSION
 
 if TYPE_CHECKING:
-    from fragprune_plugins.engines import slice_at
     from fragprune_plugins.files.model import Model
     from fragprune_plugins.injection.api import activate, deactivate, paused
     from fragprune_plugins.learning.goals import (
@@ -33,11 +32,8 @@ if TYPE_CHECKING:
     from fragprune_plugins.plugins.hooks import engine_for, rasterize
     from fragprune_plugins.types import (
         Footprints,
-        Moment,
         RasterInputs,
         RasterOutputs,
-        Sliced,
-        SpacetimeSplats,
         Splats,
         View,
     )
@@ -67,7 +63,6 @@ _HOME = {
     "FinetuneResult": "workbench.finetune.result",
     "Footprints": "types",
     "Model": "files.model",
-    "Moment": "types",
     "Portable": "learning.goals",
     "Pressure": "learning.goals",
     "RasterInputs": "types",
@@ -75,8 +70,6 @@ _HOME = {
     "Schedule": "learning.schedule",
     "Settings": "learning.schedule",
     "ShardedEngine": "workbench.distributed.sharded",
-    "Sliced": "types",
-    "SpacetimeSplats": "types",
     "Splats": "types",
     "StepPlan": "learning.schedule",
     "ThresholdStore": "learning.thresholds",
@@ -100,7 +93,6 @@ _HOME = {
     "rasterize": "plugins.hooks",
     "render_view": "workbench.figures.viewing",
     "save": "workbench.models.model",
-    "slice_at": "engines",
     "whole_of": "workbench.distributed.processes",
 }
 
@@ -113,7 +105,6 @@ __all__ = [
     "FinetuneResult",
     "Footprints",
     "Model",
-    "Moment",
     "Portable",
     "Pressure",
     "RasterInputs",
@@ -121,8 +112,6 @@ __all__ = [
     "Schedule",
     "Settings",
     "ShardedEngine",
-    "Sliced",
-    "SpacetimeSplats",
     "Splats",
     "StepPlan",
     "ThresholdStore",
@@ -147,7 +136,6 @@ __all__ = [
     "rasterize",
     "render_view",
     "save",
-    "slice_at",
     "whole_of",
 ]
 

@@ -3,7 +3,7 @@
 a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo,
             ParamGroup, Finding
 its seams   Seam, Role, SeamCall, RowTrace, revised
-drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs, slice_at
+drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs
 its script  CommandLine, ConfigFile, Photographs
 of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
             share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages;
@@ -13,8 +13,8 @@ settings    parse_goal
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
-Importing this module imports no torch. Model, read_ply, slice_at and stand_ins load it when
-they are first used: import them inside functions, or under TYPE_CHECKING; so is read_plain.
+Importing this module imports no torch. Model, read_ply and stand_ins load it when they
+are first used: import them inside functions, or under TYPE_CHECKING; so is read_plain.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.constants import ALPHA_MIN, MARGINAL_MIN
+from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.errors import (
     AlignmentError,
     EngineError,
@@ -55,17 +55,13 @@ from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.types import (
     Footprints,
-    Moment,
     RasterInputs,
     RasterOutputs,
-    Sliced,
-    SpacetimeSplats,
     Splats,
     View,
 )
 
 if TYPE_CHECKING:
-    from fragprune_plugins.engines import slice_at
     from fragprune_plugins.files.model import Model
     from fragprune_plugins.files.ply import read_ply
     from fragprune_plugins.hosts.graphdeco import stand_ins
@@ -75,13 +71,11 @@ _LATE = {
     "Model": "files.model",
     "read_plain": "hosts.plain",
     "read_ply": "files.ply",
-    "slice_at": "engines",
     "stand_ins": "hosts.graphdeco.stand_ins",
 }
 
 __all__ = [
     "ALPHA_MIN",
-    "MARGINAL_MIN",
     "AlignmentError",
     "CommandLine",
     "ConfigFile",
@@ -100,7 +94,6 @@ __all__ = [
     "Interrupted",
     "Model",
     "ModelFileError",
-    "Moment",
     "NotComparedError",
     "ParamGroup",
     "Photographs",
@@ -113,8 +106,6 @@ __all__ = [
     "Seam",
     "SeamCall",
     "SessionError",
-    "Sliced",
-    "SpacetimeSplats",
     "Splats",
     "Terminated",
     "UsageError",
@@ -125,7 +116,6 @@ __all__ = [
     "read_plain",
     "read_ply",
     "revised",
-    "slice_at",
     "stand_ins",
 ]
 

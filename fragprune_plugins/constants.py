@@ -57,9 +57,6 @@ ROTATION_TOLERANCE: Final = 1e-2
 DISTANCE_MAX: Final = 1e12
 """Most world units of a camera from the origin: float32 holds its square with room to spare."""
 
-MARGINAL_MIN: Final = 0.05
-"""A Gaussian is not there when the moment is this unlikely for it, 1 at its mean in time."""
-
 RIM_WIDTH: Final = 0.01
 """Width w, in falloff, of the surrogate s((g - tau)/w) at the rim; results are flat .003 to .03."""
 

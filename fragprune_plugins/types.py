@@ -62,7 +62,7 @@ def short(value: Any) -> str:
     return repr(value)
 
 
-def _check(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = False) -> None:
+def check_tensor(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = False) -> None:
     """Raise InputError unless tensor is None or holds real numbers in the shape.
 
     Args:
@@ -93,11 +93,11 @@ def _check(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = F
         raise InputError(name, found, expected, "Check the call's arguments.")
 
 
-def _require(name: str, tensor: Tensor, *shape: int | None) -> None:
-    """Raise InputError as ``_check`` does, and if there is no tensor."""
+def require_tensor(name: str, tensor: Tensor, *shape: int | None) -> None:
+    """Raise InputError as ``check_tensor`` does, and if there is no tensor."""
     if tensor is None:
         raise InputError(name, "None", "a torch.Tensor", "Check the call's arguments.")
-    _check(name, tensor, *shape)
+    check_tensor(name, tensor, *shape)
 
 
 def _is_whole(dtype: torch.dtype) -> bool:
@@ -144,8 +144,8 @@ def check_pose(rotation: Tensor, translation: Tensor) -> None:
     """
     import torch
 
-    _require("rotation", rotation, 3, 3)
-    _require("translation", translation, 3)
+    require_tensor("rotation", rotation, 3, 3)
+    require_tensor("translation", translation, 3)
     exact = rotation.detach().double()
     skew = float((exact @ exact.T - torch.eye(3).to(exact)).abs().max())
     # NaN, too, is not within the tolerance.
@@ -160,7 +160,7 @@ def check_pose(rotation: Tensor, translation: Tensor) -> None:
 
 def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
     """Raise InputError unless tensor is None or (n, F) with F in 1 to FEATURES_MAX."""
-    _check(name, tensor, n, None)
+    check_tensor(name, tensor, n, None)
     if tensor is not None and not 1 <= tensor.shape[1] <= FEATURES_MAX:
         raise InputError(
             name,
@@ -170,7 +170,7 @@ def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
         )
 
 
-def _check_degree(name: str, sh: Tensor | None, degree: int) -> None:
+def check_degree(name: str, sh: Tensor | None, degree: int) -> None:
     """Raise InputError unless the degree is 0 to 3, and sh has coefficients enough for it."""
     if not 0 <= degree <= 3:
         raise InputError(f"{name}.sh_degree", str(degree), "0 to 3", "Lower the SH degree.")
@@ -220,10 +220,10 @@ class View:
 
     def __post_init__(self) -> None:
         _check_size(self.width, self.height)
-        _require("View.viewmatrix", self.viewmatrix, 4, 4)
-        _require("View.projmatrix", self.projmatrix, 4, 4)
-        _require("View.campos", self.campos, 3)
-        _require("View.background", self.background, 3)
+        require_tensor("View.viewmatrix", self.viewmatrix, 4, 4)
+        require_tensor("View.projmatrix", self.projmatrix, 4, 4)
+        require_tensor("View.campos", self.campos, 3)
+        require_tensor("View.background", self.background, 3)
 
     def to(self, device: torch.device | str) -> View:
         """The same camera with its tensors on a device."""
@@ -324,7 +324,7 @@ class View:
 
         at, to, over = (torch.as_tensor(p, dtype=torch.float64).cpu() for p in (eye, target, up))
         for name, point in (("eye", at), ("target", to), ("up", over)):
-            _check(f"View.look_at {name}", point, 3)
+            check_tensor(f"View.look_at {name}", point, 3)
         forward = torch.nn.functional.normalize(to - at, dim=0)
         right = torch.linalg.cross(forward, over)
         straight = float(right.norm()) > 1e-6 * float(over.norm())  # False for NaN, too
@@ -378,14 +378,14 @@ class Splats:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        _require("Splats.means", self.means, None, 3)
+        require_tensor("Splats.means", self.means, None, 3)
         n = len(self.means)
-        _require("Splats.opacities", self.opacities, n)
-        _check("Splats.scales", self.scales, n, 2 if self.flat else 3)
-        _check("Splats.rotations", self.rotations, n, 4)
-        _check("Splats.cov3d", self.cov3d, n, 6)
-        _check("Splats.sh", self.sh, n, None, 3)
-        _check("Splats.colors", self.colors, n, 3)
+        require_tensor("Splats.opacities", self.opacities, n)
+        check_tensor("Splats.scales", self.scales, n, 2 if self.flat else 3)
+        check_tensor("Splats.rotations", self.rotations, n, 4)
+        check_tensor("Splats.cov3d", self.cov3d, n, 6)
+        check_tensor("Splats.sh", self.sh, n, None, 3)
+        check_tensor("Splats.colors", self.colors, n, 3)
         _check_features("Splats.features", self.features, n)
         if (self.scales is None) != (self.rotations is None) or (
             (self.scales is None) == (self.cov3d is None)
@@ -403,7 +403,7 @@ class Splats:
                 "exactly one of them",
                 "Pass one of the two.",
             )
-        _check_degree("Splats", self.sh, self.sh_degree)
+        check_degree("Splats", self.sh, self.sh_degree)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -421,143 +421,6 @@ class Splats:
     def device(self) -> torch.device:
         """The device of the Gaussians."""
         return self.means.device
-
-
-@dataclass(frozen=True)
-class SpacetimeSplats:
-    """N Gaussians in space and time, activated; a ``Moment`` cuts them.
-
-    They are given in one of four ways. ``cov3d``: sliced already, only colours depend on the
-    moment. ``scales`` and ``rotations``: in space alone. With ``times`` and ``scales_t``: in time,
-    apart from space. With ``rotations_r`` too: with axes anywhere in space and time.
-
-    Attributes:
-        means: (N, 3) world.
-        opacities: (N,) in (0, 1).
-        times: (N,) means in time.
-        scales: (N, 3) standard deviations, world units.
-        scales_t: (N,) in time: a standard deviation with ``rotations_r``, else a variance.
-        rotations: (N, 4) quaternions w, x, y, z; used as given, the host normalises.
-        rotations_r: (N, 4) the right ones; ``rotations`` are the left ones then.
-        cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz; scale_modifier does not apply.
-        sh: (N, K, 3), 16 coefficients to each cosine in time; None for no colours.
-        sh_degree: 0 to 3, how many bands of ``sh`` are used.
-    """
-
-    means: Tensor
-    opacities: Tensor
-    times: Tensor | None = None
-    scales: Tensor | None = None
-    scales_t: Tensor | None = None
-    rotations: Tensor | None = None
-    rotations_r: Tensor | None = None
-    cov3d: Tensor | None = None
-    sh: Tensor | None = None
-    sh_degree: int = 0
-
-    __repr__ = one_line
-
-    def __post_init__(self) -> None:
-        _require("SpacetimeSplats.means", self.means, None, 3)
-        n = len(self.means)
-        widths: dict[str, tuple[int | None, ...]] = {
-            **dict.fromkeys(("opacities", "times", "scales_t"), ()),
-            **dict.fromkeys(("rotations", "rotations_r"), (4,)),
-            "scales": (3,),
-            "cov3d": (6,),
-            "sh": (None, 3),
-        }
-        for name, width in widths.items():
-            _check(f"SpacetimeSplats.{name}", getattr(self, name), n, *width)
-        given = tuple(
-            getattr(self, name) is not None
-            for name in ("cov3d", "scales", "rotations", "scales_t", "rotations_r")
-        )
-        if given not in _SPACETIME_KINDS or (self.scales_t is not None and self.times is None):
-            raise InputError(
-                "SpacetimeSplats",
-                "cov3d, scales, rotations and times as given",
-                "cov3d alone, or scales and rotations, with scales_t and times, with rotations_r",
-                "Pass one of the four.",
-            )
-        _check_degree("SpacetimeSplats", self.sh, self.sh_degree)
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-    @property
-    def device(self) -> torch.device:
-        """The device of the Gaussians."""
-        return self.means.device
-
-
-_SPACETIME_KINDS = (
-    (True, False, False, False, False),
-    (False, True, True, False, False),
-    (False, True, True, True, False),
-    (False, True, True, True, True),
-)
-
-
-@dataclass(frozen=True)
-class Moment:
-    """A moment and a camera position at which Gaussians in space and time are cut.
-
-    Attributes:
-        timestamp: the moment.
-        campos: (3,) camera centre in the world, for colour.
-        duration: longest period of the colours' cosines in time; above 0.
-        sh_degree_t: how many cosines are used at ``sh_degree`` 3, 0 to 2; None for colours without
-            time.
-        prefilter_var: if positive, added to the variance in time of the marginal.
-        scale_modifier: factor on the scales.
-    """
-
-    timestamp: float
-    campos: Tensor
-    duration: float = 1.0
-    sh_degree_t: int | None = None
-    prefilter_var: float = -1.0
-    scale_modifier: float = 1.0
-
-    __repr__ = one_line
-
-    def __post_init__(self) -> None:
-        _check("Moment.campos", self.campos, 3)
-        checks = (
-            ("duration", self.duration > 0, "above 0"),
-            ("sh_degree_t", self.sh_degree_t in (None, 0, 1, 2), "None, 0, 1 or 2"),
-        )
-        for name, holds, expected in checks:
-            if not holds:
-                raise InputError(
-                    f"Moment.{name}",
-                    repr(getattr(self, name)),
-                    expected,
-                    "Check the call's arguments.",
-                )
-
-
-@dataclass(frozen=True)
-class Sliced:
-    """N Gaussians at a moment. Absent ones have their mean at the camera and zeros elsewhere.
-
-    Attributes:
-        means: (N, 3) world.
-        cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz.
-        opacities: (N,) multiplied by the likelihood of the moment.
-        present: (N,) bool: whether the likelihood of the moment (1 at the mean in time) exceeds
-            0.05 and the covariance is finite.
-        colors: (N, 3) RGB, not below 0; None without ``sh``.
-    """
-
-    means: Tensor
-    cov3d: Tensor
-    opacities: Tensor
-    present: Tensor
-    colors: Tensor | None = None
-
-    __repr__ = one_line
 
 
 @dataclass(frozen=True)
@@ -588,13 +451,13 @@ class Footprints:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        _require("Footprints.means2d", self.means2d, None, 2)
+        require_tensor("Footprints.means2d", self.means2d, None, 2)
         n = len(self.means2d)
-        _require("Footprints.conics", self.conics, n, 3)
-        _require("Footprints.depths", self.depths, n)
-        _require("Footprints.opacities", self.opacities, n)
-        _require("Footprints.colors", self.colors, n, 3)
-        _check("Footprints.tiles", self.tiles, n, 4, whole=True)
+        require_tensor("Footprints.conics", self.conics, n, 3)
+        require_tensor("Footprints.depths", self.depths, n)
+        require_tensor("Footprints.opacities", self.opacities, n)
+        require_tensor("Footprints.colors", self.colors, n, 3)
+        check_tensor("Footprints.tiles", self.tiles, n, 4, whole=True)
         _check_features("Footprints.features", self.features, n)
 
     def __len__(self) -> int:
@@ -674,9 +537,9 @@ class RasterInputs:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        _check("RasterInputs.means2d_hook", self.means2d_hook, len(self.splats), None)
+        check_tensor("RasterInputs.means2d_hook", self.means2d_hook, len(self.splats), None)
         size = self.view.height, self.view.width
-        _check("RasterInputs.sample_offsets", self.sample_offsets, *size, 2)
+        check_tensor("RasterInputs.sample_offsets", self.sample_offsets, *size, 2)
         stop, highest = self.stop, 1 if self.stop is None else STOPPED_ALPHA_MAX
         checks = (
             ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),
@@ -730,7 +593,7 @@ class RasterInputs:
         Args:
             thresholds: (N,) falloff in (0, 1), of any floating type; None for no truncation.
         """
-        _check("thresholds", thresholds, len(self.splats))
+        check_tensor("thresholds", thresholds, len(self.splats))
 
     def with_counts(self) -> RasterInputs:
         """The same inputs with ``counts`` on."""

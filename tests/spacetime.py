@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from fragprune_plugins.engines import Slicer
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.types import Moment, Sliced, SpacetimeSplats
+from fragprune_plugins.slicing.cutting import slice_at
+from fragprune_plugins.slicing.splats import Moment, Sliced, SpacetimeSplats
 
 NOW = 0.3
 KINDS = ("sliced", "still", "apart", "joint")
@@ -56,11 +56,11 @@ def leaves(given: SpacetimeSplats, dtype: torch.dtype) -> SpacetimeSplats:
     return SpacetimeSplats(**tensors)
 
 
-def gradients(given: SpacetimeSplats, cut: Sliced, outputs=OUTPUTS) -> dict[str, torch.Tensor]:
+def gradients(given: SpacetimeSplats, result: Sliced, outputs=OUTPUTS) -> dict[str, torch.Tensor]:
     """Of a weighted sum of outputs, by all that wants one; zeros where nothing is felt."""
     total = torch.zeros((), dtype=torch.float64)
     for name in outputs:
-        value = getattr(cut, name)
+        value = getattr(result, name)
         weights = torch.randn(
             value.shape,
             generator=torch.Generator().manual_seed(OUTPUTS.index(name)),
@@ -72,14 +72,19 @@ def gradients(given: SpacetimeSplats, cut: Sliced, outputs=OUTPUTS) -> dict[str,
     return dict(zip(tensors, found, strict=True))
 
 
-def agree(slicer: Slicer, given: SpacetimeSplats, when: Moment, *, outputs=OUTPUTS) -> None:
+def cut(engine, given: SpacetimeSplats, when: Moment) -> Sliced:
+    """Cut by an engine."""
+    return slice_at(given, when, engine=engine)
+
+
+def agree(engine, given: SpacetimeSplats, when: Moment, *, outputs=OUTPUTS) -> None:
     """Values and gradients are the oracle's, to single precision's rounding.
 
     A rounding is 6e-8 of the largest term. Some forty lie on the way of a value, more on that of a
     gradient, and they add up like a random walk, to 1e-6 of the largest where it was measured.
     """
     exact, single = leaves(given, torch.float64), leaves(given, torch.float32)
-    expected, found = ReferenceEngine().slice(exact, when), slicer.slice(single, when)
+    expected, found = cut(ReferenceEngine(), exact, when), cut(engine, single, when)
     assert torch.equal(found.present, expected.present)
     for name in OUTPUTS:
         torch.testing.assert_close(

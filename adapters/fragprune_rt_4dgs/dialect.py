@@ -8,17 +8,14 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapting import (
-    MARGINAL_MIN,
     AlignmentError,
     GraphdecoDialect,
     HostCall,
-    Moment,
     RasterInputs,
     RasterOutputs,
-    Sliced,
-    SpacetimeSplats,
     Splats,
 )
+from fragprune_plugins.slicing.splats import MARGINAL_MIN, Moment, Sliced, SpacetimeSplats
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -122,7 +119,7 @@ class RT4DGSDialect(GraphdecoDialect):
 
 def at_moment(call: HostCall) -> Sliced:
     """The Gaussians of a call as 3D Gaussians, by the host's code path for this call."""
-    from fragprune_plugins.adapting import slice_at
+    from fragprune_plugins.slicing.cutting import slice_at
 
     s, given = call.settings, {}
     in_time = s.gaussian_dim == 4 or s.rot_4d

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 from fragprune_plugins.errors import EngineError, UsageError
 
@@ -13,13 +13,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from fragprune_plugins.types import (
-        Moment,
-        RasterInputs,
-        RasterOutputs,
-        Sliced,
-        SpacetimeSplats,
-    )
+    from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")
 
@@ -41,17 +35,6 @@ class Engine(Protocol):
 
         Raises:
             InputError: there is not one threshold per Gaussian (``inputs.check_thresholds``).
-        """
-
-
-@runtime_checkable
-class Slicer(Protocol):
-    """An engine that also cuts Gaussians in space and time, as all of ours do."""
-
-    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
-        """Cut Gaussians in space and time at a moment.
-
-        Inputs that require gradients receive them.
         """
 
 
@@ -145,34 +128,3 @@ def _fallback(why: str, remedy: str) -> Engine:
     from fragprune_plugins.engines.reference import Fallback
 
     return Fallback(why, remedy)
-
-
-_slicer = cache(create_engine)
-"""Engines keep memory and kernels that the next frame uses again."""
-
-
-def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = "auto") -> Sliced:
-    """Cut Gaussians in space and time at a moment: 3D Gaussians remain. Differentiable.
-
-    Gradients are those of RT-4DGS, whose hand-written kernels differ from the true derivatives.
-    Without ``rotations_r`` the marginal has no gradient. Colours are evaluated with directions to
-    the stored means, but differentiated with directions to the moved means. If colours depend on
-    time, the second coefficient receives the first one's gradient, and the times receive only the
-    gradient of the highest cosine, with the opposite sign.
-
-    Args:
-        splats: the Gaussians.
-        moment: when and from where.
-        engine: a name for ``create_engine``, or an engine. If it cannot cut Gaussians, the fastest
-            of our engines on the device does.
-
-    Raises:
-        InputError: there are fewer SH coefficients than the moment's cosines need.
-        EngineError: there is no such engine here.
-    """
-    if isinstance(engine, Slicer):
-        return engine.slice(splats, moment)
-    if not isinstance(engine, str) or engine == "auto":
-        engine, _ = _fastest(str(splats.device))
-    slicer: Slicer = _slicer(engine)  # type: ignore[assignment]
-    return slicer.slice(splats, moment)

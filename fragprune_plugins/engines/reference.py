@@ -8,15 +8,11 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from fragprune_plugins.constants import TILE
-from fragprune_plugins.engines.slicing import check_harmonics
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import (
     Footprints,
-    Moment,
     RasterInputs,
     RasterOutputs,
-    Sliced,
-    SpacetimeSplats,
     Splats,
 )
 from reference_renderer import (
@@ -25,11 +21,9 @@ from reference_renderer import (
     Gaussians,
     Options,
     Rendering,
-    SpacetimeGaussians,
     blended,
     render,
     render_footprints,
-    slice_gaussians,
 )
 from reference_renderer import Footprints as Projected
 
@@ -64,12 +58,6 @@ class ReferenceEngine:
             winners=drawn.winners if inputs.scores else None,
             surface=drawn.surface,
         )
-
-    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
-        """Cut Gaussians in space and time at a moment."""
-        check_harmonics(splats, moment)
-        given = SpacetimeGaussians(**vars(splats))
-        return Sliced(**vars(slice_gaussians(given, **vars(moment))))
 
 
 FALLBACK_LIMIT: Final = 10**9

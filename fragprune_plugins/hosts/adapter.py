@@ -124,7 +124,7 @@ class HostCall:
         settings: the host's rasterizer settings.
         arguments: of the call, by name.
         entry: the function called, "module:attribute" as seams spell it.
-        engine: draws the call; dialects may compute with it first (``slice_at``).
+        engine: draws the call; dialects may compute with it first.
         still: stage 2 has begun, in which no strategy of the host reads gradients.
     """
 

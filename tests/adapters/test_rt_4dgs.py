@@ -16,6 +16,8 @@ from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.injection.stand_ins import runs_here
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.slicing import cutting
+from fragprune_plugins.slicing.cutting import slice_at
 from fragprune_plugins.testing.host import joint, running
 from fragprune_rt_4dgs import RT4DGS, neighbours
 from fragprune_rt_4dgs.config import YAMLFile
@@ -23,6 +25,7 @@ from fragprune_rt_4dgs.dialect import RT4DGSDialect
 from reference_renderer import Camera, Gaussians, render
 
 COUNT = 16
+ENGINE = ReferenceEngine()
 HOSTS = {"4D rotation": RT4DGSHost, "without": RigidHost, "in Python": PythonHost}
 
 
@@ -129,25 +132,25 @@ def test_flow_is_blended_as_colour_is(mini, driver, monkeypatch):
 
 
 @pytest.mark.parametrize("opened", [True, False])
-def test_moments_are_cut_by_the_engine_that_draws(mini, opened):
+def test_moments_are_cut_by_the_engine_that_draws(mini, opened, monkeypatch):
     cut = []
-
-    class Noting(ReferenceEngine):
-        def slice(self, splats, moment):
-            cut.append(len(splats))
-            return super().slice(splats, moment)
 
     class Plugin:
         @hookimpl
         def fragprune_create_engine(self, name, device):
-            return Noting()
+            return ENGINE
 
+    def noting(splats, moment, engine):
+        cut.append((len(splats), engine))
+        return slice_at(splats, moment, engine=engine)
+
+    monkeypatch.setattr(cutting, "slice_at", noting)
     with joint(plugins=[Plugin()], **of(mini)) as host:
         model, camera = host.model(COUNT), host.camera()
         if opened:
             host.store(model).open(host.adapter.opacities(model))
         host.render(camera, model)
-    assert cut == [COUNT]
+    assert cut == [(COUNT, ENGINE)]
 
 
 @pytest.mark.parametrize("driver", [RT4DGSHost, RigidHost], ids=["4D rotation", "without"])

@@ -23,7 +23,7 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (16_065, 12_000),
+    "core lines": (15_533, 12_000),
     "core imports of the workbench": (0, 0),
     "imports inside functions": (91, 60),
     "functions over 60 lines": (9, 10),

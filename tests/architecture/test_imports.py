@@ -143,6 +143,12 @@ def test_import_rules_hold():
 KNOWN = {
     "reference_renderer": set(),
     "fragprune_plugins": {"reference_renderer"},
+    # its host moves in time
+    "fragprune_rt_4dgs": {
+        "fragprune_plugins.adapting",
+        "fragprune_plugins.slicing.cutting",
+        "fragprune_plugins.slicing.splats",
+    },
     # its host draws with gsplat; it activates a session itself, and ends it at Ctrl-C
     "fragprune_nerfstudio": {
         "fragprune_gsplat",

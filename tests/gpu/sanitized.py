@@ -20,7 +20,7 @@ import torch
 from gpu.emulated import EmulatedDevice
 from native.test_dialects import dialect
 from native.test_invariants import everything
-from spacetime import moment, splats
+from spacetime import cut, moment, splats
 
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
@@ -109,8 +109,8 @@ def draw(device: EmulatedDevice, seed: int) -> None:
     leaves = {k: t for k, t in vars(given).items() if isinstance(t, torch.Tensor)}
     for leaf in leaves.values():
         leaf.requires_grad_()
-    cut = engine.slice(given, moment(1))
-    (cut.means.sum() + cut.cov3d.sum() + cut.opacities.sum()).backward()
+    result = cut(engine, given, moment(1))
+    (result.means.sum() + result.cov3d.sum() + result.opacities.sum()).backward()
 
 
 class Broken(EmulatedDevice):

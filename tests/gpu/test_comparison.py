@@ -115,11 +115,6 @@ def other_gradients_each_time(kernel: str, arguments: ctypes.Structure) -> None:
         array(arguments.to.means, 1)[0] *= 1 + 1e-6 * next(RUNS)
 
 
-def a_wrong_slice(kernel: str, arguments: ctypes.Structure) -> None:
-    if kernel == "fp_slice":
-        array(arguments.sliced.opacities, 3000)[2999] = 2.0
-
-
 def nothing_in_the_widest_rows_of_tiles(kernel: str, arguments: ctypes.Structure) -> None:
     if kernel == "fp_blend" and arguments.inputs.width == SMALL.wide_size[0]:
         ctypes.memset(arguments.outputs.image + 4 * 330 * 288, 0, 4 * 330 * 2)
@@ -149,7 +144,6 @@ def nothing_in_the_widest_rows_of_tiles(kernel: str, arguments: ctypes.Structure
             "large",
             "gradient of means is another in another run",
         ),
-        (a_wrong_slice, "slices", "slice, opacities: off by"),
         (nothing_in_the_widest_rows_of_tiles, "wide", "wide frame, picture: 660 of"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
@@ -162,7 +156,6 @@ def only(part: str, device: EmulatedDevice | Watched) -> list[str]:
     """What one part of the comparison says; a sound engine shows that the whole runs each part."""
     parts = {
         "sorting": (comparison._sorting, SMALL.keys),
-        "slices": (comparison._slices,),
         "large": (comparison._large_frame, SMALL),
         "wide": (comparison._wide_frame, SMALL),
     }

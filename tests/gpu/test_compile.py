@@ -10,6 +10,7 @@ import pytest
 
 from fragprune_plugins.engines.cuda import kernels
 from fragprune_plugins.engines.cuda.frame import MACROS, VARIANTS, unblend_macros
+from fragprune_plugins.slicing import structs
 
 ARCHITECTURES = (
     90,
@@ -65,7 +66,7 @@ def test_all_kernels_compile_without_stack_or_spills(
             pool.submit(nvrtc.compile, source, {**MACROS, **macros}, f"sm_{architecture}")
             for source, macros in (
                 ("scene", {}),
-                ("slice", {}),
+                ("slice", structs.MACROS),
                 ("unblend", {}),
                 ("unblend", TRAINED),
                 ("unblend", TUNED),
@@ -105,4 +106,4 @@ def test_nvcc_compiles_the_same_sources() -> None:
 
 
 def test_what_is_built_beforehand_is_what_training_asks_for() -> None:
-    assert {source for source, _ in VARIANTS} == {"scene", "slice", "blend", "unblend"}
+    assert {source for source, _ in VARIANTS} == {"scene", "blend", "unblend"}

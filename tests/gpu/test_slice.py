@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import pytest
 import torch
-from spacetime import KINDS, OUTPUTS, agree, gradients, leaves, moment, splats
+from spacetime import KINDS, OUTPUTS, agree, cut, gradients, leaves, moment, splats
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.errors import EngineError
+from fragprune_plugins.slicing.cutting import expect_right
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -27,6 +32,7 @@ def test_each_output_has_its_own_gradients(engine, output):
 
 @pytest.mark.parametrize("count", [0, 1, 300])
 def test_any_number_of_them(engine, device, count):
+    expect_right(device, torch.device("cpu"))
     before = len(device.launched)
     agree(engine, splats("joint", count), moment())
     kernels = [name for name, _ in device.launched[before:]]
@@ -35,10 +41,23 @@ def test_any_number_of_them(engine, device, count):
 
 def test_who_is_not_there_is_as_in_the_cpu_engine(engine):
     given, when = leaves(splats("joint", 300, coefficients=50), torch.float32), moment()
-    ours, theirs = engine.slice(given, when), CpuEngine().slice(given, when)
+    ours, theirs = cut(engine, given, when), cut(CpuEngine(), given, when)
     absent = ~ours.present
     assert absent.any()
     assert torch.equal(absent, ~theirs.present)
     for name in OUTPUTS:
         assert torch.equal(getattr(ours, name)[absent], getattr(theirs, name)[absent])
     assert not any(g[absent].any() for g in gradients(given, ours).values())
+
+
+def test_a_gpu_that_cuts_wrongly_is_refused(device):
+    class Faulty:
+        kind = "cpu"
+
+        def launch(self, where, source, macros, kernel, blocks, arguments):
+            device.launch(where, source, macros, kernel, blocks, arguments)
+            if kernel == "fp_slice":
+                (ctypes.c_float * 3000).from_address(arguments.sliced.opacities)[2999] = 2.0
+
+    with pytest.raises(EngineError, match="opacities are off by"):
+        cut(CudaEngine(Faulty()), leaves(splats("joint", 20), torch.float32), moment())

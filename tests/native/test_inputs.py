@@ -14,8 +14,9 @@ from footprints import footprints_of
 from fragprune_plugins.engines.arrays import address
 from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs
-from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError
+from fragprune_plugins.slicing.cutting import slice_by
+from fragprune_plugins.slicing.structs import Spacetime
 from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
 
@@ -180,10 +181,10 @@ class Doubting:
     def unslice(self, *structs: ctypes.Structure) -> None:
         self.call(self.calls.fragprune_unslice, *structs)
 
-    def call(self, function: Any, given: binding.Spacetime, *more: ctypes.Structure) -> None:
+    def call(self, function: Any, given: Spacetime, *more: ctypes.Structure) -> None:
         error = binding.Error()
         structs = [ctypes.byref(struct) for struct in (given, *more, error)]
-        for name in dict(binding.Spacetime._fields_).keys() & set(binding.ARRAYS):
+        for name in dict(Spacetime._fields_).keys() & set(binding.ARRAYS):
             held = getattr(given.lengths, name)
             setattr(given.lengths, name, held - 1)
             assert function(*structs) != binding.OK

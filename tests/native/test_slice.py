@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import replace
 
 import pytest
 import spacetime
 import torch
-from spacetime import KINDS, agree, gradients, leaves, moment, splats
+from spacetime import KINDS, agree, cut, gradients, leaves, moment, splats
 
-import fragprune_plugins
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError
+from fragprune_plugins.slicing.cutting import slice_at
+from fragprune_plugins.slicing.structs import Sliced, Spacetime
 
 SIZES = (1, 3, 1024 + 37)
 """Fewer than any register has lanes, and more than one piece of work, the last one odd."""
@@ -38,8 +40,8 @@ def test_any_number_of_them(engine):
 
 def test_coefficients_that_are_not_in_use_have_no_gradient(engine):
     given = leaves(splats("joint", 50, coefficients=60), torch.float32)
-    cut = engine.slice(given, moment(1))
-    by_sh = gradients(given, cut)["sh"]
+    result = cut(engine, given, moment(1))
+    by_sh = gradients(given, result)["sh"]
     assert by_sh[:, :32].any()
     assert not by_sh[:, 32:].any()
 
@@ -69,20 +71,25 @@ def test_rotations_are_used_as_given(engine):
 def test_who_is_not_there_is_nowhere_and_has_no_gradients(engine):
     given = leaves(splats("joint", 300), torch.float32)
     when = moment()
-    cut = engine.slice(given, when)
-    absent = ~cut.present
+    result = cut(engine, given, when)
+    absent = ~result.present
     assert 30 < int(absent.sum()) < 270
-    assert (cut.means[absent] == when.campos.float()).all()
-    for values in (cut.cov3d, cut.opacities, cut.colors, *gradients(given, cut).values()):
+    assert (result.means[absent] == when.campos.float()).all()
+    for values in (
+        result.cov3d,
+        result.opacities,
+        result.colors,
+        *gradients(given, result).values(),
+    ):
         assert not values[absent].any()
-        assert values[cut.present].any()
+        assert values[result.present].any()
 
 
 def test_long_after_everything_nobody_is_there(engine):
     given = leaves(splats("joint", 40), torch.float32)
-    cut = engine.slice(given, replace(moment(), timestamp=1e6))
-    assert not cut.present.any()
-    assert not any(g.any() for g in gradients(given, cut).values())
+    result = cut(engine, given, replace(moment(), timestamp=1e6))
+    assert not result.present.any()
+    assert not any(g.any() for g in gradients(given, result).values())
 
 
 def broken(given, **changes):
@@ -109,11 +116,11 @@ def test_what_is_not_finite_is_not_there_and_spoils_nobody(engine, kind, changes
     first = len(next(iter(changes.values())))
     if kind == "joint" and "scales_t" in changes:  # turned, other axes reach into time
         first, bad = 1, leaves(broken(good, scales_t=(NAN,)), torch.float32)
-    cut, well = engine.slice(bad, moment()), engine.slice(leaves(good, torch.float32), moment())
-    assert not cut.present[:first].any()
+    result, well = cut(engine, bad, moment()), cut(engine, leaves(good, torch.float32), moment())
+    assert not result.present[:first].any()
     for name in spacetime.OUTPUTS:
-        assert torch.equal(getattr(cut, name)[first:], getattr(well, name)[first:])
-    for grad in gradients(bad, cut).values():
+        assert torch.equal(getattr(result, name)[first:], getattr(well, name)[first:])
+    for grad in gradients(bad, result).values():
         assert not grad[:first].any()
         assert grad.isfinite().all()
 
@@ -129,8 +136,8 @@ def test_a_fast_gaussian_keeps_its_shape(engine):
     given = splats("joint", 60)
     still = torch.full_like(given.times, spacetime.NOW)
     fast = replace(given, scales_t=300 * given.scales_t, times=still)
-    expected = ReferenceEngine().slice(fast, moment())
-    found = engine.slice(leaves(fast, torch.float32), moment())
+    expected = cut(ReferenceEngine(), fast, moment())
+    found = cut(engine, leaves(fast, torch.float32), moment())
     size = expected.cov3d.abs().amax(dim=1, keepdim=True)
     assert ((found.cov3d - expected.cov3d).abs() < 1e-4 * size).all()
 
@@ -138,49 +145,49 @@ def test_a_fast_gaussian_keeps_its_shape(engine):
 def test_no_gaussians(engine):
     for kind in KINDS:
         given = leaves(splats(kind, 0), torch.float32)
-        cut = engine.slice(given, moment())
-        assert cut.means.shape == cut.colors.shape == (0, 3)
-        assert all(len(grad) == 0 for grad in gradients(given, cut).values())
+        result = cut(engine, given, moment())
+        assert result.means.shape == result.colors.shape == (0, 3)
+        assert all(len(grad) == 0 for grad in gradients(given, result).values())
 
 
 def test_without_harmonics_there_are_no_colours(engine):
     given = leaves(replace(splats("joint", 20), sh=None), torch.float32)
-    cut = engine.slice(given, moment())
-    assert cut.colors is None
-    assert gradients(given, cut, ("means",))["rotations_r"].any()
+    result = cut(engine, given, moment())
+    assert result.colors is None
+    assert gradients(given, result, ("means",))["rotations_r"].any()
 
 
 def test_what_wants_no_gradient_gets_none(engine):
     given = splats("joint", 20)
     opacities = given.opacities.float().requires_grad_()
-    cut = engine.slice(replace(given, opacities=opacities), moment())
-    assert cut.opacities.requires_grad
-    assert not any(t.requires_grad for t in (cut.means, cut.cov3d, cut.colors))
-    cut.opacities.sum().backward()
-    marginal = ReferenceEngine().slice(given, moment()).opacities / given.opacities
+    result = cut(engine, replace(given, opacities=opacities), moment())
+    assert result.opacities.requires_grad
+    assert not any(t.requires_grad for t in (result.means, result.cov3d, result.colors))
+    result.opacities.sum().backward()
+    marginal = cut(ReferenceEngine(), given, moment()).opacities / given.opacities
     torch.testing.assert_close(opacities.grad.double(), marginal, rtol=1e-5, atol=1e-7)
     with torch.no_grad():
-        assert not engine.slice(replace(given, opacities=opacities), moment()).means.requires_grad
+        assert not cut(engine, replace(given, opacities=opacities), moment()).means.requires_grad
 
 
 def test_changes_in_place_before_the_way_back_are_noticed(engine):
     given = leaves(splats("joint", 20), torch.float32)
-    cut = engine.slice(given, moment())
+    result = cut(engine, given, moment())
     with torch.no_grad():
         given.scales.mul_(2)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        cut.cov3d.sum().backward()
+        result.cov3d.sum().backward()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_input_alone_has_the_gradient_that_it_has_among_all(engine, kind):
     given, when = splats(kind, 40), moment()
     everything = leaves(given, torch.float32)
-    expected = gradients(everything, engine.slice(everything, when))
+    expected = gradients(everything, cut(engine, everything, when))
     assert len(expected) >= 5
     for name in expected:
         alone = replace(given, **{name: getattr(everything, name)})
-        assert torch.equal(gradients(alone, engine.slice(alone, when))[name], expected[name])
+        assert torch.equal(gradients(alone, cut(engine, alone, when))[name], expected[name])
 
 
 def test_the_number_of_threads_changes_no_bit(engine):
@@ -189,8 +196,8 @@ def test_the_number_of_threads_changes_no_bit(engine):
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            cut = engine.slice(given, moment())
-            found.append([cut.means, cut.colors, *gradients(given, cut).values()])
+            result = cut(engine, given, moment())
+            found.append([result.means, result.colors, *gradients(given, result).values()])
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
@@ -198,18 +205,18 @@ def test_the_number_of_threads_changes_no_bit(engine):
 
 def test_slice_at_takes_the_fastest_engine(monkeypatch):
     given, when = splats("joint", 50), moment()
-    expected = ReferenceEngine().slice(given, when)
-    assert fragprune_plugins.slice_at(given, when).means.dtype == (
+    expected = cut(ReferenceEngine(), given, when)
+    assert slice_at(given, when).means.dtype == (
         torch.float32 if binding.usable_builds() else torch.float64
     )
     monkeypatch.setenv(binding.ENVIRONMENT, "off")
-    assert torch.equal(fragprune_plugins.slice_at(given, when).means, expected.means)
+    assert torch.equal(slice_at(given, when).means, expected.means)
 
 
 @pytest.mark.skipif(not binding.usable_builds(), reason="no compiled rasterizer here")
 def test_slice_at_takes_the_engine_that_was_asked_for():
     given, when = splats("joint", 50), moment()
-    expected = ReferenceEngine().slice(given, when)
+    expected = cut(ReferenceEngine(), given, when)
 
     class Drawing:
         """Another's engine, which cuts nothing."""
@@ -220,12 +227,10 @@ def test_slice_at_takes_the_engine_that_was_asked_for():
             raise AssertionError
 
     for engine in ("reference", ReferenceEngine()):
-        assert torch.equal(
-            fragprune_plugins.slice_at(given, when, engine=engine).means, expected.means
-        )
+        assert torch.equal(slice_at(given, when, engine=engine).means, expected.means)
     for engine in ("cpu", "auto", Drawing()):
-        cut = fragprune_plugins.slice_at(given, when, engine=engine)
-        assert cut.means.dtype == torch.float32
+        result = slice_at(given, when, engine=engine)
+        assert result.means.dtype == torch.float32
 
 
 def test_what_does_not_fit_is_refused(engine):
@@ -240,7 +245,7 @@ def test_what_does_not_fit_is_refused(engine):
             replace(moment(), **{name: value})
     for slicer in (engine, ReferenceEngine()):
         with pytest.raises(InputError, match="at least 48 for 2 cosines"):
-            slicer.slice(replace(good, sh=good.sh[:, :40]), moment())
+            cut(slicer, replace(good, sh=good.sh[:, :40]), moment())
 
 
 def test_the_library_refuses_what_does_not_fit(engine):
@@ -249,16 +254,20 @@ def test_the_library_refuses_what_does_not_fit(engine):
     three = torch.zeros(3).data_ptr()
     lengths = binding.Lengths(campos=3)
     good = {"count": 0, "campos": three, "duration": 1.0, "threads": 1, "lengths": lengths}
-    to = binding.Sliced()
-    assert calls.fragprune_slice(binding.Spacetime(**good), to, error) == binding.OK
+    to = Sliced()
+
+    def status_of(*given):
+        return calls.fragprune_slice(*map(ctypes.byref, (*given, error)))
+
+    assert status_of(Spacetime(**good), to) == binding.OK
     for change in (
         *({"threads": 1025}, {"threads": 0}, {"count": -1}, {"count": 1}),
         *({"campos": None}, {"lengths": binding.Lengths(campos=2)}),
     ):
-        status = calls.fragprune_slice(binding.Spacetime(**{**good, **change}), to, error)
+        status = status_of(Spacetime(**{**good, **change}), to)
         assert status != binding.OK
         assert error.message
-    stale = binding.Sliced()
+    stale = Sliced()
     stale.size = 4
-    assert calls.fragprune_slice(binding.Spacetime(**good), stale, error) != binding.OK
+    assert status_of(Spacetime(**good), stale) != binding.OK
     assert b"version" in error.message

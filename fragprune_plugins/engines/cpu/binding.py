@@ -45,14 +45,15 @@ class _Named(ctypes.Structure):
         super().__init__(**fields)
 
 
-class _Sized(_Named):
+class Sized(_Named):
     """A struct whose first field is its own size."""
 
     def __init__(self, **fields: Any) -> None:
         super().__init__(size=ctypes.sizeof(type(self)), **fields)
 
 
-def _pointers(names: str) -> tuple[tuple[str, Any], ...]:
+def pointers(names: str) -> tuple[tuple[str, Any], ...]:
+    """Fields of a struct that are addresses, by their names in one string."""
     return tuple((name, _POINTER) for name in names.split())
 
 
@@ -74,7 +75,7 @@ ARRAYS: Final = tuple(name for name, *_ in Lengths._fields_)
 """The arrays that go in, by name: of a rasterization, and of a cut in time."""
 
 
-class Inputs(_Sized):
+class Inputs(Sized):
     """fragprune_inputs."""
 
     _fields_ = (
@@ -100,19 +101,19 @@ class Inputs(_Sized):
         ("soft", ctypes.c_int32),
         ("count", ctypes.c_int64),
         ("lengths", Lengths),
-        *_pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
-        *_pointers("cov3d sh colors features thresholds sample_offsets"),
-        *_pointers("means2d conics depths tiles workspace"),
+        *pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
+        *pointers("cov3d sh colors features thresholds sample_offsets"),
+        *pointers("means2d conics depths tiles workspace"),
     )
 
 
-class Outputs(_Sized):
+class Outputs(Sized):
     """fragprune_outputs."""
 
     _fields_ = (
         ("size", ctypes.c_uint32),
-        *_pointers("image invdepth alpha radii features fragments fragments_per_gaussian"),
-        *_pointers("weights_per_gaussian wins_per_gaussian winners surface"),
+        *pointers("image invdepth alpha radii features fragments fragments_per_gaussian"),
+        *pointers("weights_per_gaussian wins_per_gaussian winners surface"),
         ("drawn", ctypes.c_int64),
         ("evaluated", ctypes.c_int64),
         ("entries", ctypes.c_int64),
@@ -122,61 +123,27 @@ class Outputs(_Sized):
     )
 
 
-class OutputGrads(_Sized):
+class OutputGrads(Sized):
     """fragprune_output_grads."""
 
     _fields_ = (
         ("size", ctypes.c_uint32),
         ("fragments_per_pixel", ctypes.c_float),
-        *_pointers("image invdepth alpha features surface"),
+        *pointers("image invdepth alpha features surface"),
     )
 
 
-class InputGrads(_Sized):
+class InputGrads(Sized):
     """fragprune_input_grads."""
 
     _fields_ = (
         ("size", ctypes.c_uint32),
-        *_pointers("means hook opacities scales rotations cov3d sh colors features thresholds"),
-        *_pointers("means2d conics depths background"),
+        *pointers("means hook opacities scales rotations cov3d sh colors features thresholds"),
+        *pointers("means2d conics depths background"),
     )
 
 
-class Spacetime(_Sized):
-    """fragprune_spacetime."""
-
-    _fields_ = (
-        ("size", ctypes.c_uint32),
-        ("threads", ctypes.c_int32),
-        ("timestamp", ctypes.c_float),
-        ("duration", ctypes.c_float),
-        ("prefilter_var", ctypes.c_float),
-        ("scale_modifier", ctypes.c_float),
-        ("sh_degree", ctypes.c_int32),
-        ("sh_degree_t", ctypes.c_int32),
-        ("sh_coefficients", ctypes.c_int32),
-        ("count", ctypes.c_int64),
-        ("lengths", Lengths),
-        *_pointers("campos means opacities times scales scales_t rotations rotations_r cov3d sh"),
-    )
-
-
-class Sliced(_Sized):
-    """fragprune_sliced."""
-
-    _fields_ = (("size", ctypes.c_uint32), *_pointers("means cov3d opacities colors present"))
-
-
-class SpacetimeGrads(_Sized):
-    """fragprune_spacetime_grads."""
-
-    _fields_ = (
-        ("size", ctypes.c_uint32),
-        *_pointers("means opacities times scales scales_t rotations rotations_r cov3d sh"),
-    )
-
-
-class Photometric(_Sized):
+class Photometric(Sized):
     """fragprune_photometric."""
 
     _fields_ = (
@@ -187,7 +154,7 @@ class Photometric(_Sized):
         ("width", ctypes.c_int32),
         ("l1_weight", ctypes.c_float),
         ("ssim_weight", ctypes.c_float),
-        *_pointers("image target gradient workspace"),
+        *pointers("image target gradient workspace"),
         ("l1", ctypes.c_double),
         ("dissimilarity", ctypes.c_double),
     )
@@ -247,17 +214,6 @@ def open_build(build: str) -> Library:
         ctypes.POINTER(OutputGrads),
         ctypes.POINTER(InputGrads),
         ctypes.c_int32,
-        ctypes.POINTER(Error),
-    ]
-    calls.fragprune_slice.argtypes = [
-        ctypes.POINTER(Spacetime),
-        ctypes.POINTER(Sliced),
-        ctypes.POINTER(Error),
-    ]
-    calls.fragprune_unslice.argtypes = [
-        ctypes.POINTER(Spacetime),
-        ctypes.POINTER(Sliced),
-        ctypes.POINTER(SpacetimeGrads),
         ctypes.POINTER(Error),
     ]
     calls.fragprune_photometric_loss.argtypes = [

@@ -14,13 +14,12 @@ from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu.calling import empty, expect_ok
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs, native_threads
-from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.types import RasterOutputs, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import Moment, RasterInputs, Sliced, SpacetimeSplats
+    from fragprune_plugins.types import RasterInputs
 
 # The differentiable inputs, in the order in which the autograd function takes them.
 _NAMES = (
@@ -184,43 +183,22 @@ class _Rasterize(torch.autograd.Function):
         return tuple(given)
 
 
-@dataclass(frozen=True)
-class _Blade:
-    """Cuts Gaussians with the compiled library; see ``engines.slicing``."""
-
-    library: binding.Library
-    workspace: binding.Workspace
-    where = torch.device("cpu")
-
-    def empty(self, *shape: int) -> Tensor:
-        return empty(self.workspace, *shape)
-
-    def slice(self, given: binding.Spacetime, to: binding.Sliced) -> None:
-        self._call("fragprune_slice", given, to)
-
-    def unslice(
-        self, given: binding.Spacetime, by: binding.Sliced, to: binding.SpacetimeGrads
-    ) -> None:
-        self._call("fragprune_unslice", given, by, to)
-
-    def _call(self, function: str, *structs: ctypes.Structure) -> None:
-        error = binding.Error()
-        status = getattr(self.library.calls, function)(*map(ctypes.byref, (*structs, error)))
-        expect_ok(status, error)
-
-
 class CpuEngine:
     """Rasterizes with the compiled library; results are the same, to the bit, for any threads.
 
     Args:
         library: the build to use; None for the best one on this machine.
+
+    Attributes:
+        library: the build in use.
+        workspace: its reusable memory.
     """
 
     name = "cpu"
 
     def __init__(self, library: binding.Library | None = None) -> None:
-        self._library = binding.library() if library is None else library
-        self._workspace = binding.Workspace(self._library)
+        self.library = binding.library() if library is None else library
+        self.workspace = binding.Workspace(self.library)
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
@@ -233,7 +211,7 @@ class CpuEngine:
         }
         tensors = {name: others.get(name, getattr(splats, name, None)) for name in _NAMES}
         arrays = native_arrays(inputs, thresholds)
-        drawing = _Drawing(inputs, self._library, self._workspace, arrays)
+        drawing = _Drawing(inputs, self.library, self.workspace, arrays)
         outputs = _Rasterize.apply(  # type: ignore[no-untyped-call]
             drawing, *(tensors[name] for name in _NAMES)
         )
@@ -252,10 +230,6 @@ class CpuEngine:
             surface=surface.to(device) if len(surface) else None,
             **{name: tensor.to(device) for name, tensor in drawing.found.items()},
         )
-
-    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
-        """Cut Gaussians in space and time at a moment."""
-        return slice_by(_Blade(self._library, self._workspace), splats, moment)
 
 
 def _channels(features: Tensor | None) -> int:

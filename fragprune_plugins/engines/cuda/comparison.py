@@ -1,6 +1,6 @@
 """Compares the cuda engine with engines that need no GPU, on frames of many thread blocks.
 
-Large frames are compared with the cpu engine's, small frames and slices with the oracle's, and
+Large frames are compared with the cpu engine's, small frames with the oracle's, and
 sorted keys with torch's. Repeated frames must be the same and must not accumulate memory.
 
 As a program it is the process that ``self_check`` starts.
@@ -32,7 +32,7 @@ from fragprune_plugins.engines.cuda.frame import (
 from fragprune_plugins.engines.cuda.self_check import BEGUN, COULD_NOT_RUN, FAILS
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import KernelError
-from fragprune_plugins.types import Moment, RasterInputs, SpacetimeSplats, Splats, View
+from fragprune_plugins.types import RasterInputs, Splats, View
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -75,7 +75,6 @@ def compare(gpu: Device, where: torch.device, workload: Workload | None = None) 
     return [
         *_sorting(gpu, where, workload.keys),
         *_small_frame(gpu, where),
-        *_slices(gpu, where),
         *_large_frame(gpu, where, workload),
         *_wide_frame(gpu, where, workload),
     ]
@@ -118,14 +117,6 @@ def _small_frame(gpu: Device, where: torch.device) -> Iterator[str]:
     expected = drawn_and_learned(ReferenceEngine(), wide, thresholds)
     found = drawn_and_learned(CudaEngine(gpu), on(inputs, where), thresholds)
     yield from differences("small frame", found, expected)
-
-
-def _slices(gpu: Device, where: torch.device) -> Iterator[str]:
-    found = _sliced(CudaEngine(gpu), where, torch.float32)
-    for name, right in _sliced(ReferenceEngine(), torch.device("cpu"), torch.float64).items():
-        away, largest = (found[name] - right).abs().max(), right.abs().max()
-        if not away <= 1e-3 * largest:
-            yield f"slice, {name}: off by {away:.2g}, the largest is {largest:.2g}"
 
 
 def _large_frame(gpu: Device, where: torch.device, workload: Workload) -> Iterator[str]:
@@ -285,25 +276,6 @@ def drawn_and_learned(
 
 
 _LEARNED = ("means", "opacities", "scales", "rotations", "sh")
-
-
-def _sliced(engine: Any, where: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Gaussians in space and time, cut at a moment, and their gradients; float64 on the CPU."""
-    count = 3000
-    splats = scene(count, (70, 50), 3.0)[0].splats
-    given = {name: getattr(splats, name) for name in _LEARNED}
-    given["times"] = torch.linspace(0, 1, count)
-    given["scales_t"] = torch.full((count,), 0.3)
-    given["rotations_r"] = given["rotations"].roll(1, dims=0)
-    leaves: dict[str, Any] = {
-        k: t.to(where, dtype, copy=True).requires_grad_() for k, t in given.items()
-    }
-    moment = Moment(timestamp=0.4, campos=torch.zeros(3, dtype=dtype, device=where))
-    cut = engine.slice(SpacetimeSplats(**leaves, sh_degree=3), moment)
-    named = {name: getattr(cut, name) for name in ("means", "cov3d", "opacities", "colors")}
-    torch.autograd.backward([each.sum() for each in named.values()])
-    named |= {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
-    return {name: each.detach().cpu().double() for name, each in named.items()}
 
 
 def main(device: str) -> int:

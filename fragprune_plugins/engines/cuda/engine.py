@@ -11,25 +11,17 @@ from fragprune_plugins.engines.cuda.frame import (
     Device,
     Drawing,
     Drawn,
-    KernelBlade,
     Wanted,
     learnable,
     refuse,
 )
-from fragprune_plugins.engines.slicing import slice_by
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterOutputs, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.types import (
-        Footprints,
-        Moment,
-        RasterInputs,
-        Sliced,
-        SpacetimeSplats,
-    )
+    from fragprune_plugins.types import RasterInputs
 
 _FIRST_CAPACITY = 1 << 20
 """Entries of the tiles' lists that there is room for before any frame has told."""
@@ -96,7 +88,7 @@ class CudaEngine:
             from fragprune_plugins.engines.cuda.driver import Driver
 
             device = Driver()
-        self._device = device
+        self.device = device
         self._deterministic, self._packed = deterministic, packed
         self._capacity = _FIRST_CAPACITY
         self._shortages: dict[torch.device, Tensor] = {}
@@ -124,8 +116,8 @@ class CudaEngine:
                 "a hard rim: there are no kernels for another",
                 "Run on the CPU (--device cpu), or draw it hard: replace(inputs, rim='hard').",
             )
-        self._on_device(inputs.splats)
-        drawing = Drawing(self._device, inputs, thresholds)
+        self.expect_on_device(inputs.splats.device)
+        drawing = Drawing(self.device, inputs, thresholds)
         tensors = {
             **learnable(inputs),
             **({} if thresholds is None else {"thresholds": thresholds}),
@@ -140,24 +132,15 @@ class CudaEngine:
             **Drawn(*drawn)._asdict(),
         )
 
-    def slice(self, splats: SpacetimeSplats, moment: Moment) -> Sliced:
-        """Cut Gaussians in space and time at a moment.
-
-        Raises:
-            InputError: the Gaussians are not on a GPU.
-        """
-        return slice_by(KernelBlade(self._device, self._on_device(splats)), splats, moment)
-
-    def _on_device(self, splats: Splats | Footprints | SpacetimeSplats) -> torch.device:
-        where = splats.device
-        if where.type != self._device.kind:
+    def expect_on_device(self, where: torch.device) -> None:
+        """Raise InputError unless Gaussians there can be drawn."""
+        if where.type != self.device.kind:
             raise InputError(
                 "engine 'cuda'",
                 f"Gaussians on {where}",
-                f"tensors on a {self._device.kind} device",
+                f"tensors on a {self.device.kind} device",
                 "Move the Gaussians, or use the engine 'cpu'.",
             )
-        return where
 
     def draw(self, drawing: Drawing, wanted: Wanted) -> Drawn:
         """Run the forward pass; repeat it with more room if the lists did not fit.
@@ -170,7 +153,7 @@ class CudaEngine:
             deterministic = torch.are_deterministic_algorithms_enabled()
         how = {"deterministic": deterministic, "packed": self._packed}
         worst = self._shortages.get(drawing.where)
-        if self._device.capturing(drawing.where):
+        if self.device.capturing(drawing.where):
             if worst is None:
                 raise EngineError(
                     "engine 'cuda'",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from dataclasses import dataclass
+from collections.abc import Hashable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
@@ -95,20 +95,9 @@ class Undraw(ctypes.Structure):
     )
 
 
-class Slicing(ctypes.Structure):
-    """fp::Slicing: the argument of the kernels that cut Gaussians at a moment, both ways."""
-
-    _fields_ = (
-        ("given", binding.Spacetime),
-        ("sliced", binding.Sliced),
-        ("to", binding.SpacetimeGrads),
-    )
-
-
 MACROS: Final = {
     "FP_FRAME_SIZE": ctypes.sizeof(Frame),
     "FP_SORT_SIZE": ctypes.sizeof(Sort),
-    "FP_SLICING_SIZE": ctypes.sizeof(Slicing),
     "FP_UNDRAW_SIZE": ctypes.sizeof(Undraw),
 }
 """What every source is compiled with, to check that it knows the same structs."""
@@ -167,7 +156,6 @@ _TRAINED: Final = frozenset(("means", "hook", "opacities", "scales", "rotations"
 
 VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
     ("scene", {"FP_PACKED": 0}),
-    ("slice", {}),
     ("blend", blend_macros()),
     ("blend", blend_macros(counts=True)),
     ("blend", blend_macros(stop=True)),
@@ -180,7 +168,7 @@ VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
 """Sources with macros that training and fine-tuning usually ask for, to be built beforehand."""
 
 
-class Device(Protocol):
+class Device(Hashable, Protocol):
     """Runs kernels by name: a GPU, or an emulation in tests.
 
     Attributes:
@@ -233,7 +221,8 @@ class Arena:
         return self.memory[self._at[name] :][: count * dtype.itemsize].view(dtype)
 
 
-def _blocks(count: int, per_block: int = THREADS) -> int:
+def blocks_of(count: int, per_block: int = THREADS) -> int:
+    """How many blocks of threads serve so many."""
     return -(-count // per_block)
 
 
@@ -261,7 +250,7 @@ def launch_sort(
     passes: int,
 ) -> None:
     """Sort 8 bits in each pass, alternating between two pairs of arrays."""
-    blocks = _blocks(arguments.capacity, SORT_KEYS)
+    blocks = blocks_of(arguments.capacity, SORT_KEYS)
     for k in range(passes):
         arguments.keys, arguments.sorted_keys = keys[k % 2], keys[1 - k % 2]
         arguments.values, arguments.sorted_values = values[k % 2], values[1 - k % 2]
@@ -420,17 +409,17 @@ class Drawing:
         n, where = self._n, self.where
         tiles = self._across * self._down
         pixels = self._inputs.view.width * self._inputs.view.height
-        passes = max(1, _blocks((tiles - 1).bit_length(), 8))
+        passes = max(1, blocks_of((tiles - 1).bit_length(), 8))
         cleared = Arena(
             where,
             torch.zeros,
             counters=COUNTERS,
-            project_words=8 * _blocks(n),
-            emit_words=8 * _blocks(n),
+            project_words=8 * blocks_of(n),
+            emit_words=8 * blocks_of(n),
             depth_histogram=4 * PASSES * DIGITS,
             tile_histogram=4 * PASSES * DIGITS,
-            depth_sort=4 * PASSES * DIGITS * _blocks(n, SORT_KEYS),
-            tile_sort=4 * passes * DIGITS * _blocks(capacity, SORT_KEYS),
+            depth_sort=4 * PASSES * DIGITS * blocks_of(n, SORT_KEYS),
+            tile_sort=4 * passes * DIGITS * blocks_of(capacity, SORT_KEYS),
             ranges=8 * tiles,
         )
         scratch = Arena(
@@ -512,15 +501,15 @@ class Drawing:
             words=cleared["tile_sort"],
             ticket=counters + 4 * 8 + 4 * (2 + PASSES),
         )
-        self._launch("scene", scene, "fp_project", _blocks(n), frame)
+        self._launch("scene", scene, "fp_project", blocks_of(n), frame)
         ids = [scratch["depth_ids"], scratch["ids_2"]]
         depths = [scratch["depth_keys"], scratch["keys_2"]]
         launch_sort(self._device, self.where, scene, by_depth, depths, ids, PASSES)
-        self._launch("scene", scene, "fp_emit", _blocks(n), frame)
+        self._launch("scene", scene, "fp_emit", blocks_of(n), frame)
         if n:
             launch_sort(self._device, self.where, scene, by_tile, keys, values, passes)
             frame.entry_keys, frame.entry_values = keys[passes % 2], values[passes % 2]
-            self._launch("scene", scene, "fp_ranges", _blocks(capacity), frame)
+            self._launch("scene", scene, "fp_ranges", blocks_of(capacity), frame)
 
     def read(self) -> int:
         """Wait for the GPU, then return the number of entries.
@@ -623,33 +612,7 @@ class Drawing:
         )
         self._launch("unblend", macros, "fp_unblend", tiles, arguments)
         if per_gaussian:
-            self._launch("unblend", macros, "fp_chain", _blocks(n), arguments)
+            self._launch("unblend", macros, "fp_chain", blocks_of(n), arguments)
         if by_tile is not None:
             grads["background"] = by_tile.sum(0, dtype=torch.float64).float()
         return grads
-
-
-@dataclass(frozen=True)
-class KernelBlade:
-    """Cuts Gaussians in space and time on a device; see ``engines.slicing``."""
-
-    device: Device
-    where: torch.device
-
-    def empty(self, *shape: int) -> Tensor:
-        """An uninitialised float32 tensor of this shape on the device."""
-        return torch.empty(shape, device=self.where)
-
-    def slice(self, given: binding.Spacetime, to: binding.Sliced) -> None:
-        """Launch fp_slice."""
-        self._launch("fp_slice", Slicing(given=given, sliced=to))
-
-    def unslice(
-        self, given: binding.Spacetime, by: binding.Sliced, to: binding.SpacetimeGrads
-    ) -> None:
-        """Launch fp_unslice."""
-        self._launch("fp_unslice", Slicing(given=given, sliced=by, to=to))
-
-    def _launch(self, kernel: str, arguments: Slicing) -> None:
-        blocks = _blocks(arguments.given.count)
-        launch(self.device, self.where, "slice", {}, kernel, blocks, arguments)

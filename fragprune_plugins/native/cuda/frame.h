@@ -86,17 +86,9 @@ struct Sort {
   uint32_t *sorted_keys, *sorted_values;
 };
 
-// Gaussians in space and time cut at a moment, or gradients on their way back through the cut.
-struct Slicing {
-  fragprune_spacetime in;
-  fragprune_sliced sliced;       // filled in; or gradients by it
-  fragprune_spacetime_grads to;  // of the way back
-};
-
 #ifdef FP_FRAME_SIZE
 static_assert(sizeof(Frame) == FP_FRAME_SIZE, "engines/cuda.py has other fields in Frame");
 static_assert(sizeof(Sort) == FP_SORT_SIZE, "engines/cuda.py has other fields in Sort");
-static_assert(sizeof(Slicing) == FP_SLICING_SIZE, "engines/cuda.py has other fields in Slicing");
 #endif
 
 __device__ inline Given<float> load_given(const fragprune_inputs& in, size_t i) {

@@ -6,6 +6,17 @@
 
 namespace fp {
 
+// Gaussians in space and time cut at a moment, or gradients on their way back through the cut.
+struct Slicing {
+  fragprune_spacetime in;
+  fragprune_sliced sliced;       // filled in; or gradients by it
+  fragprune_spacetime_grads to;  // of the way back
+};
+
+#ifdef FP_SLICING_SIZE
+static_assert(sizeof(Slicing) == FP_SLICING_SIZE, "slicing/structs.py has other fields in Slicing");
+#endif
+
 __device__ inline void read4(const float* from, size_t i, float* to) {
   for (int k = 0; k < 4; k++) to[k] = from[4 * i + k];
 }

@@ -24,9 +24,11 @@ from fragprune_plugins.constants import (
     RIM_REACH,
     RIM_WIDTH,
 )
-from fragprune_plugins.engines import Engine, slice_at
+from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import InputError, RanksError
-from fragprune_plugins.types import Moment, RasterInputs, SpacetimeSplats, Splats, View
+from fragprune_plugins.slicing.cutting import slice_at
+from fragprune_plugins.slicing.splats import Moment, SpacetimeSplats
+from fragprune_plugins.types import RasterInputs, Splats, View
 
 if TYPE_CHECKING:
     from fragprune_plugins.types import RasterOutputs

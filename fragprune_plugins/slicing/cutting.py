@@ -1,0 +1,339 @@
+"""Cuts Gaussians in space and time at a moment, under autograd: ``slice_at``.
+
+Each Gaussian is cut by itself. So the cpu engine and the cuda engine share everything but the call
+itself, ``SliceKernels``. Between the two passes only the inputs are kept.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.arrays import address, plain
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cpu.calling import empty, expect_ok
+from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.engines.cuda.frame import Device, blocks_of, launch
+from fragprune_plugins.engines.inputs import native_lengths, native_threads
+from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.slicing import structs
+from fragprune_plugins.slicing.splats import Moment, Sliced, SpacetimeSplats
+from reference_renderer import SpacetimeGaussians, slice_gaussians
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fragprune_plugins.engines import Engine
+
+
+def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = "auto") -> Sliced:
+    """Cut Gaussians in space and time at a moment: 3D Gaussians remain. Differentiable.
+
+    Gradients are those of RT-4DGS, whose hand-written kernels differ from the true derivatives.
+    Without ``rotations_r`` the marginal has no gradient. Colours are evaluated with directions to
+    the stored means, but differentiated with directions to the moved means. If colours depend on
+    time, the second coefficient receives the first one's gradient, and the times receive only the
+    gradient of the highest cosine, with the opposite sign.
+
+    Args:
+        splats: the Gaussians.
+        moment: when and from where.
+        engine: a name for ``create_engine``, or an engine. If it is not ours, the fastest of our
+            engines on the device cuts.
+
+    Raises:
+        InputError: there are fewer SH coefficients than the moment's cosines need, or the Gaussians
+            are not where the engine reads them.
+        EngineError: there is no such engine here, or a GPU cuts wrongly.
+    """
+    check_harmonics(splats, moment)
+    if isinstance(engine, str):
+        engine = create_engine(engine, splats.device)
+    if not isinstance(engine, CpuEngine | CudaEngine | ReferenceEngine):
+        engine = create_engine("auto", splats.device)
+    if isinstance(engine, CpuEngine):
+        return slice_by(CpuKernels(engine.library, engine.workspace), splats, moment)
+    if isinstance(engine, CudaEngine):
+        engine.expect_on_device(splats.device)
+        expect_right(engine.device, splats.device)
+        return slice_by(CudaKernels(engine.device, splats.device), splats, moment)
+    return slice_by_oracle(splats, moment)
+
+
+def slice_by_oracle(splats: SpacetimeSplats, moment: Moment) -> Sliced:
+    """Cut with plain torch, in the precision of the tensors."""
+    return Sliced(**vars(slice_gaussians(SpacetimeGaussians(**vars(splats)), **vars(moment))))
+
+
+def check_harmonics(splats: SpacetimeSplats, moment: Moment) -> None:
+    """Raise InputError if coefficients or times for the cosines in use are missing."""
+    orders = moment.sh_degree_t if splats.sh is not None and splats.sh_degree == 3 else 0
+    if not orders:
+        return
+    assert splats.sh is not None
+    if splats.sh.shape[1] < 16 * (1 + orders) or splats.times is None:
+        raise InputError(
+            "SpacetimeSplats.sh",
+            f"{splats.sh.shape[1]} coefficients, times {'' if splats.times is not None else 'not '}"
+            "given",
+            f"times, and at least {16 * (1 + orders)} for {orders} cosines",
+            "Use fewer cosines or pass all coefficients.",
+        )
+
+
+# ---- compiled code -----------------------------------------------------------------------------
+
+
+class SliceKernels(Protocol):
+    """The compiled functions that cut Gaussians, and the device they run on."""
+
+    @property
+    def where(self) -> torch.device:
+        """The device on which the tensors must be."""
+
+    def empty(self, *shape: int) -> Tensor:
+        """An uninitialised float32 tensor of this shape on the device."""
+
+    def slice(self, given: structs.Spacetime, to: structs.Sliced) -> None:
+        """Call fragprune_slice."""
+
+    def unslice(
+        self, given: structs.Spacetime, by: structs.Sliced, to: structs.SpacetimeGrads
+    ) -> None:
+        """Call fragprune_unslice."""
+
+
+@dataclass(frozen=True)
+class CpuKernels:
+    """Those of the compiled library."""
+
+    library: binding.Library
+    workspace: binding.Workspace
+    where = torch.device("cpu")
+
+    def empty(self, *shape: int) -> Tensor:
+        """An uninitialised float32 tensor of this shape."""
+        return empty(self.workspace, *shape)
+
+    def slice(self, given: structs.Spacetime, to: structs.Sliced) -> None:
+        """Call fragprune_slice."""
+        self._call("fragprune_slice", given, to)
+
+    def unslice(
+        self, given: structs.Spacetime, by: structs.Sliced, to: structs.SpacetimeGrads
+    ) -> None:
+        """Call fragprune_unslice."""
+        self._call("fragprune_unslice", given, by, to)
+
+    def _call(self, function: str, *structs: ctypes.Structure) -> None:
+        error = binding.Error()
+        status = getattr(self.library.calls, function)(*map(ctypes.byref, (*structs, error)))
+        expect_ok(status, error)
+
+
+@dataclass(frozen=True)
+class CudaKernels:
+    """Those of native/cuda/slice.cu."""
+
+    device: Device
+    where: torch.device
+
+    def empty(self, *shape: int) -> Tensor:
+        """An uninitialised float32 tensor of this shape on the device."""
+        return torch.empty(shape, device=self.where)
+
+    def slice(self, given: structs.Spacetime, to: structs.Sliced) -> None:
+        """Launch fp_slice."""
+        self._launch("fp_slice", structs.Slicing(given=given, sliced=to))
+
+    def unslice(
+        self, given: structs.Spacetime, by: structs.Sliced, to: structs.SpacetimeGrads
+    ) -> None:
+        """Launch fp_unslice."""
+        self._launch("fp_unslice", structs.Slicing(given=given, sliced=by, to=to))
+
+    def _launch(self, kernel: str, arguments: structs.Slicing) -> None:
+        blocks = blocks_of(arguments.given.count)
+        launch(self.device, self.where, "slice", structs.MACROS, kernel, blocks, arguments)
+
+
+@cache
+def expect_right(device: Device, where: torch.device) -> None:
+    """Cut a few Gaussians on a GPU, once for each, and compare with the oracle.
+
+    Raises:
+        EngineError: values or gradients differ.
+    """
+    found = _some(lambda *given: slice_by(CudaKernels(device, where), *given), where, torch.float32)
+    for name, right in _some(slice_by_oracle, torch.device("cpu"), torch.float64).items():
+        away, largest = (found[name] - right).abs().max(), right.abs().max()
+        if not away <= 1e-3 * largest:
+            raise EngineError(
+                f"engine 'cuda' on {where}",
+                f"a cut in time whose {name} are off by {away:.2g}",
+                f"at most {1e-3 * largest:.2g}, a thousandth of the largest",
+                "Run on the CPU (--device cpu), and report this with the GPU's name.",
+            )
+
+
+def _some(cut: Any, where: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+    """What a function cuts of 3,000 Gaussians, and their gradients; float64 on the CPU."""
+    count, generator = 3000, torch.Generator().manual_seed(3000)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(count, *shape, generator=generator)
+
+    given = {
+        "means": normal(3) + torch.tensor([0.0, 0.0, 4.0]),
+        "opacities": normal().sigmoid(),
+        "times": torch.linspace(0, 1, count),
+        "scales": 0.3 * normal(3).exp(),
+        "scales_t": torch.full((count,), 0.3),
+        "rotations": torch.nn.functional.normalize(normal(4)),
+        "rotations_r": torch.nn.functional.normalize(normal(4)),
+        "sh": 0.2 * normal(16, 3),
+    }
+    leaves: dict[str, Any] = {
+        name: each.to(where, dtype, copy=True).requires_grad_() for name, each in given.items()
+    }
+    moment = Moment(timestamp=0.4, campos=torch.zeros(3, dtype=dtype, device=where))
+    result = cut(SpacetimeSplats(**leaves, sh_degree=3), moment)
+    named = {name: getattr(result, name) for name in ("means", "cov3d", "opacities", "colors")}
+    torch.autograd.backward([each.sum() for each in named.values()])
+    named |= {f"gradients by {name}": leaf.grad for name, leaf in leaves.items()}
+    return {name: each.detach().cpu().double() for name, each in named.items()}
+
+
+# ---- autograd ----------------------------------------------------------------------------------
+
+# The differentiable inputs, in the order in which the autograd function takes them.
+_NAMES = (
+    "means",
+    "opacities",
+    "times",
+    "scales",
+    "scales_t",
+    "rotations",
+    "rotations_r",
+    "cov3d",
+    "sh",
+)
+
+
+_SHAPE = frozenset(("scales", "scales_t", "rotations", "rotations_r"))
+
+# The inputs that affect each output. If none of them needs a gradient, an engine skips the output's
+# part of the backward pass; in fine-tuning that is most of it.
+_FELT_BY = {
+    "means": _SHAPE | {"means", "times"},
+    "cov3d": _SHAPE | {"cov3d"},
+    "opacities": _SHAPE | {"opacities", "times"},
+    "colors": _SHAPE | {"sh", "means", "times"},
+}
+
+
+@dataclass
+class _Cut:
+    """The inputs of one cut that are not differentiable.
+
+    Attributes:
+        kernels: the engine's compiled functions.
+        splats: the engine's input.
+        moment: the engine's input.
+        arrays: the tensors that compiled code reads.
+    """
+
+    kernels: SliceKernels
+    splats: SpacetimeSplats
+    moment: Moment
+    arrays: dict[str, Tensor]
+
+    def given(self) -> structs.Spacetime:
+        """The C struct of the inputs; it points into ``arrays``."""
+        moment, sh = self.moment, self.splats.sh
+        return structs.Spacetime(
+            threads=native_threads(),
+            timestamp=moment.timestamp,
+            duration=moment.duration,
+            prefilter_var=moment.prefilter_var,
+            scale_modifier=moment.scale_modifier,
+            sh_degree=self.splats.sh_degree,
+            sh_degree_t=-1 if moment.sh_degree_t is None else moment.sh_degree_t,
+            sh_coefficients=0 if sh is None else sh.shape[1],
+            count=len(self.splats),
+            lengths=native_lengths(self.arrays),
+            **{name: address(array) for name, array in self.arrays.items()},
+        )
+
+
+class _Slice(torch.autograd.Function):
+    """The autograd function of a cut."""
+
+    @staticmethod
+    def forward(ctx: Any, cut: _Cut, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
+        n, kernels = len(cut.splats), cut.kernels
+        outputs = {
+            "means": kernels.empty(n, 3),
+            "cov3d": kernels.empty(n, 6),
+            "opacities": kernels.empty(n),
+            "colors": kernels.empty(n, 3) if "sh" in cut.arrays else None,
+        }
+        present = torch.empty(n, dtype=torch.bool, device=kernels.where)
+        addresses = {name: address(output) for name, output in outputs.items()}
+        kernels.slice(cut.given(), structs.Sliced(present=address(present), **addresses))
+        wanted = {n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs}
+        idle = [o for name, o in outputs.items() if o is not None and not wanted & _FELT_BY[name]]
+        ctx.mark_non_differentiable(present, *idle)
+        ctx.set_materialize_grads(False)
+        ctx.cut, ctx.present = cut, present
+        # Saved for the sake of autograd's check against changes in place: the cut reads these.
+        ctx.save_for_backward(*tensors)
+        return *outputs.values(), present
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        cut, tensors = ctx.cut, ctx.saved_tensors
+        by = [None if g is None else plain(g, cut.kernels.where) for g in upstream[:4]]
+        wanted = [n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs]
+        grads = {name: cut.kernels.empty(*cut.arrays[name].shape) for name in wanted}
+        cut.kernels.unslice(
+            cut.given(),
+            structs.Sliced(
+                present=address(ctx.present),
+                **{name: address(g) for name, g in zip(_FELT_BY, by, strict=True)},
+            ),
+            structs.SpacetimeGrads(**{name: address(grad) for name, grad in grads.items()}),
+        )
+        given: list[Tensor | None] = [None]
+        for name, tensor in zip(_NAMES, tensors, strict=True):
+            grad = grads.get(name)
+            given.append(None if grad is None else grad.to(tensor.device, tensor.dtype))
+        return tuple(given)
+
+
+def slice_by(kernels: SliceKernels, splats: SpacetimeSplats, moment: Moment) -> Sliced:
+    """Cut the Gaussians at the moment; differentiable in every tensor of the splats."""
+    tensors = {name: getattr(splats, name) for name in _NAMES}
+    read = {**tensors, "campos": moment.campos}
+    arrays = {name: plain(t, kernels.where) for name, t in read.items() if t is not None}
+    cut = _Cut(kernels, splats, moment, arrays)
+    means, cov3d, opacities, colors, present = _Slice.apply(  # type: ignore[no-untyped-call]
+        cut, *tensors.values()
+    )
+    device = splats.device
+    return Sliced(
+        means=means.to(device),
+        cov3d=cov3d.to(device),
+        opacities=opacities.to(device),
+        present=present.to(device),
+        colors=None if colors is None else colors.to(device),
+    )
