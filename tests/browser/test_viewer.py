@@ -14,8 +14,16 @@ from finetune import tiny
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
-from fragprune_plugins.workbench.view.site import Layer, Shown, make_site, save_site, single_page
+from fragprune_plugins.workbench.view.site import (
+    Layer,
+    Shown,
+    compacted,
+    make_site,
+    save_site,
+    single_page,
+)
 from reference_renderer import Camera, Gaussians, Options
 from reference_renderer.project import project
 
@@ -264,15 +272,39 @@ def test_slow_frames_stay_small_while_the_camera_turns(browser, tmp_path):
         assert tab.errors == []
 
 
-def test_one_page_from_disk(browser, tmp_path):
-    model, view = a_model(), a_view()
-    layers = [Layer("it", 0, False)]
-    (tmp_path / "page.html").write_bytes(single_page(make_site("one", [model], layers, (), view)))
+def test_one_page_from_disk_is_small_and_shows_the_same(browser, tmp_path):
+    """Of a .spz file: there nothing is rounded once more."""
+    file, view = tmp_path / "model.spz", a_view()
+    formats.write(formats.named(file), file, a_model(3, count=3000))
+    model, layers = formats.read(file), [Layer("whole", 0, False), Layer("cut", 0, True)]
+    site = make_site("one", [model], layers, (), view)
+    small, rounded = compacted(site)
+    assert rounded == []
+    page, shown = single_page(small), {}
+    assert len(small["model-0.splats"]) < 1.3 * file.stat().st_size
+    (tmp_path / "page.html").write_bytes(page)
+    save_site(tmp_path / "raw", site)
+    with served(tmp_path / "raw") as raw:
+        for address in (raw, (tmp_path / "page.html").as_uri()):
+            with opened(browser, address) as tab:
+                tab.page.wait_for_function("() => window.viewer && viewer.counted")
+                hold(tab, view)
+                shown[address] = [frame(tab, view, layer).image for layer in (0, 1)]
+                assert tab.errors == tab.strangers == []
+    for one, other in zip(*shown.values(), strict=True):
+        assert np.abs(one - other).max() < 1.01 / 255
+    assert decibels(shown[raw][1], engine_frame(model, view)) > 56
+
+
+def test_a_damaged_page_says_so(browser, tmp_path):
+    site = make_site("one", [a_model()], [Layer("it", 0, False)], (), a_view())
+    small, _ = compacted(site)
+    held = bytearray(small["model-0.splats"])
+    held[len(held) // 2] ^= 0x55
+    (tmp_path / "page.html").write_bytes(single_page({**small, "model-0.splats": bytes(held)}))
     with opened(browser, (tmp_path / "page.html").as_uri()) as tab:
-        tab.page.wait_for_function("() => window.viewer && viewer.counted")
-        hold(tab, view)
-        assert decibels(frame(tab, view).image, engine_frame(model, view, truncated=False)) > 56
-        assert tab.errors == tab.strangers == []
+        tab.page.wait_for_function("() => document.querySelector('#loading progress').hidden")
+        assert "damaged" in tab.page.locator("#loading span").inner_text()
 
 
 INTRUDE = """async () => {
@@ -297,7 +329,7 @@ INTRUDE = """async () => {
 def test_what_somebody_put_into_the_page_neither_runs_nor_asks_anybody(browser, tmp_path, single):
     model, view = a_model(), a_view()
     site = make_site("one", [model], [Layer("it", 0, False)], (), view)
-    save_site(tmp_path, {"index.html": single_page(site)} if single else site)
+    save_site(tmp_path, {"index.html": single_page(compacted(site)[0])} if single else site)
     with served(tmp_path) as address, opened(browser, address) as tab:
         tab.page.wait_for_function("() => window.viewer && viewer.counted")
         assert tab.errors == []

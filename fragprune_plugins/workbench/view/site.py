@@ -21,6 +21,7 @@ from fragprune_plugins.workbench.figures.page import allowed
 from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.scenes.generated import bounds
+from fragprune_plugins.workbench.view.compact import compact
 from fragprune_plugins.workbench.view.packing import pack
 
 Site = dict[str, bytes]
@@ -29,9 +30,19 @@ Site = dict[str, bytes]
 STATIC = Path(__file__).parent / "static"
 
 SINGLE_MAX = 64 << 20
-"""Most bytes that one page holds: about 500,000 Gaussians of degree 3, a page of 85 MiB."""
+"""Most bytes of models and photographs that one page holds: a page of 80 MiB."""
 
-_MODULES = ("shaders.js", "sorting.js", "splats.js", "camera.js", "drawing.js", "main.js")
+_SAFE = bytes.maketrans(b"<&", b",.")  # of base 85, so that no text ends or hides an element
+
+_MODULES = (
+    "shaders.js",
+    "compact.js",
+    "sorting.js",
+    "splats.js",
+    "camera.js",
+    "drawing.js",
+    "main.js",
+)
 _PHOTOGRAPH_SIDE = 960
 
 
@@ -144,8 +155,27 @@ def save_site(folder: Path, site: Site) -> None:
             temporary.write_bytes(content)
 
 
+def compacted(site: Site) -> tuple[Site, list[str]]:
+    """The same viewer with models that take few bytes, and what was rounded for that.
+
+    Raises:
+        OutputError: a model has a Gaussian too far from all others.
+    """
+    scene, small = json.loads(site["scene.json"]), dict(site)
+    rounded: dict[str, None] = {}
+    for facts in scene["models"]:
+        small[facts["file"]], more, names = compact(site[facts["file"]], facts)
+        facts |= more
+        rounded |= dict.fromkeys(names)
+    small["scene.json"] = json.dumps(scene, allow_nan=False).encode()
+    return small, list(rounded)
+
+
 def single_page(site: Site) -> bytes:
     """A viewer as one HTML file, which a browser opens from disk.
+
+    Args:
+        site: the viewer, better ``compacted``.
 
     Raises:
         OutputError: it is larger than ``SINGLE_MAX``.
@@ -165,7 +195,7 @@ def single_page(site: Site) -> bytes:
         for name in _MODULES
     )
     held = "".join(
-        f'<script type="text/plain" data-name="{name}">{base64.b64encode(each).decode()}</script>\n'
+        f'<script type="text/plain" data-name="{name}">{_text(name, each)}</script>\n'
         for name, each in data.items()
     )
     style = site["style.css"].decode()
@@ -191,3 +221,10 @@ def _jpeg(photograph: Shot) -> bytes:
     held = io.BytesIO()
     image.save(held, format="JPEG", quality=88)
     return held.getvalue()
+
+
+def _text(name: str, data: bytes) -> str:
+    """Bytes as text of a page: photographs as browsers read them, the rest in less."""
+    if name.endswith(".jpg"):
+        return base64.b64encode(data).decode()
+    return base64.b85encode(data).translate(_SAFE).decode()

@@ -23,6 +23,7 @@ from fragprune_plugins.workbench.view.site import (
     Layer,
     Shown,
     Site,
+    compacted,
     make_site,
     save_site,
     single_page,
@@ -68,16 +69,20 @@ def view(
         "bytes": sum(map(len, site.values())),
         "address": None,
         "files": [],
+        "rounded": [],
     }
     if out is None:
         facts["address"] = _serve(site, port, browse=not no_browser)
         return Report(facts, "The viewer is closed.")
     if single:
+        site, rounded = compacted(site)
         page = single_page(site)
         with replacing(out) as temporary:
             temporary.write_bytes(page)
-        facts |= {"bytes": len(page), "files": [str(out)]}
+        facts |= {"bytes": len(page), "files": [str(out)], "rounded": rounded}
         wrote = f"Wrote {out} ({_mebibytes(len(page))}): open it in a browser."
+        if rounded:
+            wrote += f" As a .spz file would, it rounds {', '.join(rounded)}."
         return Report(facts, wrote)
     save_site(out, site)
     facts["files"] = [str(out / name) for name in sorted(site)]

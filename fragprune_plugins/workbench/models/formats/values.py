@@ -133,12 +133,18 @@ def byte(values: npt.NDArray[Any]) -> Bytes:
 
 def morton_order(splat: Model) -> Tensor:
     """(N,) rows along a Z-order curve: near ones in space are near in the file."""
-    xyz = array(splat.xyz).astype(np.float64)
-    low, high = xyz.min(axis=0), xyz.max(axis=0)
-    cells = (1023 * (xyz - low) / np.maximum(high - low, 1e-30)).astype(np.uint32)
+    return torch.from_numpy(z_order(array(splat.xyz)))
+
+
+def z_order(xyz: Floats) -> npt.NDArray[np.int64]:
+    """(N,) rows of (N, 3) points along a Z-order curve."""
+    points = xyz.astype(np.float64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    cells = (1023 * (points - low) / np.maximum(high - low, 1e-30)).astype(np.uint32)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         cells = (cells | (cells << shift)) & mask
-    return torch.from_numpy(np.argsort(cells @ np.array([1, 2, 4], np.uint32), kind="stable"))
+    order: npt.NDArray[np.int64] = np.argsort(cells @ np.array([1, 2, 4], np.uint32), kind="stable")
+    return order
 
 
 def turned(splat: Model, signs: tuple[int, int, int]) -> Model:

@@ -1,6 +1,7 @@
 // The page: what is shown, and what hands and keys do.
 
 import { add, axis, dot, fitted, listen, moved, rotated } from "./camera.js";
+import { bytesOf, expanded } from "./compact.js";
 import { Drawing } from "./drawing.js";
 import { Splats } from "./splats.js";
 
@@ -16,11 +17,9 @@ const REST = 220; // milliseconds without a movement
 async function asset(name, progress = () => {}) {
     const within = document.querySelector(`script[data-name="${name}"]`);
     if (within) {
-        const text = atob(within.textContent.trim());
-        const bytes = new Uint8Array(text.length);
-        for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+        const bytes = bytesOf(within.textContent);
         within.remove();
-        return bytes.buffer;
+        return bytes;
     }
     const answer = await fetch(name);
     if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
@@ -510,7 +509,8 @@ async function start() {
     const loaded = new Map();
     wire(viewer);
     for (const [number, facts] of scene.models.entries()) {
-        const buffer = await asset(facts.file, part => { bar.value = part; });
+        const held = await asset(facts.file, part => { bar.value = part; });
+        const buffer = facts.bits === undefined ? held : await expanded(held, facts);
         loaded.set(number, new Splats(viewer.drawing.gl, facts, buffer));
         const layers = scene.layers.filter(({ model }) => model === number);
         viewer.addLayers(layers.map(({ truncated, name }) => ({ splats: loaded.get(number), truncated, name })));

@@ -1,0 +1,155 @@
+"""A page's own model is what a .spz file makes of it, in few bytes."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from finetune import tiny
+
+from fragprune_plugins.errors import OutputError
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.models import formats
+from fragprune_plugins.workbench.models.formats.values import morton_order
+from fragprune_plugins.workbench.view.compact import compact
+from fragprune_plugins.workbench.view.packing import pack
+
+
+def a_model(degree: int = 1, count: int = 400) -> Model:
+    splat = tiny.random_model(count, degree, 5)
+    thresholds = torch.linspace(0.002, 0.9, count)
+    return replace(splat, thresholds=ThresholdStore.from_falloff(thresholds))
+
+
+def of_spz(folder, model: Model) -> Model:
+    """What a .spz file keeps of a model."""
+    path = folder / "model.spz"
+    formats.write(formats.named(path), path, model)
+    return formats.read(path)
+
+
+def expand(data: bytes, facts: dict) -> tuple[np.ndarray, np.ndarray]:
+    """Geometry (N, 16) and harmonics (N, K) as 16-bit words, row by row from the description."""
+    stream, count, rows = memoryview(zlib.decompress(data)), facts["gaussians"], facts["rows"]
+
+    def planes(number, length=count):
+        nonlocal stream
+        held, stream = stream[: number * length], stream[number * length :]
+        return np.frombuffer(held, np.uint8).reshape(number, length).astype(np.int64)
+
+    def words(columns, length=count):
+        book = np.frombuffer(planes(1, 512).astype(np.uint8).tobytes(), "<u2")
+        return book[planes(columns, length)].T
+
+    def numbers():
+        return np.array([1, 1 << 8, 1 << 16, 1 << 24]) @ planes(4)
+
+    steps = [[n // 2 if n % 2 == 0 else -(n // 2) - 1 for n in numbers()] for _ in range(3)]
+    means = (np.cumsum(steps, axis=1) / 2 ** facts["bits"]).T.astype("<f4")
+    turns = np.empty((count, 4))
+    for row, (*lower, upper) in enumerate(planes(4).T):
+        three = [
+            (-1 if upper >> 2 * k & 1 else 1)
+            * (low + 256 * (upper >> 2 * k + 1 & 1))
+            / 511
+            / 2**0.5
+            for k, low in enumerate(lower)
+        ]
+        turns[row] = np.insert(three, upper >> 6, max(0, 1 - np.square(three).sum()) ** 0.5)
+    opacities, cutoffs, scales, colours = (words(columns) for columns in (1, 1, 3, 3))
+    rest = 3 * (facts["degree"] + 1) ** 2 - 3
+    book = np.frombuffer(planes(1, 512).astype(np.uint8).tobytes(), "<u2")
+    which = numbers() if rows < count else np.arange(count)
+    harmonics = book[planes(rest, rows)].T.reshape(rows, rest)[which]
+    assert not len(stream)
+    turned = np.rint(turns * 32767).astype("<i2").view("<u2")
+    geometry = [
+        np.ascontiguousarray(means).view("<u2"),
+        opacities,
+        cutoffs,
+        turned,
+        scales,
+        0 * opacities,
+    ]
+    return np.hstack(geometry), np.hstack([colours, harmonics])
+
+
+def tables(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """The same of what ``pack`` gives, in the order of ``compact``."""
+    (data, facts), order = pack(model), morton_order(model)
+    count = len(model)
+    geometry = np.frombuffer(data, "<u2", count * 16).reshape(count, 16)
+    harmonics = np.frombuffer(data, "<u2", offset=count * 32).reshape(count, -1)
+    return geometry[order], harmonics[order, : 3 * (facts["degree"] + 1) ** 2]
+
+
+TURNS = slice(8, 12)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_a_model_of_an_spz_file_stays_what_it_is(degree, tmp_path):
+    model = of_spz(tmp_path, a_model(degree))
+    data, facts = pack(model)
+    small, more, rounded = compact(data, facts)
+    assert rounded == []
+    geometry, harmonics = expand(small, facts | more)
+    expected, coefficients = tables(model)
+    np.testing.assert_array_equal(harmonics, coefficients)
+    turns, expected_turns = (
+        each[:, TURNS].copy().view("<i2").astype(int) for each in (geometry, expected)
+    )
+    signs = np.sign((turns * expected_turns).sum(axis=1, keepdims=True))
+    assert np.abs(turns - signs * expected_turns).max() <= 1
+    others = np.delete(np.arange(16), np.arange(8, 12))
+    np.testing.assert_allclose(geometry[:, others], expected[:, others], rtol=0, atol=1)
+
+
+def test_another_model_becomes_what_an_spz_file_keeps_and_says_so(tmp_path):
+    model = a_model(2)
+    data, facts = pack(model)
+    small, more, rounded = compact(data, facts)
+    assert rounded == [
+        *("positions", "rotations", "opacities", "cutoffs", "scales", "colours", "harmonics")
+    ]
+    assert len(small) < len(data) / 3
+    geometry, harmonics = expand(small, facts | more)
+    expected, coefficients = tables(of_spz(tmp_path, model))
+    np.testing.assert_allclose(geometry[:, :8], expected[:, :8], rtol=0, atol=1)
+    assert (harmonics != coefficients).mean() < 1e-3  # half floats in the middle of a step
+    low, high = facts["scales"]
+    scales = low + geometry[:, 12:15] / 65535 * (high - low)
+    given = model.scaling[morton_order(model)].numpy()
+    assert np.abs(scales - given).max() <= 1 / 32 + 1e-3
+
+
+def test_rows_of_harmonics_that_repeat_are_there_once():
+    model = a_model(3)
+    model.f_rest[:] = model.f_rest[torch.arange(len(model)) % 7]
+    data, facts = pack(model)
+    small, more, _ = compact(data, facts)
+    assert more["rows"] == 7
+    each = model.f_rest[morton_order(model)].flatten(1).numpy()
+    assert (
+        np.abs(expand(small, facts | more)[1][:, 3:].view("<f2") - each).max() <= 1 / 16 + 1 / 256
+    )
+
+
+def test_a_small_unit_does_not_make_a_scene_coarse():
+    model = a_model()
+    model.xyz.mul_(1e-3)
+    data, facts = pack(model)
+    small, more, _ = compact(data, facts)
+    means = expand(small, facts | more)[0][:, :6].copy().view("<f4")
+    off = np.abs(means - model.xyz[morton_order(model)].numpy()).max()
+    assert off < model.xyz.abs().max() / 1000
+
+
+def test_a_mean_that_no_step_reaches_is_refused():
+    model = a_model()
+    model.xyz[3, 1] = 1e9
+    with pytest.raises(OutputError, match="Name a folder"):
+        compact(*pack(model))
