@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -28,6 +29,13 @@ settings.load_profile("fragprune")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 for _variable in ("FRAGPRUNE_BLOCK", "FRAGPRUNE_ONLY"):
     os.environ.pop(_variable, None)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _frozen():
+    """What is imported needs no further collection: every run of a host ends in a full one."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from fragprune_plugins.files.columns import change_of
 from fragprune_plugins.hosts.graphdeco.call import RASTERIZER
 from fragprune_plugins.hosts.kernels import SPLAT, read_kernels
-from fragprune_plugins.hosts.source import Function, HostRepo
+from fragprune_plugins.hosts.source import Function, HostRepo, nodes
 
 _COLUMNS = ("f_dc", "f_rest", "opacity", "scale", "rot")
 _PLAIN = {"x", "y", "z", "nx", "ny", "nz", "l", *_COLUMNS}
@@ -120,7 +120,7 @@ def _columns(repo: HostRepo, module: str, name: str) -> tuple[Function | None, l
     listed = listed or repo.function(module, f"{name}.save_ply")
     names = dict.fromkeys(
         re.sub(r"_?(\{\})?\d*$", "", node.value)
-        for node in (ast.walk(listed) if listed else ())
+        for node in nodes(listed)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     )
     return listed, [each for each in names if each.isidentifier()]
@@ -141,7 +141,7 @@ def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 def _flat(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     """Gaussians with two scales."""
     setup = repo.function(module, f"{name}.create_from_pcd")
-    for node in ast.walk(setup) if setup else ():
+    for node in nodes(setup):
         if isinstance(node, ast.Call) and ast.unparse(node).endswith(".repeat(1, 2)"):
             yield f"its Gaussians are flat, with two scales ({repo.at(module, node.lineno)})"
             break
@@ -151,7 +151,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     """Values that are not saved as they are before activation."""
     raw = {"scaling": True, "opacity": True}
     function = repo.function(module, f"{name}.save_ply")
-    for node in ast.walk(function) if function else ():
+    for node in nodes(function):
         if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Name):
             continue
         target, value = node.targets[0].id, ast.unparse(node.value)
@@ -167,7 +167,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
             if re.search(r"self\.\w+ ?[*+/-] ?self\.\w+", value):
                 yield f"save_ply stores a product or sum, {target} = {value[:60]} ({at})"
     setup = repo.function(module, f"{name}.setup_functions")
-    for node in ast.walk(setup) if setup else ():
+    for node in nodes(setup):
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
             attribute, value = node.targets[0].attr, ast.unparse(node.value)
             expected = _ACTIVATIONS.get(attribute, (value,))
@@ -183,7 +183,7 @@ def _of_kernel(repo: HostRepo) -> Iterator[str]:
     """Differences of vendored rasterizers that the drawing functions import."""
     for module in _renderers(repo):
         tree = repo.tree(module)
-        for node in ast.walk(tree) if tree else ():
+        for node in nodes(tree):
             if isinstance(node, ast.ImportFrom) and any(RASTERIZER in a.name for a in node.names):
                 for finding in read_kernels(repo, repo.absolute(module, node), SPLAT):
                     if finding.level == "error":
@@ -219,7 +219,7 @@ def _call(function: Function) -> ast.Call | None:
     """The first call that draws."""
     calls = [
         node
-        for node in ast.walk(function)
+        for node in nodes(function)
         if isinstance(node, ast.Call) and any(each.arg == "means3D" for each in node.keywords)
     ]
     return min(calls, key=lambda each: each.lineno, default=None)
@@ -250,7 +250,7 @@ class _Drawing:
         self._collect(function.body)
         models = [
             node.value.id
-            for node in ast.walk(function)
+            for node in nodes(function)
             if isinstance(node, ast.Attribute)
             and node.attr.startswith("get_xyz")
             and isinstance(node.value, ast.Name)
@@ -338,11 +338,11 @@ class _Drawing:
         call = _call(self.function)
         whole = {
             getattr(target.elts[0] if isinstance(target, ast.Tuple) else target, "id", "")
-            for node in ast.walk(self.function)
+            for node in nodes(self.function)
             if isinstance(node, ast.Assign) and node.value is call
             for target in node.targets
         } - {""}
-        for node in ast.walk(self.function):
+        for node in nodes(self.function):
             if isinstance(node, ast.Attribute) and node.attr in ("split", "chunk", "unbind"):
                 inner = node.value
                 while isinstance(inner, ast.Subscript):

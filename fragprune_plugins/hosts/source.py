@@ -52,11 +52,28 @@ def parsed(text: str) -> ast.Module | None:
         return None
 
 
+@lru_cache(maxsize=512)
+def nodes(tree: ast.AST | None) -> tuple[ast.AST, ...]:
+    """Every node of a tree from ``parsed``, or of a part of it, cached; none of None."""
+    return tuple(ast.walk(tree)) if tree is not None else ()
+
+
+def imported(tree: ast.Module | None) -> list[str]:
+    """Top-level packages that a module imports anywhere, each once."""
+    names: dict[str, None] = {}
+    for node in nodes(tree):
+        if isinstance(node, ast.Import):
+            names |= {each.name.split(".")[0]: None for each in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names[node.module.split(".")[0]] = None
+    return list(names)
+
+
 @lru_cache(maxsize=256)
 def _identifiers(tree: ast.Module) -> dict[str, int]:
     """Every name, attribute, definition and parameter in a tree, with its first line."""
     lines: dict[str, int] = {}
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         for kind in ("id", "attr", "name", "arg"):
             name = getattr(node, kind, None)
             if isinstance(name, str):
@@ -89,6 +106,7 @@ class HostRepo:
     def __init__(self, root: Path, package: str = "") -> None:
         self.root, self.package = Path(root).resolve(), package
         self._trees: dict[str, ast.Module | None] = {}
+        self._paths: dict[str, Path | None] = {}
 
     @classmethod
     def installed(cls, package: str) -> HostRepo | None:
@@ -98,12 +116,13 @@ class HostRepo:
         return cls(Path(next(iter(folders))).parent, package) if folders else None
 
     def path(self, module: str) -> Path | None:
-        """The file a dotted module name would be imported from, or None."""
-        base = self.root.joinpath(*module.split("."))
-        for candidate in (base / "__init__.py", base.with_suffix(".py")):
-            if self._inside(candidate) and os.path.isfile(candidate):  # also for too long a name
-                return candidate
-        return None
+        """The file a dotted module name would be imported from, or None; looked for once."""
+        if module not in self._paths:
+            base = self.root.joinpath(*module.split("."))
+            both = (base / "__init__.py", base.with_suffix(".py"))
+            found = (each for each in both if self._inside(each) and os.path.isfile(each))
+            self._paths[module] = next(found, None)  # also for too long a name
+        return self._paths[module]
 
     def _inside(self, path: Path) -> bool:
         """Whether a path of a checkout stays in it once its links are followed.
@@ -163,10 +182,9 @@ class HostRepo:
 
     def calls(self, module: str, name: str) -> list[ast.Call]:
         """Every call of a bare name in a module, in source order."""
-        tree = self.tree(module)
         return [
             node
-            for node in (ast.walk(tree) if tree else ())
+            for node in nodes(self.tree(module))
             if isinstance(node, ast.Call)
             and isinstance(node.func, ast.Name)
             and node.func.id == name
@@ -194,16 +212,7 @@ class HostRepo:
 
     def imports(self, package: str) -> bool:
         """Whether a script right in the folder imports a top-level package."""
-        for script in self.root.glob("*.py"):
-            tree = self.tree(script.stem)
-            for node in ast.walk(tree) if tree else ():
-                if isinstance(node, ast.Import):
-                    names = [alias.name for alias in node.names]
-                else:
-                    names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-                if any(name.split(".")[0] == package for name in names):
-                    return True
-        return False
+        return any(package in imported(self.tree(each.stem)) for each in self.root.glob("*.py"))
 
     @cached_property
     def commit(self) -> str:

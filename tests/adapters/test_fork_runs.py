@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import pytest
-import torch
 from miniatures import runs
 from miniatures.changed import ForkHost
-from miniatures.runs import OPTIONS, edit, frozen_differences
+from miniatures.runs import OPTIONS, check_stage_two, edit
 
-from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import run
 
 RATES = "        gaussians.update_learning_rate(iteration)\n"
@@ -33,11 +30,5 @@ def fork(request, tmp_path):
 def test_a_fork_is_trained_and_pruned(fork, photographs, tmp_path):
     words = runs.command(fork / "train_scene.py", photographs, tmp_path / "out", 12)
     summary = run(words, OPTIONS)
-    assert (summary.iterations, summary.adapter) == (8, "3dgs-fork")
-    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
-    assert frozen_differences(summary.model_before, summary.model_after) == []
-    assert not torch.equal(before.opacity, after.opacity)
-    store, _ = sidecar.load(summary.model_after)
-    assert (store.steps, len(store)) == (8, len(after.xyz))
-    assert summary.fragments_after < summary.fragments_before
+    check_stage_two(summary, "3dgs-fork")
     assert [each["step"] for each in summary.curves] == list(range(1, 9))

@@ -14,8 +14,8 @@ import pytest
 import torch
 from miniatures import light_gaussian, runs
 from miniatures.light_gaussian import LightGaussianHost
-from miniatures.runs import OPTIONS, frozen_differences, written
-from miniatures.vanilla_3dgs import expect_ancestors, joint, label, running
+from miniatures.runs import OPTIONS, check_stage_two, frozen_differences, written
+from miniatures.vanilla_3dgs import Notes, expect_ancestors, joint, label, running
 from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
@@ -39,21 +39,7 @@ def of(mini, **options):
     return {"path": mini, "adapter": LightGaussian()} | options
 
 
-# -- which host ----------------------------------------------------------------------------------
-
-
-RENDERER = "gaussian_renderer/__init__.py"
-
-
 # -- the counting call ---------------------------------------------------------------------------
-
-
-class Notes:
-    """Remembers what was rasterized."""
-
-    @hookimpl(tryfirst=True)
-    def fragprune_truncate(self, inputs, store):
-        self.inputs = inputs
 
 
 def brute_force(inputs, thresholds):
@@ -189,15 +175,9 @@ def trained(mini, photographs, tmp_path_factory):
 
 def test_training_resumes_itself_and_pruning_stands_still(trained):
     summary, out = trained
-    assert (summary.adapter, summary.iterations) == ("light-gaussian", 8)
+    check_stage_two(summary, "light-gaussian")  # though --prune_iterations names 22
     before, after = summary.model_before, summary.model_after
     assert (before.parent.name, after.parent.name) == ("iteration_20", "iteration_29")
-    assert frozen_differences(before, after) == []  # though --prune_iterations names 22
-    store, info = sidecar.load(after)
-    assert len(store) == info.rows == summary.gaussians
-    assert not store.neutral
-    assert summary.fragments_after < summary.fragments_before
-    assert info.adapter == "light-gaussian"
     assert np.load(out / "imp_score.npz")["arr_0"].shape == (summary.gaussians,)
 
 
@@ -228,18 +208,6 @@ def test_pruning_is_stage_one_of_its_own_script(mini, photographs, trained, tmp_
     assert frozen_differences(again.model_before, again.model_after) == []
     stage1, stage2 = (sidecar.load(path)[0] for path in (again.model_before, again.model_after))
     assert (stage1.steps, stage2.steps) == (8, 16)  # thresholds came along and learned on
-
-
-def test_thresholds_learn_on_while_the_host_prunes(mini, photographs, trained, tmp_path):
-    summary, _ = trained
-    words = command(mini, "prune_finetune.py", photographs, tmp_path, 6, "--sh_degree", 2)
-    words += ["--start_pointcloud", str(summary.model_after)]
-    words += ["--prune_percent", "0.3", "--prune_iterations", "4"]
-    run(words, RunOptions(device="cpu", stage="joint", from_iter=1, settings=OPTIONS.settings))
-    file = tmp_path / "point_cloud" / "iteration_6" / "point_cloud.ply"
-    store, before = sidecar.load(file)[0], sidecar.load(summary.model_after)[0]
-    assert len(store) == len(read_ply(file).xyz) < 0.75 * len(before)
-    assert store.steps > before.steps > 0
 
 
 def test_a_point_cloud_alone_is_resumed_with_the_hosts_weight_decay(

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
 
 import pytest
 import torch
 from miniatures import runs
 from miniatures.mcmc import MCMCHost
-from miniatures.runs import OPTIONS, frozen_differences, written
+from miniatures.runs import OPTIONS, check_stage_two, written
 from miniatures.vanilla_3dgs import (
     joint,
 )
 
 from fragprune_mcmc import MCMC
 from fragprune_plugins.errors import HostFailed, UsageError
-from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import run
 
 COUNT = 24
@@ -31,12 +28,6 @@ def mini(tmp_path_factory):
 
 def of(mini, **options):
     return {"path": mini, "adapter": MCMC()} | options
-
-
-# -- which host ----------------------------------------------------------------------------------
-
-
-MODEL = "scene/gaussian_model.py"
 
 
 # -- rows ----------------------------------------------------------------------------------------
@@ -70,12 +61,6 @@ def test_the_dialect_gives_three_outputs_and_thresholds_leave_radii_and_use_alon
 
 # -- stage 2 -------------------------------------------------------------------------------------
 
-MOVES = {
-    "opacity": {"opacity"},
-    "appearance": {"opacity", "f_dc", "f_rest"},
-    "all": {"xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"},
-}
-
 
 def command(mini, scene, out, iterations, *more):
     words = runs.command(mini / "train.py", scene, out, iterations, "--noise_lr", 5e7)
@@ -89,21 +74,8 @@ def test_train_then_finetune_moves_no_frozen_bit(mini, photographs, tmp_path):
     """The schedule of relocation lasts into stage 2, and the noise would go on for ever."""
     more = (*CAP, "--densify_until_iter", 99)
     summary = run(command(mini, photographs, tmp_path / "out", 12, *more), OPTIONS)
-    assert (summary.adapter, summary.iterations) == ("mcmc", 8)
+    check_stage_two(summary, "mcmc")
     assert 150 < summary.gaussians <= 170
-    assert frozen_differences(summary.model_before, summary.model_after) == []
-    store, info = sidecar.load(summary.model_after)
-    assert len(store) == summary.gaussians == len(read_ply(summary.model_after).xyz)
-    assert info.adapter == "mcmc"
-    assert summary.fragments_after < summary.fragments_before
-
-
-def test_joint_learning_through_relocation_and_addition(mini, photographs, tmp_path):
-    options = replace(OPTIONS, stage="joint", from_iter=3)
-    summary = run(command(mini, photographs, tmp_path / "out", 20, *CAP), options)
-    store, _ = sidecar.load(summary.model_after)
-    assert len(store) == len(read_ply(summary.model_after).xyz) > 150
-    assert not store.neutral
 
 
 # -- the host's own refusals, and files over the command line --------------------------------------

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from miniatures.mip_splatting import MipHost
-from miniatures.runs import OPTIONS, command, frozen_differences, written
-from miniatures.vanilla_3dgs import joint, label, running
+from miniatures.runs import OPTIONS, check_stage_two, command, frozen_differences, written
+from miniatures.vanilla_3dgs import Notes, joint, label, running
 from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
@@ -20,7 +20,6 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.run.work import measure_models, photographs_of
@@ -45,14 +44,6 @@ RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
 
 
 # -- the call ------------------------------------------------------------------------------------
-
-
-class Notes:
-    """Remembers what was rasterized."""
-
-    @hookimpl(tryfirst=True)
-    def fragprune_truncate(self, inputs, store):
-        self.inputs = inputs
 
 
 def test_filters_and_offsets_reach_the_engine(mini):
@@ -149,16 +140,6 @@ def test_a_hosts_model_says_who_may_read_it(mini, tmp_path):
 # -- whole runs ----------------------------------------------------------------------------------
 
 
-def models(summary):
-    paths = (summary.model_before, summary.model_after)
-    return [MipSplatting().read_model(path) for path in paths]
-
-
-def moved(summary):
-    paths = (summary.model_before, summary.model_after)
-    return frozen_differences(*paths, MipSplatting().read_model)
-
-
 @pytest.fixture(scope="module")
 def trained(mini, photographs, tmp_path_factory):
     """Trained with jittered rays and another kernel, then fine-tuned."""
@@ -169,14 +150,8 @@ def trained(mini, photographs, tmp_path_factory):
 
 def test_stage_two_moves_opacities_and_thresholds_alone(trained):
     summary, _, _ = trained
-    assert (summary.adapter, summary.iterations) == ("mip-splatting", 8)
+    check_stage_two(summary, "mip-splatting", read=MipSplatting().read_model)
     assert summary.gaussians != 150  # it densified
-    assert moved(summary) == []
-    before, after = models(summary)
-    assert not torch.equal(before.opacity, after.opacity)
-    store, info = sidecar.load(summary.model_after)
-    assert len(store) == info.rows == summary.gaussians == len(after)
-    assert summary.fragments_after < summary.fragments_before
     assert "open3d" not in sys.modules  # its stand-in left with the run
 
 
@@ -186,7 +161,7 @@ def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained,
     run([str(mini / "render.py"), "-m", str(out), "--skip_train"], OPTIONS)
     folder = out / "test" / "ours_29" / "test_preds_1"
     values = sidecar.load(summary.model_after)[0].values.detach()
-    candidate = Candidate(models(summary)[1], summary.drawing)
+    candidate = Candidate(MipSplatting().read_model(summary.model_after), summary.drawing)
     (shot,) = load_dataset(photographs).test
     with torch.no_grad():
         image = rasterize(candidate.inputs(shot.view, candidate.model.splats()), values).image
@@ -212,17 +187,10 @@ def test_a_point_cloud_alone_is_resumed(mini, photographs, trained, tmp_path):
     start = tmp_path / "point_cloud" / "iteration_28" / "point_cloud.ply"
     words = command(mini / "train.py", photographs, tmp_path, 20, "--start_checkpoint", start)
     again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
-    assert moved(again) == []
+    paths = (again.model_before, again.model_after)
+    assert frozen_differences(*paths, MipSplatting().read_model) == []
     first, second = (sidecar.load(s.model_after)[0] for s in (summary, again))
     assert (first.steps, second.steps) == (8, 16)
-
-
-def test_thresholds_learn_beside_densification(mini, photographs, tmp_path):
-    options = RunOptions(device="cpu", stage="joint", from_iter=3, settings=OPTIONS.settings)
-    summary = run(command(mini / "train.py", photographs, tmp_path, 20), options)
-    store, _ = sidecar.load(summary.model_after)
-    assert len(store) == len(MipSplatting().read_model(summary.model_after)) != 150
-    assert not store.neutral
 
 
 def test_the_hosts_fusing_script_carries_thresholds_along(mini, trained, tmp_path):

@@ -6,23 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from miniatures.vanilla_3dgs import joint, running
+from miniatures.vanilla_3dgs import Notes, joint, running
 
 from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.goals import Fewer, Portable, Pressure
 from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE, MOST_PRESSURE
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_vanilla_3dgs import Vanilla3DGS
-
-
-class Notes:
-    """Remembers what was rasterized."""
-
-    @hookimpl(tryfirst=True)
-    def fragprune_truncate(self, inputs, store):
-        self.inputs = inputs
 
 
 @pytest.mark.parametrize("pressure", [0.0, 1e-4, 0.02])

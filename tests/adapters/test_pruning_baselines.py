@@ -11,7 +11,7 @@ import torch
 from miniatures import runs
 from miniatures.compact_3dgs import CompactHost
 from miniatures.lp_3dgs import LPHost
-from miniatures.runs import edit, frozen_differences, written
+from miniatures.runs import check_stage_two, edit, written
 from miniatures.speedy_splat import SpeedyHost
 from miniatures.vanilla_3dgs import joint, running
 from plyfile import PlyData
@@ -46,14 +46,6 @@ def command(root, *more):
     return runs.command(root / "train.py", *more)
 
 
-def expect_fine_tuned(summary):
-    assert frozen_differences(summary.model_before, summary.model_after) == []
-    store, _ = sidecar.load(summary.model_after)
-    assert len(store) == summary.gaussians
-    assert not store.neutral
-    assert summary.fragments_after < summary.fragments_before
-
-
 # -- Speedy-Splat --------------------------------------------------------------------------------
 
 
@@ -76,7 +68,7 @@ def test_speedys_pruning_is_refused_and_never_gets_zeros(speedy, photographs, tm
 def test_stage_two_of_speedy_prunes_nothing(speedy, photographs, tmp_path):
     more = ["--prune_interval", 14, "--checkpoint_iterations", 12]  # due in stage 2, at 14
     summary = run(command(speedy, photographs, tmp_path, 12, *more), OPTIONS)
-    expect_fine_tuned(summary)
+    check_stage_two(summary, "speedy-splat", 6)
 
 
 # -- LP-3DGS -------------------------------------------------------------------------------------
@@ -88,7 +80,7 @@ def test_lp_ends_in_its_own_error_and_stage_two_begins_from_what_it_saved(
     words = command(lp, photographs, tmp_path, 11, "--checkpoint_iterations", 11)
     with pytest.raises(HostFailed, match="ours_30000"):
         run(words, replace(OPTIONS, stage="off"))
-    expect_fine_tuned(run(words, replace(OPTIONS, stage="finetune")))
+    check_stage_two(run(words, replace(OPTIONS, stage="finetune")), "lp-3dgs", 6)
 
 
 def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
@@ -105,7 +97,7 @@ def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
             replace(OPTIONS, stage="off"),
         )
     summary = run(words, replace(OPTIONS, stage="finetune"))
-    expect_fine_tuned(summary)
+    check_stage_two(summary, "lp-3dgs", 6)
     rows = len(read_ply(summary.model_before).xyz)
     assert len(read_ply(pruned).xyz) == rows - int(0.3 * (rows - 1)) - 1
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.rain_gs import RainHost
-from miniatures.runs import OPTIONS, frozen_differences, written
-from miniatures.vanilla_3dgs import expect_ancestors, identity, joint, label, running
+from miniatures.runs import OPTIONS, check_stage_two, written
+from miniatures.vanilla_3dgs import Notes, expect_ancestors, identity, joint, label, running
 
 from fragprune_plugins import rasterize
 from fragprune_plugins.files import sidecar
@@ -63,14 +63,6 @@ def test_the_hosts_own_rasterizer_is_used_where_it_can_be_compiled(mini, monkeyp
         assert runs_here(dialect, "submodules") == bool(compiler and gpu)
         assert runs_here(dialect, "torch")
         assert not runs_here(dialect, "simple_knn")
-
-
-class Notes:
-    """Remembers what was rasterized."""
-
-    @hookimpl(tryfirst=True)
-    def fragprune_truncate(self, inputs, store):
-        self.inputs = inputs
 
 
 def test_dilation_reaches_the_engine_and_depth_comes_back_without_a_gradient(mini):
@@ -146,11 +138,7 @@ def test_every_mode_is_fine_tuned_and_moves_opacities_and_thresholds_alone(
 ):
     words = command(mini, scene, tmp_path / "out", 22, f"--{mode}", "--num_gaussians", 60)
     summary = run([*words, "--c2f"], OPTIONS)
-    assert (summary.adapter, summary.iterations) == ("rain-gs", 8)
-    assert frozen_differences(summary.model_before, summary.model_after) == []
-    store, info = sidecar.load(summary.model_after)
-    assert len(store) == info.rows == summary.gaussians
-    assert summary.fragments_after < summary.fragments_before
+    check_stage_two(summary, "rain-gs")
     assert summary.drawing == {}
     assert measure_models(
         photographs_of(summary), EngineOptions()

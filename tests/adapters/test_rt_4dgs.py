@@ -288,15 +288,6 @@ def test_a_checkpoint_with_thresholds_is_applied_and_learned_on(mini, config, tm
     assert again.fragments_before == pytest.approx(first.fragments_before, rel=0.3)
 
 
-def test_joint_learning_follows_rows_through_densification(mini, config, tmp_path):
-    options = RunOptions(**OPTIONS, stage="joint", from_iter=3)
-    summary = run(command(mini, config(iterations=14)), options)
-    capture, _ = load(tmp_path / "out" / "chkpnt14.pth")
-    assert summary.model_after == tmp_path / "out" / "chkpnt14.pth"
-    assert len(capture[11]["fragprune"]["logits"]) == len(capture[1]) != 150
-    assert summary.iterations == 12
-
-
 def test_the_sky_comes_back_and_stands_still(mini, config, tmp_path):
     """The loop makes a new environment map after it has restored the old one."""
     summary = run(command(mini, config(sky=1)), RunOptions(**OPTIONS))

@@ -10,7 +10,6 @@ import random
 import runpy
 import shutil
 import signal
-import subprocess
 import sys
 import weakref
 from dataclasses import replace
@@ -21,8 +20,8 @@ import pytest
 import torch
 from click.testing import CliRunner
 from miniatures import runs
-from miniatures.runs import OPTIONS, frozen_differences
-from miniatures.vanilla_3dgs import HOST, running
+from miniatures.runs import OPTIONS, check_stage_two
+from miniatures.vanilla_3dgs import HOST, InterruptAt, running
 
 from fragprune_plugins.errors import Interrupted, SessionError, UsageError
 from fragprune_plugins.files import sidecar
@@ -34,7 +33,6 @@ from fragprune_plugins.injection.process import forget_modules, host_process
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.goals import Portable
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands import cli
 from fragprune_vanilla_3dgs import Vanilla3DGS
@@ -98,22 +96,6 @@ def test_a_neutral_run_is_the_hosts_own_to_the_bit(photographs, tmp_path):
     assert ours[2][:2] == alone[2][:2]
     assert torch.equal(ours[2][2], alone[2][2])
     assert not list(tmp_path.rglob("*.safetensors"))
-
-
-class InterruptAt:
-    """Ctrl-C, or another signal, at the end of a learned step."""
-
-    def __init__(self, step, number=signal.SIGINT):
-        self.step, self.number, self.finished = step, number, []
-
-    @hookimpl
-    def fragprune_step(self, stats):
-        if stats.step == self.step:
-            signal.raise_signal(self.number)
-
-    @hookimpl
-    def fragprune_finished(self, summary):
-        self.finished.append(summary)
 
 
 def with_plugin(monkeypatch, plugin):
@@ -204,29 +186,24 @@ def test_killed_in_stage_two_it_starts_again_from_stage_one_and_leaves_nothing(
 def test_sigterm_in_stage_one_ends_the_process_as_the_host_alone(photographs, tmp_path):
     script = tmp_path / "host" / "train.py"
     shutil.copytree(HOST, script.parent)
-    text = script.read_text()
     loop = "    for iteration in range(first_iter + 1, opt.iterations + 1):\n"
     kill = "        import signal\n        signal.raise_signal(signal.SIGTERM)\n"
-    assert loop in text
-    script.write_text(text.replace(loop, loop + kill))
-    words = command(photographs, tmp_path / "out", 10)[1:]
-    program = "from fragprune_plugins.workbench.commands import main; main()"
-    options = ["run", "--device", "cpu", "--", str(script), *words]
-    done = subprocess.run([sys.executable, "-c", program, *options], capture_output=True)
-    assert done.returncode == -signal.SIGTERM
+    runs.edit(script, loop, loop + kill)
+    words = ["run", "--device", "cpu", "--", str(script)]
+    words += command(photographs, tmp_path / "out", 10)[1:]
+    pid = os.fork()
+    if pid == 0:
+        with contextlib.suppress(BaseException):
+            cli(words, standalone_mode=False)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGTERM
 
 
 def test_train_then_finetune_then_render(photographs, tmp_path):
     out = tmp_path / "out"
     summary = run(command(photographs, out, 12), OPTIONS)
-    assert (summary.iterations, summary.adapter, summary.stage) == (8, "vanilla-3dgs", "auto")
-    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
-    assert frozen_differences(summary.model_before, summary.model_after) == []
-    assert not torch.equal(before.opacity, after.opacity)
-    store, _ = sidecar.load(summary.model_after)
-    assert store.steps == OPTIONS.settings.iterations  # though hosts take none in their last one
-    assert len(store) == summary.gaussians == len(after.xyz)
-    assert summary.fragments_after < summary.fragments_before
+    check_stage_two(summary, "vanilla-3dgs")  # eight steps, though hosts take none in their last
+    assert summary.stage == "auto"
     assert [c["step"] for c in summary.curves] == list(range(1, 9))
     # the host's own render script, with and without what lies beside its model
     renders = out / "test" / "ours_21" / "renders"

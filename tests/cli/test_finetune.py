@@ -308,35 +308,6 @@ def test_goes_on_from_the_thresholds_of_the_model(scene, tmp_path):
     assert change == pytest.approx(1, abs=0.1)
 
 
-def test_goes_on_from_an_exported_column(scene, tmp_path):
-    data, path, model = scene
-    write_ply(path, tiny.cut(model, 0.3))
-    out = tmp_path / "out.ply"
-    run_json("finetune", path, "--data", data, "--out", out, "--iters", 1)
-    values = read_ply(out).falloff
-    assert float((values - 0.3).abs().max()) < 0.02
-
-
-def test_ctrl_c_saves_and_leaves_with_130(scene, tmp_path, monkeypatch):
-    data, path, _ = scene
-    out = tmp_path / "out.ply"
-    loss, calls = loop.photometric_loss, []
-
-    def photometric(*args):
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return loss(*args)
-
-    monkeypatch.setattr(loop, "photometric_loss", photometric)
-    result = run("finetune", path, "--data", data, "--out", out, "--iters", 50, "--json")
-    assert result.exit_code == 130
-    report = json.loads(result.stdout)
-    assert report["interrupted"] is True
-    assert report["iterations"] == 3
-    assert read_ply(out).falloff is not None
-
-
 def test_sigterm_saves_at_once_and_leaves_with_143(scene, tmp_path, monkeypatch):
     data, path, _ = scene
     out, before = tmp_path / "out.ply", signal.getsignal(signal.SIGTERM)

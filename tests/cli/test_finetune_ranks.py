@@ -71,7 +71,7 @@ def test_the_first_process_writes_and_reports_and_the_others_say_nothing(scene, 
     assert other.left == (0, "", "")
 
 
-@pytest.mark.parametrize(("size", "killed"), [(2, 0), (2, 1), (4, 2)])
+@pytest.mark.parametrize(("size", "killed"), [(2, 0), (4, 2)])
 def test_a_kill_of_one_ends_all_with_one_error_and_leaves_what_was_saved(
     scene, tmp_path, size, killed
 ):
@@ -189,8 +189,8 @@ def test_shards_report_and_write_what_one_process_does(scene, tmp_path):
     assert "2 processes held a part of the Gaussians each" in text
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_shards_save_what_they_learned_when_a_signal_comes_to_one(scene, tmp_path, number):
+def test_shards_save_what_they_learned_when_a_signal_comes_to_one(scene, tmp_path):
+    number = signal.SIGTERM
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
     shards = ("--shard-gaussians",)
     command(2, *words(scene, whole, *shards))
@@ -208,27 +208,9 @@ def test_shards_save_what_they_learned_when_a_signal_comes_to_one(scene, tmp_pat
     assert out.read_bytes() == whole.read_bytes()
 
 
-def test_a_kill_of_a_shard_ends_all_with_one_error_and_leaves_what_was_saved(scene, tmp_path):
-    out = tmp_path / "out.ply"
-    run_json(*words(scene, out, "--iters", 3))
-    before = out.read_bytes()
-    ended = command(
-        3,
-        *words(scene, out, "--shard-gaussians", "--again"),
-        prepare=lambda rank: (
-            at_step(7, lambda: os.kill(os.getpid(), signal.SIGKILL)) if rank == 2 else None
-        ),
-    )
-    assert ended[2].code == -signal.SIGKILL
-    left = [each.left for each in ended[:2]]
-    assert [code for code, _, _ in left] == [1, 1]
-    assert "".join(out + err for _, out, err in left).count("[ranks]") == 1
-    assert out.read_bytes() == before
-
-
 @pytest.mark.parametrize(
     "more",
-    [("--portable",), ("--max-drop", 0.1), ("--keep", 0.9), ("--drop-invisible",), ("--self",)],
+    [("--portable",), ("--self",)],
 )
 def test_what_a_part_of_the_gaussians_cannot_do_is_refused(scene, tmp_path, more):
     ended = command(2, *words(scene, tmp_path / "out.ply", "--shard-gaussians", *more))

@@ -6,9 +6,8 @@ import contextlib
 
 import pytest
 import torch
-from core.sessions import Model, Role, call, follow, state
+from core.sessions import Role, call, follow, state
 
-from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.seams import RowTrace
 from fragprune_plugins.injection.aligning import OF_MODELS
@@ -49,30 +48,6 @@ def parents(session, model, rows, body):
     return OF_MODELS[Role.PARENTS](session, seam)
 
 
-def test_rows_without_parents_are_neutral(session):
-    model, known = follow(session)
-    append(session, model, torch.tensor([1, 2]))
-    assert torch.equal(known.store.logits[:6], LOGITS)
-    assert known.store.logits[6:].tolist() == [NEUTRAL_LOGIT] * 2
-    assert told(session) == [("append", 6, 8)]
-    assert session.plugins.told[0][1]["store"] is known.store
-
-
-def test_children_inherit_in_as_many_appends_as_the_host_makes(session):
-    model, known = follow(session)
-    rows = torch.tensor([4, 1, 5])
-
-    def body():
-        append(session, model, rows[:1])
-        append(session, model, rows[1:])
-
-    assert parents(session, model, rows, body) == "chosen"
-    assert torch.equal(known.store.logits, LOGITS[torch.tensor([0, 1, 2, 3, 4, 5, 4, 1, 5])])
-    assert known.store.numbers["their moments"].tolist() == [1, 2, 3, 4, 5, 6, 0, 0, 0]
-    assert told(session) == [("append", 6, 7), ("append", 7, 9)]
-    assert known.pending_parents is None
-
-
 def test_a_parent_without_a_child_is_refused_with_their_number(session):
     model, known = follow(session)
     rows = torch.tensor([4, 1, 5])
@@ -110,22 +85,6 @@ def test_a_row_that_differs_in_one_inherited_group_is_no_copy(session):
         parents(session, model, torch.tensor([2]), body)
 
 
-@pytest.mark.parametrize("role", OF_MODELS)
-def test_a_model_that_is_not_followed_is_the_hosts_own_business(session, role):
-    seam = call(Model(3), role, lambda tensors: f"done with {tensors}", "these")
-    assert OF_MODELS[role](session, seam) == "done with these"
-    assert session.plugins.told == []
-
-
-def test_thresholds_of_removed_rows_go_with_them(session):
-    model, known = follow(session)
-    mask = torch.tensor([True, False, True, True, False, False])
-    seam = call(model, Role.KEEP, lambda mask: "kept", mask)
-    assert OF_MODELS[Role.KEEP](session, seam) == "kept"
-    assert torch.equal(known.store.logits, LOGITS[mask])
-    assert told(session) == [("keep", 6, 3)]
-
-
 def rearrange(session, model, trace, rows=None):
     events = []
 
@@ -143,21 +102,6 @@ def rearrange(session, model, trace, rows=None):
 
     result = OF_MODELS[Role.REARRANGE](session, call(model, Role.REARRANGE, host, how=tracing))
     return result, events
-
-
-def test_one_operation_keeps_copies_and_appends(session):
-    model, known = follow(session)
-    known.views[3] = print
-    origins = torch.tensor([5, 0, 0])
-    trace = RowTrace(origins, torch.tensor([False, False, True]))
-    assert rearrange(session, model, trace, origins) == (
-        "rearranged",
-        ["begun", "host", "over"],
-    )
-    assert torch.equal(known.store.logits, LOGITS[origins])
-    assert known.store.numbers["their moments"].tolist() == [6, 1, 0]
-    assert known.views == {}
-    assert told(session) == [("rearrange", 6, 3)]
 
 
 @pytest.mark.parametrize("trace", [RowTrace(), RowTrace(torch.tensor([0])), RowTrace(None, None)])

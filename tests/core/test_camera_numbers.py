@@ -256,30 +256,6 @@ def test_a_colmap_model_in_binary_gives_every_number(tmp_path):
     assert train[0][1].translation.tolist() == PLACE
 
 
-BENT = {  # COLMAP's parameters after the principal point, in OpenCV's order of eight or four
-    2: (1, (0.1,), (0.1, 0, 0, 0, 0, 0, 0, 0)),
-    3: (1, (0.1, 0.2), (0.1, 0.2, 0, 0, 0, 0, 0, 0)),
-    4: (2, (0.1, 0.2, 0.3, 0.4), (0.1, 0.2, 0.3, 0.4, 0, 0, 0, 0)),
-    5: (2, (0.1, 0.2, 0.3, 0.4), (0.1, 0.2, 0.3, 0.4)),
-    6: (2, tuple(each / 1000 for each in range(1, 9)), tuple(each / 1000 for each in range(1, 9))),
-    8: (1, (0.1,), (0.1, 0, 0, 0)),
-    9: (1, (0.1, 0.2), (0.1, 0.2, 0, 0)),
-}
-
-
-@pytest.mark.parametrize("code", BENT)
-def test_the_numbers_of_a_lens_are_those_that_colmap_writes(tmp_path, code):
-    pytest.importorskip("cv2")
-    focals, values, expected = BENT[code]
-    cameras = [camera(7, code, *(30.0, 25.0)[:focals], 19.0, 11.0, *values)]
-    _, (row,) = binary(tmp_path, cameras, [image()])
-    lens = row.lens
-    assert (lens.fx, lens.fy) == (30.0, 25.0 if focals == 2 else 30.0)
-    assert (lens.cx, lens.cy, lens.width, lens.height) == (19.0, 11.0, 40, 20)
-    assert lens.coefficients == expected
-    assert lens.fisheye is (len(expected) == 4)
-
-
 @pytest.mark.parametrize("code", [7, 10, 11, -1])
 def test_a_lens_that_nothing_can_straighten_is_refused_by_its_name(tmp_path, code):
     cameras = [camera(7, code, *[1.0] * CODES.get(code, 3))]
@@ -327,14 +303,6 @@ def test_binary_files_count_more_than_text(tmp_path):
     (tmp_path / "sparse/0/cameras.txt").write_text("7 PINHOLE 40 20 30 25 19 11\n")
     (tmp_path / "sparse/0/images.txt").write_text("1 1 0 0 0 0 0 0 7 text.png\n\n")
     assert [row[0] for row in colmap.read(tmp_path)[1]] == ["binary.png"]
-
-
-def test_every_eighth_of_the_sorted_names_is_held_out(tmp_path):
-    names = [f"{number:02d}" for number in range(17)]
-    images = [image(f"{name}.png".encode()) for name in reversed(names)]
-    train, test = binary(tmp_path, [camera()], images)
-    assert [row[0][:2] for row in test] == ["00", "08", "16"]
-    assert [row[0][:2] for row in train] == [name for name in names if int(name) % 8]
 
 
 FRAME = {

@@ -18,7 +18,6 @@ from fragprune_plugins.files.atomic import (
     in_flight,
     locked,
     put,
-    rename,
     replacing,
     staging,
     writable_folder,
@@ -33,13 +32,6 @@ def test_the_new_file_appears_whole_under_its_name(tmp_path):
         assert not target.exists()
     assert target.read_text() == "whole"
     assert list(target.parent.iterdir()) == [target]
-
-
-def test_permissions_are_those_of_a_plain_open(tmp_path):
-    (tmp_path / "plain").write_text("")
-    with replacing(tmp_path / "ours") as temporary:
-        temporary.write_text("")
-    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 @pytest.mark.parametrize("error", [ValueError("ours"), KeyboardInterrupt(), OSError(28, "full")])
@@ -172,14 +164,6 @@ def test_a_folder_that_a_dead_process_left_is_removed_by_the_next(tmp_path):
         assert list(folder.iterdir()) == []
         assert not left.exists()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_rename_replaces_what_was_there(tmp_path):
-    (tmp_path / "old").write_text("content")
-    (tmp_path / "new").write_text("before")
-    rename(tmp_path / "old", tmp_path / "new")
-    assert (tmp_path / "new").read_text() == "content"
-    assert list(tmp_path.iterdir()) == [tmp_path / "new"]
 
 
 def test_a_writable_folder_is_made_and_left_empty(tmp_path):

@@ -37,12 +37,6 @@ def test_learned_thresholds_come_back_to_the_bit(model, tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_others_may_read_what_a_plain_open_lets_them(model, tmp_path):
-    (tmp_path / "plain").write_text("")
-    fp.save(tmp_path / "a.ply", model)
-    assert (tmp_path / "a.ply").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
 def test_a_model_without_thresholds_replaces_one_with_them(model, tmp_path):
     fp.save(tmp_path / "a.ply", model)
     fp.save(tmp_path / "a.ply", model.untruncated())

@@ -301,14 +301,9 @@ def test_rounded_matrices_are_accepted(tmp_path, rounded):
     ("content", "words"),
     [
         (image_record(points=1 << 40), "bytes announced"),
-        (image_record(points=1 << 62), "bytes announced"),
-        (image_record(count=1 << 62), f"{1 << 62} announced, in"),
-        (image_record(quaternion=(0, 0, 0, 0)), "number 1 of 1.*quaternion"),
-        (image_record(quaternion=(NAN, 0, 0, 0)), "quaternion"),
-        (image_record(name=b"x" * 10_000), "a name without end at byte 72"),
         (image_record(name=b"\xff\xfe\0"), "number 1 of 1, byte 8"),
     ],
-    ids=range(7),
+    ids=range(2),
 )
 def test_colmaps_counts_are_checked_against_the_file(tmp_path, content, words):
     tiny.write_colmap(tmp_path, [torch.zeros(3, 4, 4)] * 9, binary=True)

@@ -12,7 +12,6 @@ from miniatures.vanilla_3dgs import joint, running
 from fragprune_plugins.errors import RanksError, SessionError
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection import ranks
-from fragprune_plugins.injection import session as module
 from fragprune_plugins.injection.rasterizing import on_metric
 from fragprune_plugins.injection.session import active_session
 from fragprune_plugins.learning.goals import Control, Portable, Pressure
@@ -38,19 +37,6 @@ def test_the_active_session_is_the_only_one(stepped):
     assert active_session() is host.session
     with host.session as inside:  # active already
         assert inside is host.session
-
-
-def test_inside_a_with_block_a_session_is_active_and_after_it_the_host_is_as_before():
-    with running(active=False) as host:
-        assert active_session() is None
-        with host.session as inside:
-            assert active_session() is inside is host.session
-            from scene.gaussian_model import GaussianModel
-
-            assert hasattr(GaussianModel.training_setup, "__wrapped__")
-        assert active_session() is None
-        assert not hasattr(GaussianModel.training_setup, "__wrapped__")
-        assert host.session.deactivate() == []
 
 
 def test_after_it_an_optimizer_has_no_hook_of_ours():
@@ -79,39 +65,6 @@ def test_only_a_session_that_learns_minds_how_many_processes_train(monkeypatch, 
         assert (active_session() is host.session) is not learn
 
 
-def test_a_seam_that_cannot_be_wrapped_leaves_nothing_patched(monkeypatch):
-    with running(active=False) as host:
-        seams = host.session.adapter.seams_for(host.session.repo)
-        seen = []
-
-        def some(repo):
-            yield seams[0]
-            raise KeyError(repo)
-
-        monkeypatch.setattr(host.session.adapter, "seams_for", some)
-        undo = module.PatchLedger.undo
-        monkeypatch.setattr(module.PatchLedger, "undo", lambda self: seen.append(1) or undo(self))
-        with pytest.raises(KeyError):
-            host.session.activate()
-        assert (seen, active_session(), host.session._ledger) == ([1], None, None)
-
-
-def test_a_paused_session_draws_without_thresholds(stepped):
-    host, _ = stepped
-    with host.session.paused():
-        assert host.session.pausing.get() is True
-        with host.session.paused():
-            pass
-        assert host.session.pausing.get() is True
-    assert host.session.pausing.get() is False
-
-
-def test_a_store_is_a_followed_models(stepped):
-    host, model = stepped
-    assert host.session.store(model) is host.session.models[model].store
-    assert host.session.store(host.model(setup=False)) is None
-
-
 def test_the_summary_is_of_what_was_learned_and_observers_get_it(monkeypatch):
     class Observer:
         def fragprune_finished(self, summary):
@@ -136,21 +89,6 @@ def test_the_summary_is_of_what_was_learned_and_observers_get_it(monkeypatch):
     assert summary.fragments_after == progress.fragments_after > 0
     assert summary.target_reached is progress.target_reached
     assert summary.settings == host.session.settings.as_dict()
-
-
-def test_of_a_session_without_a_model_the_summary_is_empty():
-    with running(learn=False) as host:
-        summary = host.session.finish()
-    assert (summary.engine, summary.steps, summary.gaussians) == ("", 0, 0)
-    assert (summary.fragments_before, summary.fragments_after) == (None, None)
-    assert summary.target_reached is None
-
-
-def test_every_engine_that_drew_is_named_once():
-    with running(learn=False) as host:
-        named = [SimpleNamespace(name=name) for name in ("cuda", "cpu", "cuda")]
-        host.session.engines = dict(enumerate(named))
-        assert host.session.finish().engine == "cuda, cpu"
 
 
 @pytest.mark.parametrize(
@@ -222,37 +160,6 @@ def test_a_model_is_saved_only_if_something_was_learned(
             state.store.open(torch.full((30,), 0.5))
         monkeypatch.setattr(host.session.adapter, "save_model", lambda *_: Path("there"))
         assert (host.session.save_interrupted() is not None) is saves
-
-
-def test_an_adapter_that_saves_nothing_saves_nothing_when_interrupted(stepped, monkeypatch):
-    host, _ = stepped
-    monkeypatch.setattr(host.session, "output", Path("out"))
-    monkeypatch.setattr(module, "ScriptAdapter", int)
-    assert host.session.save_interrupted() is None
-
-
-def test_a_call_goes_to_the_handler_of_its_role_with_its_model(stepped, monkeypatch):
-    host, model = stepped
-    session, given = host.session, []
-    seams = {seam.role: seam for seam in session.adapter.seams_for(session.repo)}
-    monkeypatch.setitem(module._OF_CALLS, Role.VIEW, lambda *words: given.append(words) or "view")
-    monkeypatch.setitem(module._OF_MODELS, Role.KEEP, lambda *words: given.append(words) or "keep")
-
-    def host_function(mask):
-        return f"the host's, {mask}"
-
-    for role, expected in ((Role.VIEW, "view"), (Role.KEEP, "keep")):
-        assert session._enter(seams[role], host_function, model, (1,), {}) == expected
-        passed, call = given.pop()
-        assert passed is session
-        assert (call.seam, call.function, call.instance) == (seams[role], host_function, model)
-        assert (call.args, call.kwargs) == ((1,), {})
-    assert call.model is model
-    monkeypatch.setattr(session, "model_of", lambda call: None)
-    assert (
-        session._enter(seams[Role.KEEP], host_function, model, (), {"mask": 3}) == "the host's, 3"
-    )
-    assert given == []
 
 
 @pytest.mark.parametrize("error", [OSError(), ModuleNotFoundError("no torchvision\nat all")])

@@ -12,7 +12,6 @@ from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 NAMES = [f"view{i:02d}" for i in range(9)]
@@ -177,44 +176,6 @@ def test_what_is_no_scene_or_two_is_refused_by_name(tmp_path, images):
     tiny.write_blender(tmp_path / "both", images)
     with pytest.raises(DatasetError, match="both COLMAP's and a transforms layout"):
         load_dataset(tmp_path / "both")
-
-
-def host_cameras() -> list[dict[str, object]]:
-    """cameras.json as hosts write it."""
-    return [
-        {
-            "id": i,
-            "img_name": f"view{i:02d}",
-            "width": camera.width,
-            "height": camera.height,
-            "position": (-camera.rotation.T @ camera.translation).tolist(),
-            "rotation": camera.rotation.T.tolist(),
-            "fx": camera.fx,
-            "fy": camera.fy,
-        }
-        for i, camera in enumerate(tiny.cameras())
-    ]
-
-
-def test_cameras_files(tmp_path):
-    (tmp_path / "cameras.json").write_text(json.dumps(host_cameras()))
-    content = tiny.transforms(NAMES, tiny.cameras()) | {"w": tiny.SIDE, "h": tiny.SIDE}
-    (tmp_path / "path.json").write_text(json.dumps(content))
-    for file in ("cameras.json", "path.json"):
-        read = load_cameras(tmp_path / file)
-        assert [name for name, _ in read] == NAMES
-        for (_, view), camera in zip(read, tiny.cameras(), strict=True):
-            torch.testing.assert_close(view.projmatrix, camera.view().projmatrix)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [("[]", "0 cameras"), ('[{"id": 0}]', "not a cameras file"), ("[1]", "not a cameras file")],
-)
-def test_bad_cameras_files(tmp_path, content, message):
-    (tmp_path / "cameras.json").write_text(content)
-    with pytest.raises(DatasetError, match=message):
-        load_cameras(tmp_path / "cameras.json")
 
 
 def shared_data() -> Path | None:

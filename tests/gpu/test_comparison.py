@@ -77,6 +77,7 @@ def test_a_sound_engine_agrees(device: EmulatedDevice) -> None:
 RUNS = itertools.count()
 
 
+@pytest.mark.slow  # compiles every kernel anew
 def test_the_rounding_of_a_gpus_special_units_is_no_fault(
     device: EmulatedDevice, tmp_path: Path
 ) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import RunOptions
 from fragprune_plugins.learning.schedule import Settings
@@ -45,6 +46,20 @@ def frozen_differences(
     """In which tensors two files of a model differ, opacities aside."""
     one, other = read(before), read(after)
     return [name for name in FROZEN if not torch.equal(getattr(one, name), getattr(other, name))]
+
+
+def check_stage_two(
+    summary: Any, adapter: str, iterations: int = 8, read: Callable[[Path], Any] = read_ply
+) -> None:
+    """Of a finished run with ``OPTIONS``: opacities moved alone, each row has its threshold."""
+    before, after = summary.model_before, summary.model_after
+    assert (summary.adapter, summary.iterations) == (adapter, iterations)
+    assert frozen_differences(before, after, read) == []
+    assert not torch.equal(read(before).opacity, read(after).opacity)
+    store, info = sidecar.load(after)
+    assert len(store) == info.rows == summary.gaussians == len(read(after).opacity)
+    assert (info.adapter, store.steps, store.neutral) == (adapter, iterations, False)
+    assert summary.fragments_after < summary.fragments_before
 
 
 def edit(file: Path, old: str, new: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 
 from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing import host as kit
 from fragprune_plugins.testing.host import MINIATURE as HOST
 from fragprune_plugins.testing.host import Running, imported
@@ -16,6 +18,8 @@ from fragprune_vanilla_3dgs import Vanilla3DGS
 
 __all__ = [
     "HOST",
+    "InterruptAt",
+    "Notes",
     "Running",
     "expect_ancestors",
     "identity",
@@ -25,6 +29,30 @@ __all__ = [
     "running",
     "tensors",
 ]
+
+
+class Notes:
+    """Remembers what was rasterized."""
+
+    @hookimpl(tryfirst=True)
+    def fragprune_truncate(self, inputs: Any, store: Any) -> None:
+        self.inputs = inputs
+
+
+class InterruptAt:
+    """Ctrl-C, or another signal, at the end of a learned step."""
+
+    def __init__(self, step: int, number: int = signal.SIGINT) -> None:
+        self.step, self.number, self.finished = step, number, []
+
+    @hookimpl
+    def fragprune_step(self, stats: Any) -> None:
+        if stats.step == self.step:
+            signal.raise_signal(self.number)
+
+    @hookimpl
+    def fragprune_finished(self, summary: Any) -> None:
+        self.finished.append(summary)
 
 
 def running(

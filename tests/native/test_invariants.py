@@ -171,13 +171,6 @@ def test_a_broken_gaussian_takes_only_itself_along(
             assert not found[name][~others].any(), name
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 1), (16, 16), (15, 33)])
-def test_any_image_size(engine: CpuEngine, size: tuple[int, int]) -> None:
-    found = everything(engine, scenes.random_scene(2, 30, *size), None)
-    assert found["image"].shape == (3, size[1], size[0])
-    assert found["image"].isfinite().all()
-
-
 def test_gradients_come_in_the_dtype_and_only_where_they_are_wanted(engine: CpuEngine) -> None:
     inputs = scenes.random_scene(0, dtype=torch.float64)
     opacities = inputs.splats.opacities.requires_grad_()
@@ -237,22 +230,6 @@ def test_stages_are_timed(engine: CpuEngine) -> None:
     out = engine.rasterize(scenes.random_scene(0), None)
     assert list(out.stages) == ["projection", "binning", "blend"]
     assert all(ms > 0 for ms in out.stages.values())
-
-
-def test_no_gaussian_at_all(engine: CpuEngine) -> None:
-    inputs = scenes.random_scene(0, 3)
-    none = replace(
-        inputs.splats,
-        **{
-            name: value[:0]
-            for name, value in vars(inputs.splats).items()
-            if isinstance(value, torch.Tensor)
-        },
-    )
-    found = everything(engine, replace(inputs, splats=none, means2d_hook=None), None)
-    assert torch.equal(
-        found["image"], inputs.view.background[:, None, None].expand_as(found["image"])
-    )
 
 
 def test_double_backward_is_refused(engine: CpuEngine) -> None:

@@ -86,41 +86,6 @@ def test_pixels_stop_alike_on_both_sides_of_a_border(engine: CpuEngine, case: Dr
 
 
 @st.composite
-def without_volume(draw: st.DrawFn) -> Drawn:
-    """Covariances of rank 0 to 3, each Gaussian its own, given either way; all sizes together."""
-    dice = Dice(draw(st.integers(0, 2**20)))
-    view = scenes.random_view(dice.generator, 35, 29)
-    n = 12
-    size = torch.tensor([view.width, view.height]).double()
-    pixels, depths = dice.uniform(-0.1, 1.1, n, 2) * size, dice.uniform(0.5, 6.0, n)
-    sigma = dice.log_uniform(0.02, 150.0, n, 1) * dice.log_uniform(0.1, 1.0, n, 3)
-    flat = torch.arange(3) < torch.arange(n)[:, None] % 4  # how many axes are nothing
-    splats = dice.splats(view, pixels, depths, torch.where(flat, 0.0, sigma))
-    if draw(st.booleans()):
-        splats = scenes.with_cov3d(splats)
-    thresholds = scenes.random_thresholds(n, n) if draw(st.booleans()) else None
-    inputs = RasterInputs(
-        view, splats, compensation=draw(st.sampled_from(["none", "antialiasing"]))
-    )
-    return scenes.cast(inputs, torch.float32), thresholds
-
-
-@settings(max_examples=40)
-@given(case=without_volume())
-def test_flat_splats_needles_and_points(engine: CpuEngine, case: Drawn) -> None:
-    truth, ours, same = draw_pair(engine, *case)
-    if not torch.equal(truth.radii, ours.radii):
-        assert (truth.radii - ours.radii).abs().max() <= 1 + 1e-6 * truth.radii.max()
-        return  # 3 sigma within rounding of an integer: a whole tile more or less, rightly
-    check_images(truth, ours, same)
-    inputs, _ = case
-    if inputs.compensation != "none" and inputs.splats.cov3d is not None:
-        return  # the determinant of a flat covariance is the rounding of its six numbers
-    # As in test_awkward_scenes_equal_the_oracle: the gradient of a needle's rotation cancels.
-    check_gradients(engine, *case, same, tolerance=2e-3)
-
-
-@st.composite
 def near_the_near_plane(draw: st.DrawFn) -> Drawn:
     """Gaussians just before and just behind the near plane, on the image and far beside it."""
     dice = Dice(draw(st.integers(0, 2**20)))

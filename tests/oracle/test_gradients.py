@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -19,6 +20,8 @@ from fragprune_plugins.testing import scenes
 from reference_renderer import Options, render, render_footprints
 
 F64 = torch.float64
+# A random direction of inputs against one of outputs: entry by entry takes 30 times as long.
+gradcheck = partial(torch.autograd.gradcheck, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 def uncut(inputs) -> Options:
@@ -78,7 +81,7 @@ def test_every_input_has_the_derivative_of_finite_differences(kind, rim):
         # But for the surrogate a count is a constant.
         return made if rim == "surrogate" else made[:3] + made[4:]
 
-    assert torch.autograd.gradcheck(drawn, (*leaves.values(), tau), eps=1e-6, atol=1e-5, rtol=1e-4)
+    assert gradcheck(drawn, (*leaves.values(), tau))
 
 
 def test_behind_a_stop_derivatives_are_those_of_finite_differences():
@@ -95,13 +98,7 @@ def test_behind_a_stop_derivatives_are_those_of_finite_differences():
 
     found = drawn(*leaves.values()).fragments
     assert {1, 2, 3} <= set(found.flatten().tolist())
-    assert torch.autograd.gradcheck(
-        lambda *tensors: outputs(drawn(*tensors))[:3],
-        tuple(leaves.values()),
-        eps=1e-6,
-        atol=1e-5,
-        rtol=1e-4,
-    )
+    assert gradcheck(lambda *tensors: outputs(drawn(*tensors))[:3], tuple(leaves.values()))
 
 
 @pytest.mark.parametrize("features", [0, 2])
@@ -121,7 +118,7 @@ def test_every_number_of_a_footprint_has_the_derivative_of_finite_differences(fe
             render_footprints(camera, prints, scene.splats.tiles, tensors[-1], options=options)
         )
 
-    assert torch.autograd.gradcheck(drawn, (*leaves.values(), tau), eps=1e-6, atol=1e-5, rtol=1e-4)
+    assert gradcheck(drawn, (*leaves.values(), tau))
 
 
 def hook_gradient(inputs, weight):
@@ -204,15 +201,3 @@ def test_gradients_of_an_awkward_scene_are_finite_and_zero_where_culled(dtype):
         assert leaf.grad.isfinite().all(), name
         assert not leaf.grad[culled].any(), name
         assert leaf.grad[~culled].any(), name
-
-
-def test_a_laptop_sized_scene_is_drawn_and_differentiated():
-    inputs, leaves = scenes.leaves(scenes.random_scene(1, 5000, 160, 90))
-    tau = scenes.random_thresholds(1, 5000).requires_grad_()
-    drawn = ReferenceEngine().rasterize(inputs.with_counts(), tau)
-    (drawn.image.mean() + 1e-4 * drawn.fragments_per_pixel).backward()
-    assert drawn.fragments.sum() == drawn.fragments_per_gaussian.sum()
-    assert drawn.fragments_per_pixel.item() == pytest.approx(
-        drawn.fragments.double().mean().item(), rel=1e-5
-    )
-    assert all(leaf.grad.isfinite().all() for leaf in (*leaves.values(), tau))

@@ -159,16 +159,6 @@ def test_an_offscreen_splat_has_radius_zero():
     assert drawn.fragments.sum() == 0
 
 
-def test_alpha_is_capped_and_the_gradient_passes_through_the_cap():
-    scene = scenes.one_splat(opacity=0.999, color=(1.0, 0.5, 0.25), dtype=F64)
-    inputs, leaves = scenes.leaves(scene)
-    drawn = draw(inputs)
-    pixel = drawn.image[:, 8, 8]
-    assert pixel.tolist() == pytest.approx([0.99, 0.495, 0.2475], rel=1e-12)
-    pixel.sum().backward()
-    assert leaves["opacities"].grad.item() == pytest.approx(1.75)
-
-
 def test_a_pixel_stops_before_the_fragment_that_would_darken_it_too_much():
     # 0.1^3 = 1e-3; times 0.05 is under 1e-4: the fourth is not blended, nor is the fifth, though
     # alone the fifth would leave enough light.

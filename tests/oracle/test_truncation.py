@@ -166,7 +166,7 @@ def explicit_gradients(inputs, tau, pressure):
 
 
 @pytest.mark.parametrize("pressure", [0.0, 300.0])
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11])
 @pytest.mark.parametrize(
     "kind", [{}, {"compensation": "antialiasing"}, {"compensation": "mip"}, {"stop": 0.3}], ids=str
 )

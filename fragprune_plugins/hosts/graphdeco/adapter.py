@@ -26,7 +26,7 @@ from fragprune_plugins.hosts.graphdeco.reading import read_flags, read_getters
 from fragprune_plugins.hosts.kernels import SPLAT, Kernel, read_kernels
 from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
-from fragprune_plugins.hosts.source import Function, HostRepo
+from fragprune_plugins.hosts.source import Function, HostRepo, nodes
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -439,9 +439,7 @@ class GraphdecoAdapter(ScriptAdapter):
 
 def group_names(function: Function | None) -> tuple[str, ...]:
     """Names of the param groups that a function spells out as dicts, in source order."""
-    dicts = [
-        node for node in (ast.walk(function) if function else ()) if isinstance(node, ast.Dict)
-    ]
+    dicts = [node for node in nodes(function) if isinstance(node, ast.Dict)]
     names = [
         (value.lineno, value.col_offset, str(value.value))
         for each in dicts
@@ -461,11 +459,10 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     Raises:
         NotComparedError: the host chooses sizes in another way.
     """
-    tree = repo.tree(CAMERAS)
-    nodes = list(ast.walk(tree)) if tree else []
+    everything = nodes(repo.tree(CAMERAS))
     divisors = {
         element.value
-        for node in nodes
+        for node in everything
         if isinstance(node, ast.Compare)
         and isinstance(node.ops[0], ast.In)
         and isinstance(node.left, ast.Attribute)
@@ -474,7 +471,7 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
         for element in node.comparators[0].elts
         if isinstance(element, ast.Constant) and isinstance(element.value, int)
     }
-    capped = any(isinstance(node, ast.Constant) and node.value == WIDEST for node in nodes)
+    capped = any(isinstance(node, ast.Constant) and node.value == WIDEST for node in everything)
     value = int(default(repo, "ModelParams", "_resolution", -1)) if asked is None else asked
     if not divisors or not capped or (value < 1 and value != -1):
         raise NotComparedError(
@@ -498,7 +495,7 @@ def default(repo: HostRepo, group: str, name: str, otherwise: float) -> float:
         otherwise: the result if the source has no such number.
     """
     function = repo.function("arguments", f"{group}.__init__")
-    for node in ast.walk(function) if function else ():
+    for node in nodes(function):
         if (
             isinstance(node, ast.Assign)
             and isinstance(node.targets[0], ast.Attribute)
@@ -521,7 +518,7 @@ def numbers(repo: HostRepo, script: Path, name: str) -> list[int]:
     if value := default(repo, "OptimizationParams", name, 0):
         return [int(value)]
     tree = repo.tree(".".join(script.relative_to(repo.root).with_suffix("").parts))
-    for node in ast.walk(tree) if tree else ():
+    for node in nodes(tree):
         if (
             isinstance(node, ast.Call)
             and getattr(node.func, "attr", "") == "add_argument"

@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from fragprune_plugins.hosts.source import Function, HostRepo
+from fragprune_plugins.hosts.source import Function, HostRepo, nodes
 
 SETTINGS, RASTERIZER = "GaussianRasterizationSettings", "GaussianRasterizer"
 
@@ -94,7 +94,7 @@ def drawing_functions(repo: HostRepo, module: str) -> list[str]:
 
 def _makes_settings(repo: HostRepo, module: str, function: Function) -> bool:
     imported = _Imported(repo, module, function)
-    return any(imported.of(each, SETTINGS) for each in ast.walk(function))
+    return any(imported.of(each, SETTINGS) for each in nodes(function))
 
 
 def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]:
@@ -106,7 +106,7 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
     if body is None:
         return []
     imported = _Imported(repo, module, body)
-    made = [node for node in ast.walk(body) if imported.of(node, SETTINGS)]
+    made = [node for node in nodes(body) if imported.of(node, SETTINGS)]
     names = _settings(made[0]) if made else ()  # type: ignore[arg-type]
     if not names:
         return []
@@ -136,14 +136,14 @@ _Drawn = tuple[int | None, int, dict[str, ast.expr], str, tuple[str, ...]]
 
 def _drawn(imported: _Imported, body: Function) -> Iterator[_Drawn]:
     """Values unpacked, line, arguments, package and names of every call of the rasterizer."""
-    assigned = [node for node in ast.walk(body) if isinstance(node, ast.Assign)]
+    assigned = [node for node in nodes(body) if isinstance(node, ast.Assign)]
     targets = {id(node.value): node.targets[0] for node in assigned}
     rasterizers = {
         node.targets[0].id: imported.package(node.value)
         for node in assigned
         if imported.of(node.value, RASTERIZER) and isinstance(node.targets[0], ast.Name)
     }
-    for node in (each for each in ast.walk(body) if isinstance(each, ast.Call)):
+    for node in (each for each in nodes(body) if isinstance(each, ast.Call)):
         called = node.func
         if isinstance(called, ast.Attribute) and called.attr != "markVisible":
             called = called.value  # another method that draws
@@ -170,7 +170,7 @@ class _Imported:
         self.classes: dict[str, tuple[str, str]] = {}
         self.modules: dict[str, str] = {}
         for scope in (repo.tree(module), body):
-            for node in ast.walk(scope) if scope else ():
+            for node in nodes(scope):
                 if isinstance(node, ast.ImportFrom):
                     package = repo.absolute(module, node)
                     for each in node.names:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from fragprune_plugins.hosts.adapter import CommandLine
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.source import Function, HostRepo
+from fragprune_plugins.hosts.source import Function, HostRepo, imported, nodes
 
 GETTERS = ("get_xyz", "get_opacity")
 """Properties of the model that every adapter of this family reads."""
@@ -57,13 +57,13 @@ def is_property(function: Function) -> bool:
 def computed(function: Function, attribute: str) -> str | None:
     """How a getter computes its value; None if it always returns an attribute of ``self``."""
     names = {f"self.{attribute}"}
-    for node in ast.walk(function):
+    for node in nodes(function):
         if isinstance(node, ast.Assign) and ast.unparse(node.value) in names:
             names |= {each.id for each in node.targets if isinstance(each, ast.Name)}
-    for node in ast.walk(function):
+    for node in nodes(function):
         if isinstance(node, ast.Assign) and ast.unparse(node.value) not in names:
             names -= {ast.unparse(each) for each in node.targets}
-    returned = [node.value for node in ast.walk(function) if isinstance(node, ast.Return)]
+    returned = [node.value for node in nodes(function) if isinstance(node, ast.Return)]
     others = [ast.unparse(each) for each in returned if each and ast.unparse(each) not in names]
     if others:
         return f"computed, it returns {others[0][:60]}"
@@ -82,9 +82,9 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
         if not any(
             isinstance(node, ast.Call)
             and getattr(node.func, "attr", "") in ("parse_args", "parse_known_args")
-            for node in ast.walk(tree)
+            for node in nodes(tree)
         ):
-            others = [name for name in _imported(tree) if name in _OTHER_FLAGS]
+            others = [name for name in imported(tree) if name in _OTHER_FLAGS]
             by = f"it reads its settings with {', '.join(others)}" if others else "no argparse"
             found.append((script, by, "flags, read with argparse"))
             continue
@@ -102,19 +102,9 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
     ]
 
 
-def _imported(tree: ast.Module) -> Iterable[str]:
-    names: dict[str, None] = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names |= {each.name.split(".")[0]: None for each in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names[node.module.split(".")[0]] = None
-    return names
-
-
 def _strings(tree: ast.Module) -> Iterator[str]:
     """Strings in a script that could be flags."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         value = getattr(node, "value", None) if isinstance(node, ast.Constant) else None
         if isinstance(value, str) and value.startswith("-"):
             yield value
@@ -123,7 +113,7 @@ def _strings(tree: ast.Module) -> Iterator[str]:
 def _of_groups(repo: HostRepo) -> Iterator[str]:
     """Flags that the argument groups make of their attributes; ``_name`` also makes ``-n``."""
     tree = repo.tree("arguments")
-    for node in ast.walk(tree) if tree else ():
+    for node in nodes(tree):
         targets = node.targets if isinstance(node, ast.Assign) else []
         for each in targets:
             if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
