@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 from cli.commands import run, run_json
-from miniatures.skeletons import STATES, skeleton
+from miniatures.skeletons import skeleton
 
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
@@ -105,17 +105,6 @@ CLONE = Seam(Role.STILL, "scene.gaussian_model", "GaussianModel.densify_and_clon
 RENDER = Seam(Role.VIEW, "gaussian_renderer", "render")
 
 
-def test_a_renamed_method_is_missing_from_its_class(host):
-    mutations.rename_function(HostRepo(host), CLONE)
-    report = of(refused(host))
-    (error,) = [f for f in report["findings"] if f["level"] == "error"]
-    at = f"{MODEL}:{line_of(host, MODEL, 'class GaussianModel')}"
-    assert (error["code"], error["where"]) == ("seam-missing", f"{CLONE} ({at})")
-    (seam,) = [s for s in report["seams"] if s["seam"] == str(CLONE)]
-    assert (seam["status"], seam["at"]) == ("missing", at)
-    assert f"MISSING in {at}" in run("check", host, "--adapter", "vanilla-3dgs").stdout
-
-
 def test_a_dropped_parameter_is_named_where_the_method_is(host):
     line = line_of(host, MODEL, "def densify_and_clone(")
     mutations.rename_parameter(HostRepo(host), CLONE, "scene_extent")
@@ -125,43 +114,6 @@ def test_a_dropped_parameter_is_named_where_the_method_is(host):
     assert error["expected"] == "also scene_extent"
     text = run("check", host, "--adapter", "vanilla-3dgs").stdout
     assert f"CHANGED at {MODEL}:{line}: parameters (grads, " in text
-
-
-def test_another_number_of_values_from_the_rasterizer_is_named_in_its_line(host):
-    line = mutations.unpack_one_more(HostRepo(host), RENDER)
-    (error,) = [f for f in of(refused(host))["findings"] if f["level"] == "error"]
-    assert (error["code"], error["where"]) == ("rasterizer-call", f"{RENDER} ({RENDERER}:{line})")
-    assert error["found"].endswith("3 values back")
-
-
-def test_another_setting_of_the_rasterizer_is_named(host):
-    text = (host / RENDERER).read_text()
-    (host / RENDERER).write_text(text.replace("debug=pipe", "sharpness=1.0,\n        debug=pipe"))
-    (error,) = [f for f in of(refused(host))["findings"] if f["level"] == "error"]
-    assert error["code"] == "rasterizer-call"
-    assert error["found"].startswith("sharpness besides the shared settings")
-
-
-def test_a_file_that_is_no_python_is_said_to_be_none(host):
-    (host / MODEL).write_text("class GaussianModel(:\n")
-    found = {f["found"] for f in of(refused(host))["findings"] if f["level"] == "error"}
-    assert found == {"source that is no Python"}
-
-
-@pytest.mark.parametrize("state", STATES)
-def test_public_states_are_told_apart(tmp_path, state):
-    skeleton(tmp_path, state)
-    findings = of(run_json("check", tmp_path))["findings"]
-    assert [f["found"] for f in findings if f["code"] == "revision"] == [state]
-
-
-def test_a_cousin_is_told_by_what_it_has_otherwise(tmp_path):
-    skeleton(tmp_path, groups=("xyz", "opacity", "scaling", "rotation", "mask"))
-    report = of(refused(tmp_path))
-    assert [f["code"] for f in report["findings"]] == ["param-groups"]
-    result = run("check", tmp_path, "--verbose")
-    assert "xyz, opacity, scaling, rotation, mask; expected xyz, f_dc" in result.stdout
-    assert "No adapter fits" in result.stdout
 
 
 def test_an_ancestor_of_the_host_steps_back_and_says_so(tmp_path, monkeypatch):

@@ -250,21 +250,6 @@ def test_shapes_are_checked():
         replace(model, f_rest=torch.zeros(4, 5, 3))
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "m.ply"
-    write_ply(path, tiny.random_model(4))
-    before = path.read_bytes()
-
-    def full(*args, **kwargs):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(PlyData, "write", full)
-    with pytest.raises(Exception, match="No space left"):
-        write_ply(path, tiny.random_model(5))
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["m.ply"]
-
-
 def test_kept_rows_stay_in_their_order_with_all_that_they_have():
     model = tiny.cut(
         replace(tiny.random_model(6), filter_3d=torch.rand(6, 1)), torch.linspace(0.1, 0.6, 6)

@@ -108,15 +108,6 @@ def test_the_record_has_the_area_of_both(scene, tmp_path, more):
     assert report["settings"]["goal"] == "portable=0.01"
 
 
-def test_a_finished_command_does_nothing(scene, tmp_path):
-    data, path, _ = scene
-    words = ("finetune", path, "--data", data, "--iters", 5, "--portable")
-    out = tmp_path / "out.ply"
-    first = run_json(*words, "--out", out)
-    assert first["already_finished"] is False
-    assert run_json(*words, "--out", out) == first | {"already_finished": True}
-
-
 def test_without_photographs(scene, tmp_path):
     data, path, _ = scene
     out = tmp_path / "out.ply"
