@@ -1,4 +1,4 @@
-"""Tools to test an engine or an adapter: seeded scenes and the conformance kit."""
+"""Tools to test an adapter: the conformance kit."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ from collections import namedtuple
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 
 from fragprune_3dgs_fork import ForkDialect
@@ -17,7 +18,6 @@ from fragprune_plugins.injection import proof
 from fragprune_plugins.injection.rasterizing import further_picture
 from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.testing import scenes
 
 ROLES = ("image", "radii", "objects", "alpha", "depth", "invdepth", "unread")
 DIALECT = ForkDialect("p", (), 2, values={"p": tuple(Output(each, each) for each in ROLES)})

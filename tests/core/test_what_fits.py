@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import pytest
+import scenes
 import spacetime
 import torch
 from footprints import footprints_of
@@ -13,7 +14,6 @@ from fragprune_plugins import rasterize
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.testing import scenes
 
 NONE = {
     "a number": lambda t: 0.1,

@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
+import scenes
 import torch
 from gpu.emulated import EmulatedDevice
 from native.test_dialects import dialect
@@ -24,7 +25,6 @@ from spacetime import cut, moment, splats
 
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs
 
 KINDS = {

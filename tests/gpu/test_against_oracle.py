@@ -11,6 +11,7 @@ import math
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 from gpu.emulated import EmulatedDevice
 from native.test_against_oracle import check_gradients, check_images, draw_pair
@@ -21,7 +22,6 @@ from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 KINDS = {

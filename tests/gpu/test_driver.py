@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import scenes
 import torch
 from gpu.emulated import EmulatedDevice
 from gpu.test_compile import nvrtc
@@ -19,7 +20,6 @@ from native.test_invariants import everything
 
 from fragprune_plugins.engines.cuda import kernels
 from fragprune_plugins.engines.cuda.engine import CudaEngine
-from fragprune_plugins.testing import scenes
 
 __all__ = ["nvrtc"]
 
@@ -37,7 +37,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cuda import self_check
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.cuda.driver import Driver
-from fragprune_plugins.testing import scenes
+import scenes
 
 asked = []
 

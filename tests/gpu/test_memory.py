@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+import scenes
 from gpu.emulated import EmulatedDevice
 from gpu.holding import Holding
 
 from fragprune_plugins.engines.cuda import engine as cuda
 from fragprune_plugins.engines.cuda.engine import CudaEngine
-from fragprune_plugins.testing import scenes
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 from gpu.test_against_oracle import KINDS
 from native.test_dialects import dialect
@@ -13,7 +14,6 @@ from fragprune_plugins.engines.cuda.comparison import compare
 from fragprune_plugins.engines.cuda.driver import Driver
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs
 
 pytestmark = pytest.mark.gpu

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import scenes
 import torch
 
 from fragprune_plugins import engines
@@ -15,7 +16,6 @@ from fragprune_plugins.engines import reference
 from fragprune_plugins.engines.cuda import comparison, driver, kernels, self_check
 from fragprune_plugins.engines.cuda.self_check import Verdict, check_in_subprocess, why_not
 from fragprune_plugins.errors import EngineError, KernelError
-from fragprune_plugins.testing import scenes
 
 AGREES = Verdict("agrees")
 FAILS = Verdict("fails", "it crashed")

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import scenes
 import torch
 from miniatures.vanilla_3dgs import HOST, joint, running
 
@@ -21,7 +22,6 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import select_adapter, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins, load_plugins
-from fragprune_plugins.testing import scenes
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("fragprune_")]

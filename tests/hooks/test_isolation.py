@@ -6,6 +6,7 @@ import logging
 from types import SimpleNamespace
 
 import pytest
+import scenes
 import torch
 from miniatures.vanilla_3dgs import HOST, joint, running
 
@@ -19,7 +20,6 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, select_adapter, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
-from fragprune_plugins.testing import scenes
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = pytest.mark.usefixtures("single_thread")

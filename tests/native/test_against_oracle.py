@@ -13,13 +13,13 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, get_args
 
 import pytest
+import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Rim, Splats
 
 IMAGE_TOLERANCE = 2e-5

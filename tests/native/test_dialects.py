@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 import pytest
+import scenes
 import torch
 from footprints import footprints_of
 from hypothesis import given, settings
@@ -19,7 +20,6 @@ from native.test_against_oracle import check_gradients, check_images, draw_pair,
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs, Rim
 
 ALONE = {

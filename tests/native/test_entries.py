@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+import scenes
 import torch
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Footprints, RasterInputs, View
 
 SIDE = 64  # 4 x 4 tiles

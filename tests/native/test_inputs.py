@@ -7,6 +7,7 @@ from dataclasses import Field, fields, replace
 from typing import Any
 
 import pytest
+import scenes
 import spacetime
 import torch
 from footprints import footprints_of
@@ -17,7 +18,6 @@ from fragprune_plugins.engines.inputs import native_arrays, native_inputs
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.slicing.cutting import slice_by
 from fragprune_plugins.slicing.structs import Spacetime
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
 
 N = 20

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import get_args
 
 import pytest
+import scenes
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,7 +15,6 @@ from hypothesis import strategies as st
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs, Rim
 
 # Enough Gaussians and tiles for several pieces of work per thread, in sorting and binning too.

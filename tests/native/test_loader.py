@@ -170,8 +170,9 @@ def test_memory_is_returned() -> None:
     """A state that nobody freed would grow by 3 MB per turn here."""
     import resource
 
+    import scenes
+
     from fragprune_plugins.engines.cpu.engine import CpuEngine
-    from fragprune_plugins.testing import scenes
 
     engine = CpuEngine()
     made, _ = scenes.leaves(scenes.random_scene(0, 5000, 300, 200, scale_modifier=0.5))

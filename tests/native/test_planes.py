@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import Plane
 
 SIZE = (70, 50)

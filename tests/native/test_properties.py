@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +17,6 @@ from native.test_against_oracle import check_gradients, check_images, draw_pair
 
 from fragprune_plugins.constants import NEAR, TILE
 from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs, Splats, View
 
 Drawn = tuple[RasterInputs, torch.Tensor | None]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,7 +23,6 @@ from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 DIALECTS = {

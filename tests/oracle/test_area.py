@@ -6,13 +6,13 @@ import math
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 from footprints import footprints_of
 from oracle import naive
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.learning.area import ellipse_areas
-from fragprune_plugins.testing import scenes
 from fragprune_plugins.workbench.figures.evaluate import covered_per_pixel
 
 F64 = torch.float64

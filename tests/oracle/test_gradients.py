@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
+import scenes
 import torch
 from footprints import footprints_of
 
@@ -16,7 +17,6 @@ from fragprune_plugins.engines.reference import (
     options_of,
     projected_of,
 )
-from fragprune_plugins.testing import scenes
 from reference_renderer import Options, render, render_footprints
 
 F64 = torch.float64

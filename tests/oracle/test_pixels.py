@@ -6,11 +6,11 @@ import math
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 from oracle import naive
 
 from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
-from fragprune_plugins.testing import scenes
 from reference_renderer import Options, render
 
 F64 = torch.float64

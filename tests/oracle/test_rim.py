@@ -6,11 +6,11 @@ import math
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 
 from fragprune_plugins import rasterize
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.testing import scenes
 
 F64 = torch.float64
 SIZE = 33

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import scenes
 import torch
 from footprints import footprints_of
 
@@ -16,7 +17,6 @@ import reference_renderer
 from fragprune_plugins import constants
 from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.testing import scenes
 from reference_renderer import Options, covariance, project, scene
 from reference_renderer.fragment import fragments
 

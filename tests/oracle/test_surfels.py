@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import scenes
 import torch
 from oracle.naive import color_of
 
@@ -17,7 +18,6 @@ from fragprune_plugins.engines.reference import (
     options_of,
 )
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.testing import scenes
 from reference_renderer import render
 from reference_renderer.surfel import meet
 

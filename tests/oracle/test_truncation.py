@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,7 +14,6 @@ from oracle import naive
 
 from fragprune_plugins import rasterize
 from fragprune_plugins.engines.reference import camera_of, gaussians_of
-from fragprune_plugins.testing import scenes
 from reference_renderer import Options, project, render
 from reference_renderer.fragment import fragments
 
