@@ -27,8 +27,6 @@ class Learning:
     """Share of a pixel's light at which it stops; None keeps what the model has."""
     rim: Literal["hard", "soft"] | None = None
     """How thresholds cut; None keeps what the model has."""
-    nonfinite: Literal["stop", "skip"] = Settings.nonfinite
-    """What to do with a step whose gradients are NaN or infinite."""
 
     def settings(self) -> Settings:
         """The settings of these flags; raises UsageError if one is out of range."""

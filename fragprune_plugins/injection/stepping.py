@@ -150,11 +150,7 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
 
 
 def expect_sound(session: SessionState, model: Any, state: ModelState) -> None:
-    """Before an optimizer steps, drop all gradients of a learning model if one is not finite.
-
-    Raises:
-        DivergedError: one is not, and the settings do not say that such steps are skipped.
-    """
+    """Raise DivergedError, before an optimizer steps, unless all gradients are finite."""
     if state.stage is None or state.stage.plan is None:
         return
     parameters = state.stage.parameters()
@@ -163,9 +159,7 @@ def expect_sound(session: SessionState, model: Any, state: ModelState) -> None:
         for name, parameter in parameters.items()
         if parameter.grad is not None
     }
-    if not state.stage.sound(gradients):
-        for parameter in parameters.values():
-            parameter.grad = None
+    state.stage.expect_sound(gradients)
 
 
 def after_step(session: SessionState, reference: Any, *_: Any) -> None:

@@ -64,8 +64,6 @@ class Settings:
         seed: of the order of views in ``finetune``; hosts have their own.
         views_per_step: that ``finetune`` draws in each step, whose loss is their mean; hosts have
             their own.
-        nonfinite: what to do with a step whose gradients are NaN or infinite: "stop" with an error,
-            or "skip" it.
 
     Raises:
         UsageError: a value is of another kind, or out of range.
@@ -81,7 +79,6 @@ class Settings:
     rim: Rim | None = None
     seed: int = 0
     views_per_step: int = 1
-    nonfinite: Literal["stop", "skip"] = "stop"
 
     def __post_init__(self) -> None:
         def whole(least: int, most: int) -> Callable[[Any], bool]:
@@ -101,7 +98,6 @@ class Settings:
             ("rim", (None, *get_args(Rim)).__contains__, "hard, soft or None"),
             ("seed", lambda value: type(value) is int, "a whole number"),
             ("views_per_step", whole(1, ITERATIONS_MAX), "a whole number, 1 or more"),
-            ("nonfinite", ("stop", "skip").__contains__, "stop or skip"),
         )
         for name, fits, expected in checks:
             if not fits(value := getattr(self, name)):

@@ -7,7 +7,7 @@ optimizer of everything but the thresholds, tells it what happens, in this order
     thresholds  what one rasterization is drawn with
     drew        what came of it; the fragment pressure, a term for the driver's loss, comes back
     lost        the loss of the view drawn last went backward
-    sound       whether its gradients are finite; the driver's optimizer steps only if they are
+    expect_sound  its gradients must be finite, before the driver's optimizer steps
     end         the driver's optimizer stepped; the thresholds step too
 
 A target (``targets``) is a ratio that thresholds are held to.
@@ -53,11 +53,8 @@ RESET, MOSTLY = 0.0101, 0.9
 CURVE_POINTS = 100
 """Thresholds' median, a sort of all rows, is taken this often in a run."""
 
-SKIPS_MOST = 100
-"""Steps with gradients that are not finite which a run leaves out at most."""
-
 _STORED = ("adam_step", "steps", "stop", "rim")
-_COUNTED = ("steps", "taken", "skipped", "_open", "_held", "_median")
+_COUNTED = ("steps", "taken", "_open", "_held", "_median")
 
 View = TypeVar("View")
 
@@ -91,7 +88,6 @@ class Progress:
         faster: frame times before over after, as measured when a target time was met; else None.
         target_reached: the ratio is within 5 % of the target; None without a target.
         pressure: lambda.
-        skipped: steps that were left out, because gradients were not finite.
     """
 
     steps: int
@@ -102,7 +98,6 @@ class Progress:
     faster: float | None
     target_reached: bool | None
     pressure: float
-    skipped: int = 0
 
 
 class Stage2:
@@ -148,7 +143,6 @@ class Stage2:
         self._everywhere = everywhere
         self.parameters = parameters
         self.picture = ""  # the view's name, for messages; drivers set it before they draw
-        self.skipped = 0  # steps whose gradients were not finite
         self._open = False  # the warm-up is over
         self._held = False  # thresholds have met their target and stay
         # by picture: fragments per pixel, and last what a target counts: these, or a cost
@@ -318,38 +312,29 @@ class Stage2:
             return self.plan.opacity_lr
         return base * self.plan.decay
 
-    def sound(self, gradients: Mapping[str, Tensor]) -> bool:
-        """Whether the driver's optimizer may step; if not, it drops all gradients of this step.
+    def expect_sound(self, gradients: Mapping[str, Tensor]) -> None:
+        """Check gradients before the driver's optimizer steps.
 
         Args:
             gradients: of the parameters that train, by their names. Those of the thresholds are
-                looked at too, and dropped here.
+                looked at too.
 
         Raises:
-            DivergedError: a gradient, or its square, is NaN or infinite, and the settings say
-                "stop", or say "skip" and this happened ``SKIPS_MOST`` times.
+            DivergedError: a gradient, or its square, is NaN or infinite.
         """
         ours = self.store.logits.grad
         known = dict(gradients) | ({} if ours is None else {"thresholds": ours})
         if are_finite(known.values()):
-            return True
+            return
         found = not_finite({name: each.float().square() for name, each in known.items()})
         if not found:  # very large, and Adam can take it
-            return True
-        where = f"stage 2, step {self.steps}" + (f", view {self.picture}" if self.picture else "")
-        what = f"NaN or infinity in the gradient of {', '.join(found)}"
-        if self.settings.nonfinite == "stop" or self.skipped == SKIPS_MOST:
-            raise DivergedError(
-                where,
-                what + (f", after {self.skipped} skipped steps" if self.skipped else ""),
-                "finite gradients",
-                "Nothing of it was taken over. Look at that view and its photograph; "
-                "--on-nonfinite skip leaves out such steps.",
-            )
-        self.skipped += 1
-        self.store.logits.grad = None
-        log.warning("%s: %s; the step is skipped", where, what)
-        return False
+            return
+        raise DivergedError(
+            f"stage 2, step {self.steps}" + (f", view {self.picture}" if self.picture else ""),
+            f"NaN or infinity in the gradient of {', '.join(found)}",
+            "finite gradients",
+            "Nothing of it was taken over. Look at that view and its photograph.",
+        )
 
     def end(self) -> None:
         """The driver's optimizer has stepped: so do the thresholds.
@@ -412,7 +397,6 @@ class Stage2:
             faster=figures.get("faster"),
             target_reached=reached,
             pressure=self.pressure.value,
-            skipped=self.skipped,
         )
 
     def state_dict(

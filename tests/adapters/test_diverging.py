@@ -78,22 +78,6 @@ def test_a_gradient_that_is_not_finite_stops_its_own_step(begin):
         assert torch.equal(model._opacity, before)  # it was not taken
 
 
-@pytest.mark.parametrize("begin", [running, joint])
-def test_such_a_step_can_be_skipped_and_is_told(begin, caplog):
-    with begin(Settings(iterations=9, train="opacity", nonfinite="skip")) as host:
-        model, camera = host.model(20), host.camera()
-        host.step(model, camera, 1)
-        before, store = model._opacity.detach().clone(), host.store(model)
-        thresholds = store.logits.detach().clone()
-        spoiled_step(model, camera, host, 2)
-        assert torch.equal(model._opacity, before)
-        assert torch.equal(store.logits, thresholds)
-        host.step(model, camera, 3)
-        assert not torch.equal(model._opacity, before)
-        assert all(each.isfinite().all() for each in store.numbers.values())
-    assert "the step is skipped" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("what", "value"), [("scaling", torch.nan), ("scaling", torch.inf), ("thresholds", torch.nan)]
 )

@@ -149,7 +149,6 @@ def test_the_model_itself_is_no_output(scene, command):
     [
         (("finetune", "m.ply", "--data", "d", "--out"), "pruned.txt", ".ply"),
         (("finetune", "m.ply", "--data", "d", "--out"), "pruned", ".ply"),
-        (("finetune", "m.ply", "--data", "d", "--out", "o.ply", "--curves"), "c.jpg", ".png"),
         (("export", "m.ply", "--out"), "pruned.obj", ".ply"),
         (("report", "d", "--out"), "page.pdf", ".html"),
     ],

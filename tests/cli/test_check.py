@@ -54,7 +54,7 @@ def test_the_host_that_fits_with_every_seam_in_its_place(host):
             file, line = seam["at"].split(":")
             name = seam["seam"].split(":")[1].split(".")[-1]
             assert f"def {name}(" in (host / file).read_text().splitlines()[int(line) - 1]
-    text = run("check", host, "--verbose")
+    text = run("check", host, "--adapter", "vanilla-3dgs")
     assert text.exit_code == 0
     assert f"{MODEL}:{line_of(host, MODEL, 'def densify_and_split')}" in text.stdout
     assert f"fragprune run -- python {host / 'train.py'}" in text.stdout
@@ -77,7 +77,7 @@ def test_a_host_that_fits_needs_no_line_of_any_other_adapter(host):
     text = run("check", host).stdout
     assert text.splitlines()[4].startswith("vanilla-3dgs fits: ")
     assert "does not fit" not in text
-    assert "others do not fit (--verbose says why)" in text
+    assert "others do not fit (--adapter NAME says why)" in text
 
 
 def test_one_that_fits_none_has_a_short_line_an_adapter_the_nearest_first(host):

@@ -45,7 +45,7 @@ def scene(tmp_path):
 COMMANDS = {
     "finetune": lambda data, path, cameras, out: (
         *(path, "--data", data, "--out", out / "small.ply", "--iters", 4),
-        *("--train", "all", "--curves", out / "curves.png"),
+        *("--train", "all"),
     ),
     "finetune to a target": lambda data, path, cameras, out: (
         *(path, "--data", data, "--out", out / "small.ply", "--iters", 20),

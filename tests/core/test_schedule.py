@@ -78,7 +78,6 @@ def test_joint_learning_begins_at_its_step_and_leaves_the_opacity_rate_alone(ste
         {"stop": 2.0},
         {"seed": "x"},
         {"views_per_step": 0},
-        {"nonfinite": "explode"},
         {"goal": Portable(), "train": "opacity"},
         {"goal": Portable(), "stop": 0.01},
     ],

@@ -10,7 +10,7 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
+from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.learning.goals import Control, Faster, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import checkpoints as files
@@ -144,27 +144,6 @@ def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkey
     assert len(read) == len(dataset.train) + len(dataset.test)
     read[0].write_bytes(read[0].read_bytes() + b"0")
     assert asked() != first
-
-
-def test_a_run_that_a_step_stopped_may_go_on_and_skip_it(
-    model, dataset, tmp_path, monkeypatch, single_thread
-):
-    loss, images = loop.photometric_loss, []
-
-    def spoiling(image, target):
-        images.append(image)
-        return loss(image, target) * (torch.nan if len(images) in bad else 1)
-
-    bad, path = {5}, tmp_path / "unfinished"
-    monkeypatch.setattr(loop, "photometric_loss", spoiling)
-    with pytest.raises(DivergedError, match="step 5"):
-        run(model, dataset, Settings(iterations=STEPS), path)
-    bad = {7}  # step 5, after the checkpoint of step 3
-    skipping = Settings(iterations=STEPS, nonfinite="skip")
-    result = run(model, dataset, skipping, path)
-    images, bad = [], {5}
-    assert result.resumed_at == 3
-    require_same(run(model, dataset, skipping), result)
 
 
 def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatch, single_thread):

@@ -12,8 +12,9 @@ from fragprune_plugins.workbench.commands.options import FILE
 
 @click.command("check", cls=Command)
 @click.argument("host", type=FILE)
-@click.option("--adapter", help="Check only this adapter, and show every seam.")
-@click.option("--verbose", is_flag=True, help="Show where every seam is and what is wrong.")
+@click.option(
+    "--adapter", help="Check only this adapter, and show where every seam is and what is wrong."
+)
 @click.option("--all", "every", is_flag=True, help="HOST is a folder of checkouts: a row for each.")
 def command(**options: Any) -> Report:
     """Read HOST, a training repository, and say what fragprune can do with it.
@@ -23,7 +24,7 @@ def command(**options: Any) -> Report:
     differences from the nearest host.
 
     Nothing is imported or run, and no GPU is needed. The output lists packages that the host
-    imports and that are not installed. --verbose shows for every seam the file and line where it
+    imports and that are not installed. --adapter shows for every seam the file and line where it
     was found, changed or expected, and lists what does not work. --all prints a table of all
     checkouts in a folder. The exit code is 0 if exactly one adapter fits.
 

@@ -20,7 +20,7 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
 
 
-def check(*, host: Path, adapter: str | None, verbose: bool, every: bool) -> Report:
+def check(*, host: Path, adapter: str | None, every: bool) -> Report:
     """Do what ``fragprune check`` promises; its options are the arguments."""
 
     if not host.is_dir() and HostRepo.installed(str(host)) is None:
@@ -56,7 +56,7 @@ def check(*, host: Path, adapter: str | None, verbose: bool, every: bool) -> Rep
     if judged.differs:
         lines += ["", f"It differs from {judged.adapter}:", *(f"  {d}" for d in judged.differs)]
     lines += [""]
-    lines += _in_full(tried, fitting) if verbose or adapter else _in_short(tried, fitting)
+    lines += _in_full(tried, fitting) if adapter else _in_short(tried, fitting)
     if missing:
         lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
         lines += [f"  {install(missing)}"]
@@ -106,7 +106,7 @@ def _in_short(tried: list[Tried], fitting: list[Tried]) -> list[str]:
         return [f"None of {len(tried)} adapters finds anything of its host."]
     ancestors = [each for each in tried if each.match.fits and each not in shown]
     others = len(tried) - len(shown) - len(ancestors)
-    why = "do not fit (--verbose says why)" if fitting else "find nothing of their hosts"
+    why = "do not fit (--adapter NAME says why)" if fitting else "find nothing of their hosts"
     return [
         *(each.brief() for each in shown),
         *(f"{each.verdict()}; {_aside(each, fitting)}" for each in ancestors),

@@ -90,14 +90,6 @@ _OPTIONS = (
         is_flag=True,
         help="Run the same iterations without truncation, to compare with.",
     ),
-    click.option(
-        "--on-nonfinite",
-        "nonfinite",
-        type=click.Choice(["stop", "skip"]),
-        default="stop",
-        show_default=True,
-        help="A step whose gradients are NaN or infinite stops with an error, or is skipped.",
-    ),
 )
 
 _OF_FINETUNE = (
@@ -146,7 +138,6 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
             stop: float | None,
             rim: Rim | None,
             control: bool,
-            nonfinite: Any,
             target_time: float | None = None,
             max_drop: float | None = None,
             **kwargs: Any,
@@ -166,7 +157,6 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
                     rim=rim,
                     seed=kwargs.get("seed", 0),
                     views_per_step=views,
-                    nonfinite=nonfinite,
                 )
             return function(*args, settings=settings, **kwargs)
 

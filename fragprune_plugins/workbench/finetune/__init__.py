@@ -87,9 +87,6 @@ def _share(
 @shard_option
 @click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
 @click.option(
-    "--curves", type=OutFile(".png"), help="File for a picture of the learning curves (.png)."
-)
-@click.option(
     "--drop-invisible",
     "drop",
     is_flag=True,

@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from torch import Tensor
-
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files import records
@@ -25,7 +23,6 @@ from fragprune_plugins.workbench.figures.wording import (
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.written import describe_dropped, describe_written
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
@@ -133,7 +130,6 @@ class Finetuned:
             "resumed_at": result.resumed_at,
             "already_finished": False,
             "iterations": done.steps,
-            "skipped": done.skipped,
             "pressure": done.pressure if settings.goal.presses else None,
             "train_seconds": result.train_seconds,
             "engine": result.engine,
@@ -174,8 +170,6 @@ class Finetuned:
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
             lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
-        if data["skipped"]:
-            lines.append(f"Skipped {data['skipped']} steps whose gradients were not finite.")
         if self.keep is not None:
             lines.append(
                 f"Removed {self.removed:,} of {len(self.start.model):,} Gaussians before learning, "
@@ -197,7 +191,7 @@ class Finetuned:
         return "\n".join(lines)
 
 
-def finished(model: Path, out: Path, asked: dict[str, Any], curves: Path | None) -> Report | None:
+def finished(model: Path, out: Path, asked: dict[str, Any]) -> Report | None:
     """The report of the same command, if it has written ``out`` already; else None."""
     if not out.is_file():
         return None
@@ -211,8 +205,6 @@ def finished(model: Path, out: Path, asked: dict[str, Any], curves: Path | None)
     if written != out.name:  # a model of the same name in another format
         return None
     data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
-    if curves is not None:
-        draw_curves(curves, record.data["curves"], models.load(out).falloff)
     text = (
         f"{record.data['text']}\n{out} was finished before: nothing was done. "
         "--again fine-tunes again."
@@ -238,20 +230,6 @@ def terminated(model: Path, out: Path, result: FinetuneResult, found: Bounded | 
     at = f"SIGTERM at {done.steps} of {asked.iterations} iterations."
     text = f"{at} Wrote {out}. {_goes_on(found)}"
     return Report(data, text, exit_code=EXIT_CODE)
-
-
-def draw_curves(path: Path, points: Sequence[dict[str, Any]], thresholds: Tensor | None) -> None:
-    """Draw the learning curves of --curves, if any step was made.
-
-    Args:
-        path: of the PNG.
-        points: one for each step, as plain values.
-        thresholds: (N,) learned ones, or None.
-    """
-    if points:
-        from fragprune_plugins.workbench.report.page import save_learning
-
-        save_learning(path, points, thresholds)
 
 
 def _goes_on(found: Bounded | None) -> str:

@@ -266,8 +266,7 @@ class Training:
         for group, (name, base) in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = stage.rate(name, base)
         gradients = {name: each.grad for name, each in self.parameters().items()}
-        if not stage.sound({name: each for name, each in gradients.items() if each is not None}):
-            self.optimizer.zero_grad(set_to_none=True)
+        stage.expect_sound({name: each for name, each in gradients.items() if each is not None})
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()

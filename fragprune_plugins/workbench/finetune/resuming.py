@@ -140,7 +140,6 @@ class Keeper:
         )
         self.asked = processes.described(asked) | {"loss": code_for(training.start.device)}
         self.asked |= {} if stage.target is None else stage.target.decides()
-        del self.asked["nonfinite"]  # a run that such a step stopped may go on and skip it
         if checkpoints is not None:
             self._go_on(checkpoints, training)
         processes.agree({**self.asked, "checkpoint": training.done, "torch": torch.__version__})

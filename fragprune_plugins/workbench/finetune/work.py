@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -57,7 +57,6 @@ class Asked:
     seed: int
     shard: bool
     no_truncation: bool
-    curves: Path | None
     drop: bool
     every: float
     again: bool
@@ -147,7 +146,7 @@ def _finished(opened: _Opened) -> Report | None:
     if asked.again:
         opened.checkpoints.clear()
         return None
-    return finetuned.finished(asked.model, asked.out, opened.configuration, asked.curves)
+    return finetuned.finished(asked.model, asked.out, opened.configuration)
 
 
 def _learned(opened: _Opened, ranks: Ranks) -> tuple[Finetuned, Engine]:
@@ -190,9 +189,6 @@ def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | N
         return finetuned.terminated(asked.model, asked.out, result, over.found)
     if asked.drop:
         over = _drop_invisible(over, opened.dataset, opened.engine)
-    if asked.curves is not None:
-        points = [asdict(point) for point in result.curves]
-        finetuned.draw_curves(asked.curves, points, over.saved.falloff)
     figures = measured or over.measured(opened.dataset, opened.engine)
     pictures = asked.scene.as_record(asked.cameras) if asked.itself else None
     report = over.report(
