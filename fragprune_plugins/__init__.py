@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.finetune.api import finetune
     from fragprune_plugins.workbench.finetune.result import FinetuneResult
     from fragprune_plugins.workbench.models.model import load, save
-    from fragprune_plugins.workbench.prices.calibration import prices_of
-    from fragprune_plugins.workbench.prices.cost import Cost
     from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
     from fragprune_plugins.workbench.ranks import joined
     from fragprune_plugins.workbench.scenes.cameras import load_cameras
@@ -57,7 +55,6 @@ __version__ = VERSION
 _HOME = {
     "AtMost": "learning.goals",
     "Control": "learning.goals",
-    "Cost": "workbench.prices.cost",
     "Faster": "learning.goals",
     "Fewer": "learning.goals",
     "FinetuneResult": "workbench.finetune.result",
@@ -89,7 +86,6 @@ _HOME = {
     "own_pictures": "workbench.scenes.itself",
     "part_of": "workbench.distributed.processes",
     "paused": "injection.api",
-    "prices_of": "workbench.prices.calibration",
     "rasterize": "plugins.hooks",
     "render_view": "workbench.figures.viewing",
     "save": "workbench.models.model",
@@ -99,7 +95,6 @@ _HOME = {
 __all__ = [
     "AtMost",
     "Control",
-    "Cost",
     "Faster",
     "Fewer",
     "FinetuneResult",
@@ -132,7 +127,6 @@ __all__ = [
     "own_pictures",
     "part_of",
     "paused",
-    "prices_of",
     "rasterize",
     "render_view",
     "save",

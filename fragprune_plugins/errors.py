@@ -138,12 +138,6 @@ class KernelError(EngineError):
     code = "kernel"
 
 
-class CostError(FragpruneError):
-    """A file of prices that cannot be read, or holds no prices."""
-
-    code = "cost"
-
-
 class InputError(FragpruneError):
     """Tensors of the wrong shape, dtype or device."""
 

@@ -55,17 +55,14 @@ class Observation:
     Attributes:
         progress: share of the learning that was over, 0 to 1.
         fragments: drawn per pixel, mean over the step's views; or what else the pressure acts on.
-        untruncated: the same views' fragments before learning began.
-        ratio: before over after of what a target counts; None for that of fragments, NaN where it
-            was not looked at.
+        ratio: before over after of what a target holds, or of the fragments.
         loss: the photometric loss, without the pressure; NaN when not known.
     """
 
     progress: float
     fragments: float
-    untruncated: float
+    ratio: float
     loss: float
-    ratio: float | None = None
 
 
 class PressureRule(Protocol):
@@ -240,11 +237,9 @@ class PressureController:
 
     def observe(self, step: Observation) -> None:
         """Average the logarithms of the ratios over a period, then correct lambda once."""
-        ratio = step.ratio or max(step.untruncated, 1e-9) / max(step.fragments, 1e-9)
-        if not math.isnan(ratio):
-            self._sum -= math.log(min(ratio, 1e6))
-            self._count += 1
-        if step.progress < self._next or not self._count:
+        self._sum -= math.log(min(step.ratio, 1e6))
+        self._count += 1
+        if step.progress < self._next:
             return
         error = math.log(self.target) + self._sum / self._count  # > 0: not enough truncated yet
         change = max(-math.log(2), min(math.log(2), self.gain * error / self._slope))

@@ -145,7 +145,7 @@ class Stage2:
         self.picture = ""  # the view's name, for messages; drivers set it before they draw
         self._open = False  # the warm-up is over
         self._held = False  # thresholds have met their target and stay
-        # by picture: fragments per pixel, and last what a target counts: these, or a cost
+        # by picture: fragments per pixel
         self._before: dict[_Picture, Tensor] = {}
         self._after: dict[_Picture, Tensor] = {}
         self._visited = (0, 0)  # how many of these there were before this step
@@ -256,8 +256,8 @@ class Stage2:
         counted = torch.is_grad_enabled() and self.plan is not None and self.plan.counted
         if counted and picture not in self._before:
             with torch.no_grad():
-                self._before[picture] = self._count(untruncated())
-        drawn = self._count(outputs)
+                self._before[picture] = _fragments_of(untruncated())
+        drawn = _fragments_of(outputs)
         if picture in self._before and self._open:
             self._after[picture] = drawn
         if not counted:
@@ -365,11 +365,10 @@ class Stage2:
             loss=views.loss,
         )
         if self.learning:
-            target = self.target
-            ratio = None if target is None else target.steers_by(self.steps, self._ratio_of_step)
-            self.pressure.observe(
-                Observation(plan.progress, views.pressed, views.untruncated, views.loss, ratio)
-            )
+            ratio = max(views.untruncated, 1e-9) / max(views.pressed, 1e-9)
+            if self.target is not None:
+                ratio = self.target.followed(ratio)
+            self.pressure.observe(Observation(plan.progress, views.pressed, ratio, views.loss))
         views.begin()  # first, so that whoever watches may raise
         if self._watch is not None:
             self._watch(stats)
@@ -451,29 +450,13 @@ class Stage2:
         put(self._views, {"expected": plain["expected"]})
         put(self.pressure, plain["pressure"])
 
-    def _count(self, outputs: RasterOutputs) -> Tensor:
-        fragments = outputs.fragments_per_pixel.detach().reshape(1)
-        cost = None if self.target is None else self.target.cost(outputs)
-        return fragments if cost is None else torch.cat([fragments, fragments.new_tensor([cost])])
-
-    @torch.no_grad()
-    def _ratio_of_step(self) -> float:
-        """The ratio of what the step's views cost, drawn once more.
-
-        A draw with gradients of thresholds evaluates rims as well.
-        """
-        for view in dict.fromkeys(view for view, _ in self._pictures):
-            self._again[view]()
-        return self._ratio(self._pictures)
-
     def _ratio(self, pictures: Iterable[_Picture]) -> float:
-        """Before over after of what a target counts, summed over pictures."""
+        """Fragments before over after, summed over pictures; infinite beyond what a target may."""
         pictures = list(pictures)
         before, after = (
-            sum(float(drawn[each][-1]) for each in pictures)
-            for drawn in (self._before, self._after)
+            sum(float(drawn[each]) for each in pictures) for drawn in (self._before, self._after)
         )
-        return before / max(after, 1e-9)
+        return before / max(after, 1e-9) if before < FEWEST * after else math.inf
 
     def _meet_target(self, progress: float) -> None:
         """Late in the run, and again before its last step, shift all thresholds onto the target."""
@@ -492,11 +475,7 @@ class Stage2:
         def ratio() -> float:
             for view in views:
                 self._again[view]()
-            before, after = (
-                sum(float(drawn[each][0]) for each in pictures)
-                for drawn in (self._before, self._after)
-            )
-            return self._ratio(pictures) if before < FEWEST * after else math.inf
+            return self._ratio(pictures)
 
         if due:
             target.meet(self.store, ratio, views)
@@ -505,5 +484,10 @@ class Stage2:
             target.look(progress, ratio, views)
 
 
+def _fragments_of(outputs: RasterOutputs) -> Tensor:
+    """(1,) drawn per pixel."""
+    return outputs.fragments_per_pixel.detach().reshape(1)
+
+
 def _mean(figures: Mapping[_Picture, Tensor]) -> float | None:
-    return float(torch.stack(list(figures.values()))[:, 0].mean()) if figures else None
+    return float(torch.stack(list(figures.values())).mean()) if figures else None

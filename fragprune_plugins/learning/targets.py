@@ -1,7 +1,7 @@
 """A ratio that thresholds are held to, before over after, and the shift that meets it.
 
-Stage 2 asks its target what a picture costs, and late in the run to meet the ratio. This one counts
-fragments; what counts something else, such as the time of a frame, overrides it.
+Stage 2 asks its target, late in the run, to meet the ratio. This one is of fragments; one of what
+follows them, such as the time of a frame, overrides it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from fragprune_plugins.learning.plain import put
 
 if TYPE_CHECKING:
     from fragprune_plugins.learning.thresholds import ThresholdStore
-    from fragprune_plugins.types import RasterOutputs
 
 TOLERANCE = 0.05
 """A target counts as reached within this relative distance."""
@@ -48,21 +47,9 @@ class Target:
     def attach(self, training: Any) -> None:
         """A training begins that is to meet it; see ``finetune.loop.Training``."""
 
-    def decides(self) -> dict[str, Any]:
-        """What decides the result beside the goal, as plain values."""
-        return {}
-
-    def cost(self, outputs: RasterOutputs) -> float | None:
-        """What is counted of a picture, in any unit; None for its fragments."""
-        return None
-
-    def steers_by(self, step: int, ratio: Callable[[], float]) -> float | None:
-        """The ratio to steer the pressure by in a step; None for that of fragments.
-
-        NaN where the step is not looked at. ``ratio()`` draws its views once more, and gives the
-        ratio of their costs.
-        """
-        return None
+    def followed(self, fragments: float) -> float:
+        """The figure's ratio that a ratio of fragments brings, to steer by."""
+        return fragments
 
     def wants_look(self, progress: float) -> bool:
         """Whether ``look`` is due before thresholds meet the target."""
@@ -76,7 +63,7 @@ class Target:
 
         Args:
             store: the thresholds.
-            ratio: draws the views and gives the ratio of their costs.
+            ratio: draws the views and gives the ratio of their fragments.
             views: that calibration measures.
         """
         self.met = calibrate(store, ratio, self.ratio)

@@ -107,8 +107,6 @@ def test_usage(arguments: tuple[object, ...]) -> None:
     ("arguments", "refused"),
     [
         (("--gaussians", 5), "--gaussians"),
-        (("--calibrate",), "MODEL"),
-        (("--out", "prices.json"), "--out"),
     ],
 )
 def test_an_option_without_effect_on_a_model_is_refused(

@@ -11,8 +11,8 @@ import torch
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 from fragprune_plugins.workbench.bench import timing as bench
+from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import Case, measure, translation
-from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
 ROW = {
     "scene",

@@ -10,7 +10,7 @@ import torch
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.prices.scene import make_scene, make_view
+from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 
 COLUMNS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 DIGEST = "f817cb6da8fd62dc50b6708bc3d1ff33eb9ef1bac9659ece73ee8aaf77c8b582"

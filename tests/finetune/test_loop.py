@@ -16,10 +16,8 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.targets import calibrate
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.finetune import faster, loop
 from fragprune_plugins.workbench.finetune.api import finetune
-from fragprune_plugins.workbench.prices import target as frames
-from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
@@ -223,29 +221,27 @@ def test_calibration_keeps_the_nearest_end_when_out_of_reach():
     assert calls[-1] > calls[0]
 
 
-COST = Cost(dict(zip(UNITS, (2e4, 1.0, 50.0, 20.0, 0.2, 0.5), strict=True)))
+def ms_of(outputs) -> float:
+    """What a frame takes on a machine whose clock is exact."""
+    return 0.02 + 1e-3 * outputs.evaluated_per_pixel + 2e-3 * float(outputs.fragments_per_pixel)
 
 
 @pytest.mark.parametrize("target", [1.2, 1.4])
 def test_a_target_time_is_met_where_frames_take_what_is_measured(
     model, dataset, target, monkeypatch
 ):
-    """On a machine whose pixels and fragments cost twice what the prices say."""
-    real = Cost(COST.prices | {"pixel": 2.0, "fragment": 1.0})
 
     def timed(work, device):
         inputs, thresholds = work.args
         leaves = [inputs.splats.means, inputs.splats.opacities, thresholds]
         assert not any(leaf is not None and leaf.requires_grad for leaf in leaves)  # no states kept
         outputs = work()
-        return outputs, real.ms(work_of(outputs))
+        return outputs, ms_of(outputs)
 
-    monkeypatch.setattr(frames, "timed", timed)
-    monkeypatch.setattr(frames, "_SECONDS", 0.0)
+    monkeypatch.setattr(faster, "timed", timed)
+    monkeypatch.setattr(faster, "_SECONDS", 0.0)
     settings = Settings(iterations=60, goal=Faster(target))
-    result = finetune(
-        model, dataset, settings, target=frames.FrameTarget(target, COST), engine="cpu"
-    )
+    result = finetune(model, dataset, settings, engine="cpu")
     assert result.progress.target_reached
     assert result.progress.faster == pytest.approx(target, rel=0.02)
     engine, times = create_engine("cpu"), []
@@ -254,15 +250,21 @@ def test_a_target_time_is_met_where_frames_take_what_is_measured(
             engine.rasterize(RasterInputs(shot.view, each.splats(), planes=()), each.falloff)
             for shot in dataset.train
         ]
-        times.append(sum(real.ms(work_of(outputs)) for outputs in drawn))
+        times.append(sum(map(ms_of, drawn)))
     assert times[0] / times[1] == pytest.approx(target, rel=0.02)
 
 
-def test_a_target_time_that_no_threshold_reaches_is_refused_before_any_work(model, dataset):
-    fixed = Cost(COST.prices | {"frame": 1e9})
-    settings, target = Settings(iterations=9, goal=Faster(1.5)), frames.FrameTarget(1.5, fixed)
+def test_a_target_time_that_no_threshold_reaches_is_refused_before_any_work(
+    model, dataset, monkeypatch
+):
+    def timed(work, device):
+        outputs = work()
+        return outputs, 1e3 + ms_of(outputs)
+
+    monkeypatch.setattr(faster, "timed", timed)
+    monkeypatch.setattr(faster, "_SECONDS", 0.0)
     with pytest.raises(UsageError, match=r"less than 1\.\d\dx"):
-        finetune(model, dataset, settings, target=target, engine="cpu")
+        finetune(model, dataset, Settings(iterations=9, goal=Faster(1.5)), engine="cpu")
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -276,6 +278,6 @@ def test_calibration_meets_what_is_measured_through_a_prediction_that_errs(noise
     def measured():
         return predicted() ** 0.5 * (1 + noise * (2 * stream.random() - 1))
 
-    reached = frames.calibrate_measured(store, predicted, measured, 1.6)
+    reached = faster.calibrate_measured(store, predicted, measured, 1.6)
     assert reached == pytest.approx(1.6, rel=0.01 + noise)
     assert predicted() ** 0.5 == pytest.approx(1.6, rel=0.01 + 2 * noise)

@@ -14,11 +14,9 @@ from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.learning.goals import Control, Faster, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import checkpoints as files
-from fragprune_plugins.workbench.finetune import loop, resuming
+from fragprune_plugins.workbench.finetune import faster, loop, resuming
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-from fragprune_plugins.workbench.prices import target as frames
-from fragprune_plugins.workbench.prices.cost import UNITS, Cost, work_of
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
@@ -96,31 +94,21 @@ def test_cut_off_again_and_again_it_ends_as_if_never_cut(
     require_same(whole, result)
 
 
-PRICES = Cost(dict(zip(UNITS, (2e4, 1.0, 50.0, 20.0, 0.2, 0.5), strict=True)))
-
-
 def test_a_target_time_that_was_cut_off_keeps_what_was_timed(
     model, dataset, tmp_path, monkeypatch, single_thread
 ):
-    real = Cost(PRICES.prices | {"fragment": 1.0})
-
     def timed(work, device):
         outputs = work()
-        return outputs, real.ms(work_of(outputs))
+        return outputs, 0.02 + 2e-3 * float(outputs.fragments_per_pixel)
 
-    monkeypatch.setattr(frames, "timed", timed)
-    monkeypatch.setattr(frames, "_SECONDS", 0.0)
+    monkeypatch.setattr(faster, "timed", timed)
+    monkeypatch.setattr(faster, "_SECONDS", 0.0)
     settings, path = Settings(iterations=STEPS, goal=Faster(1.2)), tmp_path / "unfinished"
 
-    def target(cost=PRICES):
-        return frames.FrameTarget(1.2, cost)
-
-    whole = run(model, dataset, settings, target=target())
+    whole = run(model, dataset, settings)
     for cut in (5, 8):
-        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch, target=target())
-    with pytest.raises(CheckpointError, match="with other prices;"):
-        run(model, dataset, settings, path, target=target(real))
-    require_same(whole, run(model, dataset, settings, path, target=target()))
+        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch)
+    require_same(whole, run(model, dataset, settings, path))
 
 
 def test_what_a_caller_decides_is_part_of_the_configuration(model, dataset, tmp_path, monkeypatch):

@@ -10,10 +10,10 @@ from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.workbench.bench import timing
+from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import Case
 from fragprune_plugins.workbench.figures import clock
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
 
 class Notes:

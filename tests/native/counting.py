@@ -156,7 +156,7 @@ def scene(
     import torch
 
     from fragprune_plugins.types import RasterInputs
-    from fragprune_plugins.workbench.prices.scene import make_scene, make_view
+    from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 
     splats, view = make_scene(gaussians).splats(), make_view(size, size)
     thresholds = torch.full((gaussians,), falloff) if falloff else None

@@ -27,9 +27,9 @@ from PIL import Image
 
 from fragprune_plugins import View, load, load_cameras, rasterize
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.bench.machine import describe_machine
+from fragprune_plugins.workbench.bench.scene import make_view
 from fragprune_plugins.workbench.figures.viewing import overview
-from fragprune_plugins.workbench.prices.machine import describe_machine
-from fragprune_plugins.workbench.prices.scene import make_view
 
 SIZE = (1280, 720)
 ENGINES = ("playcanvas", "spark")

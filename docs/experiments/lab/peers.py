@@ -184,8 +184,8 @@ def _table(sizes: Sequence[str], count: int, repeats: int) -> Iterator[str]:
     """A line for our engine and for each peer, at each size: forward, SH degree 0."""
     from fragprune_plugins.engines import create_engine
     from fragprune_plugins.types import RasterInputs
+    from fragprune_plugins.workbench.bench.scene import make_scene, make_view
     from fragprune_plugins.workbench.bench.timing import Case, measure
-    from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 
     engine = create_engine("auto")
     scene = make_scene(count).splats()

@@ -36,8 +36,6 @@ from fragprune_plugins.workbench.figures.extents import (
     shaded,
 )
 from fragprune_plugins.workbench.figures.metrics import psnr
-from fragprune_plugins.workbench.prices.calibration import kept_at
-from fragprune_plugins.workbench.prices.cost import Cost, Work, work_of
 from fragprune_plugins.workbench.scenes.generated import Named
 
 HALF_LEVEL = 0.5 / 255
@@ -280,8 +278,6 @@ class _Survey:
             itself = out if itself is None else itself
             error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
             row = {
-                "timed": shown,
-                "work": work_of(out),
                 "mse": float(error),
                 "psnr": psnr(out.image, itself.image),
             }
@@ -318,9 +314,8 @@ class _Survey:
 
     def figures(self, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
         """Everything as plain values, with the frame times of each candidate."""
-        cost = _prices(self._engine, self._model)
         cuts: list[dict[str, Any]] = [
-            {"name": label} | _mean(rows) | frame | {"foreseen_ms": _foreseen(cost, rows)}
+            {"name": label} | _mean(rows) | frame
             for (label, rows), frame in zip(self._rows.items(), frames, strict=True)
         ]
         same = ("fragments_per_pixel", "evaluated_per_pixel", "frame_ms", "frame_ms_se")
@@ -369,20 +364,6 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         "psnr": -10 * math.log10(error) if error else math.inf,
         "worst_psnr": min(row["psnr"] for row in rows),
     }
-
-
-def _prices(engine: Engine, model: Model) -> Cost | None:
-    """What ``fragprune bench --calibrate`` measured on this machine; None if it never ran."""
-    path = kept_at(engine, model.device)
-    return Cost.load(path) if path.exists() else None
-
-
-def _foreseen(cost: Cost | None, rows: Sequence[Mapping[str, Any]]) -> float | None:
-    """Milliseconds of a frame of the timed views, by the machine's prices."""
-    if cost is None:
-        return None
-    works: list[Work] = [row["work"] for row in rows if row["timed"]]
-    return statistics.median(cost.ms(work) for work in works)
 
 
 def _viewers(asked: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:

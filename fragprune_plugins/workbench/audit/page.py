@@ -124,7 +124,6 @@ def compose(figures: Mapping[str, Any], folder: Path) -> str:
 def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
     """Cuts, viewers, where idle fragments sit, and of which Gaussians they are."""
     idle = figures["idle"]
-    known = any(cut["foreseen_ms"] is not None for cut in figures["cuts"])
     first = figures["cuts"][0]["fragments_per_pixel"]
     cuts = [
         [
@@ -134,7 +133,6 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
             _decibels(cut["psnr"]),
             _decibels(cut["worst_psnr"]),
             f"{cut['frame_ms']:.2f} ± {cut['frame_ms_se']:.2f}",
-            *([f"{cut['foreseen_ms']:.2f}"] if known else []),
         ]
         for cut in figures["cuts"]
     ]
@@ -144,8 +142,6 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
         f"the {figures['engine']} engine ({figures['device']}). PSNR is that of the mean squared "
         "error over all views."
     )
-    if known:
-        said += " Foreseen: by the prices of this machine (fragprune bench --calibrate)."
     quads = figures["viewers"][0]["shaded_per_pixel"]
     viewers = [
         [
@@ -177,7 +173,7 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
     every, together = 1.0, idle["together"]
     reasons.append(["all", f"{every:.1%}", f"{together:.1%}", _part(together, every)])
     return [
-        page.Table([*head, *(["foreseen, ms"] if known else [])], cuts, said),
+        page.Table(head, cuts, said),
         page.Table(["viewer", "draws", "shaded/pixel", "against √8 quads"], viewers, shaded, 2),
         page.Table(["fragments", "of all", "idle together, of all", "of these"], reasons, _REASONS),
         _kinds(idle),

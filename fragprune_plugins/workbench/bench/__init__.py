@@ -10,7 +10,6 @@ from fragprune_plugins.workbench.commands.command import Command, Report
 from fragprune_plugins.workbench.commands.options import (
     FILE,
     MODEL,
-    OutFile,
     engine_options,
 )
 
@@ -48,17 +47,6 @@ def _sizes(
     show_default=True,
     help="Number of Gaussians in the generated scene; may be given several times.",
 )
-@click.option(
-    "--calibrate",
-    is_flag=True,
-    help="Instead, measure what a pixel, a Gaussian, a list entry, an evaluated and a drawn "
-    "fragment cost here, and keep the prices for finetune --target-time.",
-)
-@click.option(
-    "--out",
-    type=OutFile(".json"),
-    help="With --calibrate: file for the prices, instead of the cache folder.",
-)
 @engine_options()
 def command(**options: Any) -> Report:
     """Time rasterization, forward and with all gradients, with and without truncation.
@@ -72,7 +60,6 @@ def command(**options: Any) -> Report:
       fragprune bench
       fragprune bench --size 320x240 --size 3840x2160 --gaussians 10000 --gaussians 3000000
       fragprune bench point_cloud.ply --cameras cameras.json --size 1280x720
-      fragprune bench --calibrate
     """
     from fragprune_plugins.workbench.bench.work import bench
 

@@ -1,4 +1,4 @@
-"""Times engines, or measures the prices of this machine."""
+"""Times engines."""
 
 from __future__ import annotations
 
@@ -13,15 +13,13 @@ from torch import Tensor
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.workbench.bench.machine import describe_machine, load_average
+from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import Case, Pass, measure, scaling, translation
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions, given
 from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.prices.calibration import calibrate as measure_prices
-from fragprune_plugins.workbench.prices.calibration import kept_at
-from fragprune_plugins.workbench.prices.machine import describe_machine, load_average
-from fragprune_plugins.workbench.prices.scene import make_scene, make_view
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
 TRUNCATION = 16 / 255
@@ -44,14 +42,10 @@ def bench(
     cameras: Path | None,
     sizes: list[Size],
     gaussians: tuple[int, ...],
-    calibrate: bool,
-    out: Path | None,
     engine: EngineOptions,
 ) -> Report:
     """Do what ``fragprune bench`` promises; its options are the arguments."""
-    _expect_used(model, calibrate=calibrate)
-    if calibrate:
-        return _calibrate(out, engine)
+    _expect_used(model)
     rasterizer, device = open_engine(engine)
     before = load_average()
     scenes = (
@@ -88,18 +82,15 @@ def _say(text: str) -> None:
     click.echo(text, err=True)
 
 
-def _expect_used(model: Path | None, *, calibrate: bool) -> None:
+def _expect_used(model: Path | None) -> None:
     """Refuse options that would change nothing."""
-    scene = {"cameras", "sizes", "gaussians"}
-    if calibrate:
-        why, unused = "--calibrate", {"model", *scene}
-    else:
-        why = "a generated scene" if model is None else "MODEL"
-        unused = {"out", "cameras" if model is None else "gaussians"}
-    for name in sorted(unused & given()):
-        option = {"model": "MODEL", "sizes": "--size"}.get(name, f"--{name}")
+    why, unused = ("a generated scene", "cameras") if model is None else ("MODEL", "gaussians")
+    if unused in given():
         raise UsageError(
-            "options", f"{option} with {why}", "options that have an effect", f"Remove {option}."
+            "options",
+            f"--{unused} with {why}",
+            "options that have an effect",
+            f"Remove --{unused}.",
         )
 
 
@@ -135,44 +126,6 @@ def _of_model(
         cut = torch.full_like(splats.opacities, TRUNCATION) if cut is None else cut.detach()
         scenes.append((model.stem, splats, view, cut, loaded.rules))
     return scenes
-
-
-def _calibrate(out: Path | None, engine: EngineOptions) -> Report:
-    """Measure the prices of this machine and keep them."""
-    rasterizer, device = open_engine(engine)
-    before = load_average()
-    found = measure_prices(rasterizer, device, say=_say)
-    cost, path = found.cost, out or kept_at(rasterizer, device)
-    cost.save(path)
-    left_out = sum(frame["left_out"] for frame in found.frames)
-    loads = {"load_before": before, "load_after": load_average()}
-    data: dict[str, Any] = {
-        "prices": dict(cost.prices),
-        "error": cost.error,
-        "machine": dict(cost.machine) | loads,
-        "frames": list(found.frames),
-        "kept": str(path),
-    }
-    lines = [f"{'':<30}{'ns':>12}"]
-    lines += [f"{_UNITS[unit]:<30}{price:>12,.2f}" for unit, price in cost.prices.items()]
-    lines += [
-        f"Predicted times of {left_out} frames left out of the fit are off by "
-        f"{100 * cost.error:.0f} % (median; {len(found.frames) - left_out} frames in the fit).",
-        f"{rasterizer.name} engine on {cost.machine['processor']}, {cost.machine['threads']} "
-        f"threads; {_busy(loads)}",
-        f"Kept in {path}.",
-    ]
-    return Report(data, "\n".join(lines))
-
-
-_UNITS = {
-    "frame": "a frame, besides",
-    "pixel": "a pixel",
-    "gaussian": "a Gaussian",
-    "entry": "a list entry",
-    "evaluated": "an evaluated fragment",
-    "fragment": "a drawn fragment, on top",
-}
 
 
 def _table(data: dict[str, Any]) -> str:

@@ -15,12 +15,12 @@ from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.targets import Target
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for
 from fragprune_plugins.workbench.distributed.processes import processes_of
+from fragprune_plugins.workbench.finetune.faster import FrameTarget
 from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, Keeper
 from fragprune_plugins.workbench.finetune.searching import strongest
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.prices.target import frame_target
 from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
@@ -51,8 +51,7 @@ def finetune(
             and follow the model one view at a time.
         settings: iterations, what moves, the goal; defaults when None.
         schedule: gives the plan of each step; when None a plugin's, or the default one.
-        target: holds thresholds to a ratio; that of the goal when None. For frame times it needs
-            the prices of this machine, which are measured at the first use and kept.
+        target: holds thresholds to a ratio; that of the goal when None.
         engine: a name or an engine.
         progress: draw a bar on stderr.
         checkpoints: where the unfinished fine-tuning is kept. If there is one of the same
@@ -83,7 +82,7 @@ def finetune(
     processes = processes_of(engine, ranks, len(model))
     processes.expect_able(settings)
     if isinstance(goal, Faster) and target is None:
-        target = frame_target(goal.ratio, engine, device)
+        target = FrameTarget(goal.ratio)
     if goal.on_area and model.pruned:
         raise UsageError(
             "finetune",

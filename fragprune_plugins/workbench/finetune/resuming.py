@@ -139,7 +139,6 @@ class Keeper:
             stage.schedule,
         )
         self.asked = processes.described(asked) | {"loss": code_for(training.start.device)}
-        self.asked |= {} if stage.target is None else stage.target.decides()
         if checkpoints is not None:
             self._go_on(checkpoints, training)
         processes.agree({**self.asked, "checkpoint": training.done, "torch": torch.__version__})

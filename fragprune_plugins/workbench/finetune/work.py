@@ -15,7 +15,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.learning.goals import AtMost, Control, Faster
+from fragprune_plugins.learning.goals import AtMost, Control
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
@@ -36,7 +36,6 @@ from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.written import dropping, require_place
-from fragprune_plugins.workbench.prices.target import frame_target
 from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
 from fragprune_plugins.workbench.pruning.visibility import visible
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
@@ -224,10 +223,7 @@ def _learn(
     if isinstance(settings.goal, AtMost):
         found = strongest(train, settings, dataset.test, engine=engine, say=_say)
         return found.result, found
-    target = None
-    if isinstance(settings.goal, Faster):
-        target = frame_target(settings.goal.ratio, engine, model.device, say=_say)
-    return train(settings, target=target, checkpoints=opened.checkpoints), None
+    return train(settings, checkpoints=opened.checkpoints), None
 
 
 def _drop_invisible(over: Finetuned, dataset: Dataset, engine: Engine) -> Finetuned:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +26,6 @@ from fragprune_plugins.workbench import finetune
 from fragprune_plugins.workbench.figures.recorded import recorded
 from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.prices.cost import UNITS, Cost
 from fragprune_plugins.workbench.report import work as report
 from fragprune_plugins.workbench.scenes import colmap
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
@@ -197,12 +195,6 @@ def _git(file: Path) -> None:
     _sound(f"a commit {commit[:90]!r}", commit == "" or set(commit) <= set("0123456789abcdef"))
 
 
-def _prices(file: Path) -> None:
-    cost = Cost.load(file)
-    known = cost.prices.keys() == set(UNITS)
-    _sound("prices", known and all(0 <= each < math.inf for each in cost.prices.values()))
-
-
 def _config(file: Path) -> None:
     values = read_config(ConfigFile("--config"), file)
     _sound("no names", all(isinstance(name, str) for name in values))
@@ -251,7 +243,6 @@ READERS = [
     Reader("source", _source),
     Reader("git", _git),
     Reader("config", _config),
-    Reader("prices", _prices),
     Reader("cfg_args", _arguments),
 ]
 BY_NAME = {reader.name: reader for reader in READERS}

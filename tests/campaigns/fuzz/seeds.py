@@ -27,7 +27,6 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.spz import zstd
-from fragprune_plugins.workbench.prices.cost import UNITS, Cost
 
 CORPUS = Path(__file__).parent / "corpus"
 
@@ -236,12 +235,6 @@ def _camera_path() -> bytes:
     return json.dumps({"camera_path": path, "render_width": 32, "render_height": 32}).encode()
 
 
-def _prices(folder: Path) -> bytes:
-    machine = {"engine": "cpu", "processor": "one", "threads": 2}
-    cost = Cost(dict.fromkeys(UNITS, 1.5), 0.07, machine)
-    return cost.save(folder / "prices.json").read_bytes()
-
-
 def make() -> dict[str, dict[str, bytes]]:
     """Seeds by reader and name."""
     with tempfile.TemporaryDirectory() as name:
@@ -282,7 +275,6 @@ def make() -> dict[str, dict[str, bytes]]:
             "source": {"renderer.py": _RENDERER},
             "git": {"head": b"ref: refs/heads/main\n", "commit": b"0123456789abcdef" * 2 + b"\n"},
             "config": {"a.json": b'{"iterations": 30000, "source_path": "scene", "lambda": 0.2}'},
-            "prices": {"a.json": _prices(folder)},
             "cfg_args": {"a.txt": _ARGUMENTS},
         }
 

@@ -12,7 +12,7 @@ from lab import peers
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.prices.scene import make_scene, make_view
+from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 
 PIPELINE = '''
 import numpy as np

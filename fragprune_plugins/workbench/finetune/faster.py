@@ -1,11 +1,10 @@
-"""A target in frame times: prices predict a frame, and the clock has the last word."""
+"""A target in frame times: thresholds change fragments, and the clock has the last word."""
 
 from __future__ import annotations
 
 import math
 import statistics
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -16,20 +15,19 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.pressure import TIME_FOLLOWS
 from fragprune_plugins.learning.stage2 import evenly
-from fragprune_plugins.learning.targets import CALIBRATION_VIEWS, FEWEST, Target, calibrate
+from fragprune_plugins.learning.targets import FEWEST, Target, calibrate
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.clock import timed
-from fragprune_plugins.workbench.prices.calibration import prices_of
-from fragprune_plugins.workbench.prices.cost import Cost, work_of
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
 CLOCKED_AT = (0.25, 0.45, 0.65)
 """Shares of the learning at which frames are timed, to steer by."""
 
-LOOK_EVERY = 10
-"""Steps from one look at predicted frame times to the next."""
+LIMIT_VIEWS = 4
+"""Training views on which the shortest frame time is measured, before any learning."""
 
 _ROUNDS, _SECONDS = 7, 1.5  # at least
 _NEAR = 0.02  # a share by which frame times are noisy
@@ -40,14 +38,12 @@ class FrameTarget(Target):
 
     Args:
         ratio: frame time of the untruncated model as it came in, over that of the truncated one.
-        cost: prices of the engine on this machine.
     """
 
     figure: ClassVar[str] = "faster"
 
-    def __init__(self, ratio: float, cost: Cost) -> None:
+    def __init__(self, ratio: float) -> None:
         super().__init__(ratio)
-        self.prices = cost
         self.training: Any = None
         self.seen = Ratios()  # by the clock, so far
         self.timed = 0  # of CLOCKED_AT
@@ -58,17 +54,8 @@ class FrameTarget(Target):
         Raises:
             UsageError: they cannot.
         """
-        model, shots = training.start, training.dataset.train
-        require_reach(self.ratio, self.prices, model, shots, training.engine)
+        require_reach(self.ratio, training.start, training.dataset.train, training.engine)
         self.training = training
-
-    def decides(self) -> dict[str, Any]:
-        """The prices, by which times are predicted."""
-        return {"prices": dict(self.prices.prices)}
-
-    def cost(self, outputs: RasterOutputs) -> float:
-        """Predicted milliseconds of a frame."""
-        return self.prices.ms(work_of(outputs))
 
     def measure(self, views: Sequence[Any]) -> float:
         """How many times as fast frames of these views are now."""
@@ -81,11 +68,9 @@ class FrameTarget(Target):
             training.engine,
         )
 
-    def steers_by(self, step: int, ratio: Callable[[], float]) -> float:
-        """The ratio by prices and what was timed so far, in every tenth step."""
-        if step % LOOK_EVERY:
-            return math.nan
-        return math.exp(self.seen.slope(self.ratio) * math.log(max(ratio(), 1e-9)))
+    def followed(self, fragments: float) -> float:
+        """The ratio of frame times that a ratio of fragments brings, by what was timed so far."""
+        return float(fragments ** self.seen.slope(self.ratio))
 
     def wants_look(self, progress: float) -> bool:
         """At some shares of the learning."""
@@ -112,72 +97,51 @@ class FrameTarget(Target):
         self.seen = Ratios(self.seen)
 
 
-def frame_target(
-    ratio: float,
-    engine: Engine,
-    device: torch.device | str,
-    *,
-    say: Callable[[str], None] | None = None,
-) -> FrameTarget:
-    """A target with the prices of this machine, which are measured at the first use and kept.
-
-    Args:
-        ratio: frame time before over after.
-        engine: draws.
-        device: where it draws.
-        say: called with a line of text before prices are measured.
-
-    Raises:
-        CostError: the kept prices are malformed, or the engine does not count its lists.
-    """
-    return FrameTarget(ratio, prices_of(engine, device, say=say))
-
-
 def _passed(progress: float) -> int:
     return sum(progress >= share for share in CLOCKED_AT)
 
 
 class Ratios(list[tuple[float, float]]):
-    """Logarithms of ratios that were predicted, and measured.
+    """Logarithms of ratios of fragments, and of frame times.
 
     Both ratios are 1 without truncation, so that their logarithms are taken as proportional. The
     slope is fitted to all of them, in which noise cancels; those near the target weigh most.
     """
 
-    def add(self, predicted: float, measured: float) -> None:
+    def add(self, fragments: float, measured: float) -> None:
         """Take a pair of ratios in, unless it is too near 1 to tell a slope from noise."""
-        if 1 + _NEAR < predicted < math.inf and measured > 1 + _NEAR:
-            self.append((math.log(predicted), math.log(measured)))
+        if 1 + _NEAR < fragments < math.inf and measured > 1 + _NEAR:
+            self.append((math.log(fragments), math.log(measured)))
 
     def slope(self, target: float) -> float:
-        """ln(measured) / ln(predicted) near a target, 0.5 to 2; 1 before anything was measured."""
+        """ln(measured) / ln(fragments) near a target, 0.1 to 1.5.
+
+        Before anything was measured, what it is roughly.
+        """
         weights = [1 / (_NEAR**2 + (m - math.log(target)) ** 2) for _, m in self]
         squares = sum(w * p * p for w, (p, _) in zip(weights, self, strict=True))
         if squares == 0:
-            return 1.0
+            return TIME_FOLLOWS
         products = sum(w * p * m for w, (p, m) in zip(weights, self, strict=True))
-        return min(max(products / squares, 0.5), 2.0)
+        return min(max(products / squares, 0.1), 1.5)
 
 
 def calibrate_measured(
     store: ThresholdStore,
-    predicted: Callable[[], float],
+    fragments: Callable[[], float],
     measured: Callable[[], float],
     target: float,
     *,
     seen: Ratios | None = None,
     tolerance: float = 0.02,
-    rounds: int = 4,
+    rounds: int = 5,
 ) -> float:
-    """Like ``calibrate``, for a ratio that is measured with noise and predicted without.
-
-    Bisection would go astray in noise: so it meets a prediction, and measurements correct what to
-    predict (``Ratios``).
+    """Shift all thresholds so that a measured ratio meets a target, through that of fragments.
 
     Args:
         store: the thresholds; changed in place.
-        predicted: before over after, with the store as it stands; need not be unbiased.
-        measured: the same, measured.
+        fragments: before over after, with the store as it stands.
+        measured: of frame times, likewise.
         target: of the measured ratio.
         seen: what was measured before, to begin with; added to.
         tolerance: relative distance at which to stop.
@@ -189,35 +153,37 @@ def calibrate_measured(
     seen, reached = Ratios() if seen is None else seen, math.nan
     for _ in range(rounds):
         aim = target ** (1 / seen.slope(target))
-        foreseen = calibrate(store, predicted, aim, tolerance=tolerance / 4)
+        met = calibrate(store, fragments, aim, tolerance=tolerance / 4)
         reached = measured()
-        seen.add(foreseen, reached)
+        seen.add(met, reached)
         if abs(reached / target - 1) <= tolerance:
             break
     return reached
 
 
 @torch.no_grad()
-def require_reach(
-    target: float, cost: Cost, model: Model, shots: Sequence[Shot], engine: Engine
-) -> None:
+def require_reach(target: float, model: Model, shots: Sequence[Shot], engine: Engine) -> None:
     """Refuse a target time that thresholds cannot reach: pixels and Gaussians stay.
 
     Args:
         target: ratio of frame times, before over after.
-        cost: prices of the engine on this machine.
         model: as it comes in.
         shots: the training views.
         engine: draws them.
 
     Raises:
-        UsageError: it is out of reach.
+        UsageError: frames with so few fragments as no target leaves take longer.
     """
-    splats, total = model.splats(), Counter[str]()
-    for shot in evenly(shots, CALIBRATION_VIEWS):
-        inputs = RasterInputs(shot.view, splats, planes=())
-        total.update(work_of(engine.rasterize(inputs, None)))
-    limit = cost.limit(total, FEWEST)
+    some, splats = evenly(shots, LIMIT_VIEWS), model.splats()
+    store = ThresholdStore.from_falloff(torch.full_like(splats.opacities, 0.05))
+    inputs = [RasterInputs(shot.view, splats, planes=()) for shot in some]
+
+    def drawn(cut: Tensor | None) -> float:
+        return sum(float(engine.rasterize(each, cut).fragments_per_pixel) for each in inputs)
+
+    before = drawn(None)
+    calibrate(store, lambda: before / max(drawn(store.values), 1e-9), FEWEST, tolerance=0.1)
+    limit = times_faster(model, model.untruncated(), lambda _: store.values, some, engine)
     if target >= limit:
         size = f"{shots[0].view.width}x{shots[0].view.height}"
         raise UsageError(
