@@ -23,10 +23,10 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (15_533, 12_000),
+    "core lines": (15_461, 12_000),
     "core imports of the workbench": (0, 0),
-    "imports inside functions": (91, 60),
-    "functions over 60 lines": (9, 10),
+    "imports inside functions": (90, 60),
+    "functions over 60 lines": (7, 10),
     "longest function": (77, 80),
     "members of an adapter": (24, 24),
     "members of a dialect": (7, 7),
