@@ -7,20 +7,24 @@ are made if their kernel was read; those that nobody reads raise if they are rea
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from fragprune_3dgs_fork.fork import (
+    CHECKPOINT,
     CLASS,
     MODEL,
-    Output,
     plain_distances,
     read_fork,
+    read_getters,
     rests_after_densification,
 )
+from fragprune_3dgs_fork.rasterizer import Output
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -49,6 +53,15 @@ CHANNELS = 7
 """That are blended beside the colours in one rasterization: engines blend 8, a proof adds one."""
 SCREEN = 3
 """Columns of the tensor that gets the screen gradient."""
+
+
+log = logging.getLogger("fragprune")
+
+
+@cache
+def tell_once(what: str) -> None:
+    """Warn of something once."""
+    log.warning("%s", what)
 
 
 def optimizers(call: SeamCall) -> list[Any]:
@@ -110,11 +123,15 @@ class ForkDialect(GraphdecoDialect):
     Attributes:
         values: what each rasterizer returns, by its package.
         fields: names of each rasterizer's settings, likewise.
+        off: settings and arguments that must be None, False or empty.
+        scaled: settings that change the gradient on the screen, which ours ignores.
         own_distances: its simple_knn returns more than that of 3DGS, and has no stand-in.
     """
 
     values: Mapping[str, tuple[Output, ...]] = field(default_factory=dict)
     fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    off: frozenset[str] = frozenset()
+    scaled: frozenset[str] = frozenset()
     own_distances: bool = False
 
     def unpack(self, call: HostCall) -> RasterInputs:
@@ -128,12 +145,31 @@ class ForkDialect(GraphdecoDialect):
         confidence = getattr(call.settings, "confidence", None)
         if confidence is not None and not bool((confidence == 1).all()):
             self._refuse("confidence", "values other than 1", "1 everywhere, which changes nothing")
+        self.expect_off(call)
         if not call.still and call["means2D"].shape[1] > SCREEN:
             self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
+        if not call.still and self.scaled:
+            tell_once(
+                f"{', '.join(sorted(self.scaled))}: the gradient on the screen is not changed by "
+                "it here, so other Gaussians are densified than by the host's own rasterizer"
+            )
         roles = [each.role for each in self._values(call)]
         planes = tuple(name for name in ("invdepth", "alpha") if name in roles)
-        inputs = replace(inputs, planes=planes)
+        counts, scores = ("count" in roles), ("weight" in roles)
+        inputs = replace(inputs, planes=planes, counts=counts, scores=scores)
         return self._with(inputs, self._channels(call), 0)
+
+    def expect_off(self, call: HostCall) -> None:
+        """Refuse a call with a value where the source has None or False by default.
+
+        Raises:
+            EngineError: it has one.
+        """
+        for name in sorted(self.off):
+            value = getattr(call.settings, name, call.arguments.get(name))
+            empty = getattr(value, "shape", ())[:1] == (0,)
+            if not (value is None or value is False or empty):
+                self._refuse(name, "a value", "None or False, which changes nothing")
 
     def _channels(self, call: HostCall) -> Tensor | None:
         """(N, F) what is blended beside the colours: depth, then objects; None if nothing is."""
@@ -194,10 +230,22 @@ class ForkDialect(GraphdecoDialect):
         }
         if outputs.features is not None:
             made |= {"depth": outputs.features[:1], "objects": outputs.features[int(deep) :]}
-        return tuple(
-            IN_PLACE[each.role](each.name) if each.role in IN_PLACE else made[each.role]
-            for each in values
-        )
+        sums = {
+            "count": outputs.fragments_per_gaussian,
+            "weight": outputs.weights_per_gaussian,
+        }
+
+        def packed(value: Output) -> Any:
+            if value.role in IN_PLACE:
+                return IN_PLACE[value.role](value.name)
+            if value.role not in sums:
+                return made[value.role]
+            each = sums[value.role]
+            assert each is not None  # unpack asked for it
+            each = each[:, None] if value.column else each
+            return each.int() if value.integer else each.float()
+
+        return tuple(map(packed, values))
 
     def names(self) -> frozenset[str]:
         """The import names of the rasterizers and simple_knn."""
@@ -230,6 +278,7 @@ class ForkAdapter(GraphdecoAdapter):
     )
     dialect_type = ForkDialect
     steps_by_rendering = True
+    checkpoints = CHECKPOINT
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Whether the model is plain, and what was read of its scripts, rows and calls."""
@@ -244,7 +293,7 @@ class ForkAdapter(GraphdecoAdapter):
         fork = read_fork(repo)
         return [
             *fork.findings,
-            *graphdeco.read_getters(repo, MODEL),
+            *read_getters(fork),
             *(graphdeco.read_flags(repo, self.command_line(repo)) if fork.scripts else ()),
             *self._groups(repo),
         ]
@@ -306,6 +355,8 @@ class ForkAdapter(GraphdecoAdapter):
             sparse_adam=bool(repo.mentions(["train", MODEL], ["SparseGaussianAdam"])),
             values=fork.outputs,
             fields=fork.settings,
+            off=fork.off,
+            scaled=fork.scaled,
             own_distances=not plain_distances(repo),
         )
 
@@ -314,11 +365,19 @@ class ForkAdapter(GraphdecoAdapter):
         return replace(super().command_line(repo), scripts=read_fork(repo).scripts or self.scripts)
 
     def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
-        """Refuse trained exposures, which checkpoints of 3DGS lack.
+        """Refuse trained exposures, which checkpoints of 3DGS lack, and joint learning where our
+        gradient on the screen is another.
 
         Raises:
-            UsageError: ``--train_test_exp``.
+            UsageError: ``--train_test_exp``, or ``--stage joint``.
         """
+        if stage == "joint" and (scaled := read_fork(repo).scaled):
+            raise UsageError(
+                "--stage joint",
+                f"{', '.join(sorted(scaled))}, which changes the gradient that densifies",
+                "a host that densifies by the gradient itself",
+                "Leave it out: thresholds then learn after the host's own training.",
+            )
         if "--train_test_exp" in arguments:
             raise UsageError(
                 "--train_test_exp",

@@ -7,15 +7,23 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Literal
 from weakref import WeakKeyDictionary
 
+from fragprune_3dgs_fork.rasterizer import (
+    Output,
+    changed_gradients,
+    is_off,
+    meaning,
+    off_by_default,
+)
 from fragprune_plugins.adapting import Finding, HostRepo, graphdeco
 
 MODEL, CLASS, RENDERER = "scene.gaussian_model", "GaussianModel", "gaussian_renderer"
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
 PRIMITIVES = {"_prune_optimizer", "cat_tensors_to_optimizer", "replace_tensor_to_optimizer"}
 """Methods that change rows or values of parameters inside the optimizer."""
+CHECKPOINT = r"(?:chkpnt|ckpt|checkpoint)[_-]?"
+"""How names of checkpoints begin, before the iteration."""
 STATISTICS = {"oneupSHdegree", "add_densification_stats"}
 _MAKES = re.compile(r"__init__|capture\w*|(restore|create|load|init|set)_?\w*|\w*setup\w*")
 """Methods that make a model, before it is trained."""
@@ -25,33 +33,14 @@ _MODELS = re.compile(r"\b(gaussians?|pc|model)$")
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
-Role = Literal["image", "radii", "depth", "invdepth", "alpha", "objects", "unproved", "unread"]
 
 NEUTRAL = {"antialiasing", "confidence"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
 SERVED = {"dc", "sh_objs"}
 """Further arguments that the engines know."""
 
-_DEPTH = re.compile(r"(\w+)\+=depths\[collected_id\[j\]\]\*alpha\*T;")
-_INVERSE = re.compile(r"(\w+)\+=\(1/depths\[collected_id\[j\]\]\)\*alpha\*T;")
-_WEIGHT = re.compile(r"(\w+)\+=alpha\*T;")
 _PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|opac)")
 """Names of values that a proof can tell, if they are what they are called."""
-_OBJECTS = re.compile(r"(\w+)\[ch\]\+=obj_features\[[^;]*\]\*alpha\*T;")
-
-
-@dataclass(frozen=True)
-class Output:
-    """A value that a rasterizer returns.
-
-    Attributes:
-        name: that the source gives it.
-        role: what it is; "unread" for one that nobody reads, "unproved" for one that only the
-            numbers of the host's own rasterizer can tell.
-    """
-
-    name: str
-    role: Role
 
 
 @dataclass(frozen=True)
@@ -85,6 +74,8 @@ class Fork:
         outputs: by package, what its rasterizer returns.
         still: methods of the model that scripts call, and that change it.
         setups: methods that make the optimizer.
+        off: settings and arguments of the rasterizer that are None or False by default.
+        scaled: settings that change the gradient on the screen alone, in its backward pass.
     """
 
     repo: HostRepo
@@ -94,6 +85,18 @@ class Fork:
     outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)
     still: tuple[str, ...] = ()
     setups: tuple[str, ...] = ()
+    off: frozenset[str] = frozenset()
+    scaled: frozenset[str] = frozenset()
+
+    def warn(self, code: str, where: str, found: str) -> None:
+        """Add a warning, once."""
+        warning = Finding("warning", code, where, found)
+        self.findings += [] if warning in self.findings else [warning]
+
+    def is_off(self, name: str) -> bool:
+        """Whether an option or an attribute of the model is None or False by default."""
+        scripts = (each.removesuffix(".py") for each in self.scripts)
+        return off_by_default(self.repo, ("arguments", MODEL, *scripts), name)
 
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
         """Add an error."""
@@ -204,7 +207,9 @@ def _check_script(fork: Fork, script: str) -> None:
     elif (backward := sum(name == "backward" for _, name in _method_calls(tree))) > 1:  # type: ignore[arg-type]
         found = f"{backward} places that go backward, perhaps in one iteration"
         fork.refuse("script", script, found, "one, by which steps are counted")
-    elif not any(isinstance(each, str) and "chkpnt" in each for each in text):
+    elif not any(
+        isinstance(each, str) and re.search(rf"(^|/){CHECKPOINT}($|[{{%])", each) for each in text
+    ):
         fork.refuse("script", script, "checkpoints of another name", "chkpnt and the iteration")
 
 
@@ -368,15 +373,64 @@ def _read_changes(fork: Fork) -> None:
             if isinstance(node, ast.Assign) and re.match(
                 r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(", ast.unparse(node.value)
             ):
-                fork.findings.append(
-                    Finding(
-                        "warning",
-                        "optimizer",
-                        fork.repo.at(script.removesuffix(".py"), node.lineno),
-                        f"stage 2 does not freeze what {ast.unparse(node.targets[0])} of {script} "
-                        "trains",
-                    )
-                )
+                what = f"what {ast.unparse(node.targets[0])} of {script} trains"
+                at = fork.repo.at(script.removesuffix(".py"), node.lineno)
+                fork.warn("optimizer", at, f"stage 2 does not freeze {what}")
+
+
+def read_getters(fork: Fork) -> list[Finding]:
+    """Errors of the model's getters. ``get_xyz`` may give something else where an attribute is set
+    that is None at first, if no method that scripts reach sets it.
+    """
+    methods = _methods(fork.repo)
+    reached = {name for _, tree in fork.trees() for _, name in _method_calls(tree)}
+    while more := {
+        called
+        for name in reached & methods.keys()
+        for _, called in _method_calls(methods[name])
+        if called in methods and called not in reached
+    }:
+        reached |= more
+    made = {
+        _target(node)
+        for name in (reached & methods.keys()) - {"__init__"}
+        for node in ast.walk(methods[name])
+        if isinstance(node, ast.Assign) and not is_off(node.value)
+    }
+    unset = {each for each in _guards(methods) if fork.is_off(each)} - made
+    found = graphdeco.read_getters(fork.repo, MODEL)
+    body = methods.get("get_xyz")
+    if body is not None and unset and _positions(body.body, unset):
+        found = [each for each in found if not each.found.startswith("computed")]
+    return found
+
+
+def _guards(methods: dict[str, Function]) -> set[str]:
+    """Attributes that getters ask for."""
+    tests = [
+        ast.unparse(node.test)
+        for name, body in methods.items()
+        if name.startswith("get_")
+        for node in ast.walk(body)
+        if isinstance(node, ast.If)
+    ]
+    return {name for test in tests for name in re.findall(r"self\.(\w+) is not None", test)}
+
+
+def _positions(body: list[ast.stmt], unset: set[str]) -> bool:
+    """Whether statements return ``self._xyz`` while attributes are None."""
+    for node in body:
+        if isinstance(node, ast.If):
+            asked = re.fullmatch(r"self\.(\w+) is not None", ast.unparse(node.test))
+            if asked is None or asked[1] not in unset:
+                return False
+            if node.orelse:
+                return _positions(node.orelse, unset)
+        elif isinstance(node, ast.Return):
+            return node.value is not None and ast.unparse(node.value) == "self._xyz"
+        elif not isinstance(node, ast.Expr):
+            return False
+    return False
 
 
 # -- draws -----------------------------------------------------------------------------------------
@@ -384,7 +438,7 @@ def _read_changes(fork: Fork) -> None:
 
 def _read_draws(fork: Fork) -> None:
     """The drawing functions that a script names, and their calls."""
-    named: set[str] = set().union(*(_mentioned(tree) for _, tree in fork.trees()))
+    named = {name for _, tree in fork.trees() for name in _reached(fork, tree)}
     functions = graphdeco.drawing_functions(fork.repo, RENDERER)
     while True:
         reached = [name for name in functions if name in named]
@@ -409,7 +463,7 @@ def _read_draws(fork: Fork) -> None:
             continue
         fork.draws += (Draw(RENDERER, name, parameters[0], model, calls),)
         for call in calls:
-            _check_call(fork, at, call)
+            _check_call(fork, at, name, call)
         if body is not None and (selected := _selected(body)):
             fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
     if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
@@ -417,8 +471,32 @@ def _read_draws(fork: Fork) -> None:
         fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
 
 
-def _check_call(fork: Fork, at: str, call: graphdeco.CallInSource) -> None:
-    unknown = [*(call.call.besides - NEUTRAL), *(call.call.arguments - SERVED)]
+def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
+    """Names and imports in a script, without those under an option that is off by default."""
+    for kind in ("id", "attr", "name"):
+        if isinstance(name := getattr(node, kind, None), str):
+            yield name
+    for each in ast.iter_child_nodes(node):
+        if isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test):
+            continue
+        yield from _reached(fork, each)
+
+
+def _needs_option(fork: Fork, test: ast.expr) -> bool:
+    return isinstance(test, ast.Attribute) and fork.is_off(test.attr)
+
+
+def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
+    """Settings and arguments besides the known ones: off, or without a part in the picture."""
+    further = [*(call.call.besides - NEUTRAL), *(call.call.arguments - SERVED)]
+    unknown = {each for each in further if not _stays_off(fork, function, call.given.get(each))}
+    fork.off |= {*further} - unknown
+    for name in sorted(unknown & call.call.besides):
+        changed = changed_gradients(fork.repo, call.call.package, name)
+        if changed is not None and changed <= {"means2D"}:
+            unknown.remove(name)
+            fork.scaled |= {name}
+            fork.warn("rasterizer-call", at, f"the gradient on the screen, which {name} changes")
     if unknown:
         fork.refuse(
             "rasterizer-call",
@@ -426,6 +504,28 @@ def _check_call(fork: Fork, at: str, call: graphdeco.CallInSource) -> None:
             f"{', '.join(sorted(unknown))}, unknown to fragprune",
             "settings and arguments whose effect is known",
         )
+
+
+def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
+    """Whether a value is None or False unless a user asks for more; every call is checked."""
+    body = fork.repo.function(RENDERER, function)
+    if isinstance(value, ast.Attribute):
+        return fork.is_off(value.attr)
+    if not isinstance(value, ast.Name) or body is None:
+        return is_off(value)
+    names = fork.repo.parameters(RENDERER, function) or ()
+    if value.id not in _off(body):
+        return False
+    number = names.index(value.id) if value.id in names else len(names)
+    for _, tree in fork.trees():
+        for node in ast.walk(tree):
+            passed = {each.arg: each.value for each in getattr(node, "keywords", ())}
+            if value.id in passed and not _stays_off(fork, "", passed[value.id]):
+                return False
+            draws = isinstance(node, ast.Call) and getattr(node.func, "id", "") == function
+            if draws and len(node.args) > number:  # type: ignore[attr-defined]
+                return False
+    return True
 
 
 def _selected(body: Function) -> str:
@@ -511,12 +611,11 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
         return Output(name, "image")
     if "radii" in name:
         return Output(name, "radii")
-    role = _meaning(fork, call, name)
-    uses = _uses(fork, draw, name) if role == "unread" else []
+    output = meaning(fork.repo, call, name)
+    uses = _uses(fork, draw, name) if output.role == "unread" else []
     if uses and _PROVABLE.search(name) and not graphdeco.normal_sources(fork.repo, package):
         at = fork.repo.at(draw.module, call.line)
-        warning = Finding("warning", "rasterizer-output", at, f"what {package} returns as {name}")
-        fork.findings += [] if warning in fork.findings else [warning]
+        fork.warn("rasterizer-output", at, f"what {package} returns as {name}")
         return Output(name, "unproved")
     if uses:
         fork.refuse(
@@ -525,32 +624,7 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
             f"{name}, read in {uses[0]}, whose meaning is unknown",
             "picture, radii, and sums along the ray whose kernel was read",
         )
-    return Output(name, role)
-
-
-def _meaning(fork: Fork, call: graphdeco.CallInSource, name: str) -> Role:
-    """What a further output is, by its name and by the vendored kernel that makes it."""
-    late = "antialiasing" in call.settings and len(call.names) == 3
-    if late and call.call.package == "diff_gaussian_rasterization":
-        return "invdepth"  # the rasterizer since August 2024
-    text = "".join(graphdeco.normal_sources(fork.repo, call.call.package))
-    if "depth" in name:
-        for rule, role in ((_DEPTH, "depth"), (_INVERSE, "invdepth")):
-            if _written(text, rule, r"out_\w*depth\w*"):
-                return role  # type: ignore[return-value]
-    elif re.search(r"alpha|acc|opac", name) and _written(text, _WEIGHT, r"out_(alpha|opac)\w*"):
-        return "alpha"
-    elif "obj" in name and "sh_objs" in call.given and _OBJECTS.search(text):
-        return "objects"
-    return "unread"
-
-
-def _written(text: str, rule: re.Pattern[str], buffer: str) -> bool:
-    """Whether a sum goes into a buffer as it is, and nothing else does."""
-    found = rule.search(text)
-    stored = re.findall(rf"\b{buffer}\[pix_id\]=([^;]+);", text)
-    values = [each[-1] if isinstance(each, tuple) else each for each in stored]
-    return found is not None and bool(values) and set(values) == {found[1]}
+    return output
 
 
 def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:

@@ -124,7 +124,7 @@ class MipSplatting(GraphdecoAdapter):
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """The command's 2D filter, or the default; ``--load_allres`` is refused."""
         parser = ArgumentParser(add_help=False)
-        size = graphdeco.default(repo, "ModelParams", "_kernel_size", KERNEL_SIZE)
+        size = graphdeco.default(repo, "_kernel_size", KERNEL_SIZE)
         parser.add_argument("-k", "--kernel_size", type=float, default=size)
         flags, rest = parser.parse_known_args(arguments)
         if "--load_allres" in rest:

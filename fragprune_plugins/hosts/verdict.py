@@ -105,9 +105,9 @@ def _unproved(repo: HostRepo, fitting: Tried) -> str:
     warned = [each.found for each in fitting.match.findings if each.level == "warning"]
     if warned:
         return "; ".join(warned)
-    package = getattr(fitting.adapter, "package", "")
-    if repo.package or not package:
+    if repo.package or not hasattr(fitting.adapter, "package"):
         return "the picture, until it is compared on the first run"
+    package: str = getattr(fitting.adapter.dialect(repo), "package", "")
     if vendored(repo, package):
         return "its picture; the rule in its vendored rasterizer is the known one"
     return f"its picture; the sources of {package} are not in the checkout"

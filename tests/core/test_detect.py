@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from miniatures.skeletons import GROUPS, SETTINGS, STATES, skeleton
+from miniatures.skeletons import FLAGS, GROUPS, SETTINGS, STATES, skeleton
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.choosing import choose, locate
@@ -89,6 +89,19 @@ def test_a_host_without_its_training_script_is_not_vanilla(tmp_path):
     (tmp_path / "train.py").rename(tmp_path / "train_densify.py")
     (error,) = errors(repo)
     assert (error.code, error.found) == ("other-host", "no train.py")
+
+
+@pytest.mark.parametrize("models", [1, 2])
+def test_scripts_have_any_names_if_they_train_one_model(tmp_path, models):
+    repo = skeleton(tmp_path)
+    made = "gaussians = GaussianModel(3)\n" * models
+    trains = "gaussians.training_setup(opt)\nloss.backward()\n"
+    (tmp_path / "train_it.py").write_text(f"{made}{trains}{FLAGS}")
+    (tmp_path / "train.py").unlink()
+    assert [error.found for error in errors(repo)] == (["no train.py"] if models == 2 else [])
+    assert Vanilla3DGS().command_line(repo).scripts == (
+        ("train.py",) if models == 2 else ("train_it.py",)
+    )
 
 
 class Renamed(Vanilla3DGS):

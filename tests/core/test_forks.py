@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 from miniatures.forks import fork
 
 from fragprune_3dgs_fork import ForkAdapter
-from fragprune_plugins.adapting import Role, UsageError
+from fragprune_plugins.adapting import EngineError, HostCall, Role, UsageError
 from fragprune_plugins.hosts.choosing import attempt, choose
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.hosts.verdict import judge
@@ -76,6 +78,164 @@ def test_objects_are_known_by_argument_and_kernel(tmp_path):
     given = {"values": values, "arguments": ", sh_objs=pc.get_objects"}
     assert errors(fork(tmp_path / "known", used, **given, kernel=OBJECTS)) == []
     assert errors(fork(tmp_path / "unknown", used, **given))
+
+
+DRAWN = "if (test_T < 0.0001f) { done = true; continue; }"
+SUM = "{drawn} C[ch] += c * alpha * T; {before} T = test_T; {behind}"
+ADDED = "atomicAdd(&(hits[collected_id[j]]), {});"
+MADE = "torch::Tensor hits = torch::zeros({{P{}}}, means3D.options(){});"
+SUMS = {
+    "fragments": (("", ADDED.format("1.0f"), MADE.format(", 1", "")), ("count", True, False)),
+    "as integers": (
+        ("", ADDED.format("1"), MADE.format("", ".dtype(torch::kInt32)")),
+        ("count", False, True),
+    ),
+    "weights": ((ADDED.format("alpha * T"), "", MADE.format("", "")), ("weight", False, False)),
+    "weights of the next": ((("", ADDED.format("alpha * T"), "")), None),
+    "of some": (("", f"if (T > 0.5f) {{ {ADDED.format('1')} }}", ""), None),
+    "of others": (("", ADDED.format("2"), ""), None),
+    "twice": ((ADDED.format("1"), ADDED.format("1"), ""), None),
+}
+
+
+@pytest.mark.parametrize("what", SUMS)
+def test_a_sum_for_each_gaussian_is_known_by_its_kernel(tmp_path, what):
+    (before, behind, made), expected = SUMS[what]
+    kernel = SUM.format(drawn=DRAWN, before=before, behind=behind) + made
+    used = (USED[0], USED[1].format("hits"))
+    repo = fork(tmp_path, used, values="image, radii, hits", kernel=kernel)
+    if expected is None:
+        assert "hits, read in train.py" in errors(repo)[0]
+        return
+    assert errors(repo) == []
+    dialect = ForkAdapter().dialect(repo)
+    value = dialect.values["diff_gaussian_rasterization"][2]
+    assert (value.role, value.column, value.integer) == expected
+
+
+OFF = {
+    "None": (", mult=None", []),
+    "False": (", mult=False", []),
+    "a parameter": (", mult=mult", [("chosen=None", "chosen=None, mult=None")]),
+    "an option": (", mult=pipe.mult", []),
+}
+OPTIONS = """
+class PipelineParams:
+    def __init__(self):
+        self.mult = False
+        self.iterations = 9
+"""
+
+
+@pytest.mark.parametrize("what", OFF)
+def test_a_setting_that_is_off_is_served_as_long_as_it_is_off(tmp_path, what):
+    settings, changes = OFF[what]
+    repo = fork(tmp_path, *changes, settings=settings)
+    options = tmp_path / "arguments/__init__.py"
+    options.parent.mkdir(exist_ok=True)
+    options.write_text(OPTIONS)
+    assert errors(repo) == []
+    dialect = ForkAdapter().dialect(repo)
+    assert dialect.off == {"mult"}
+    with pytest.raises(EngineError, match="None or False"):
+        dialect.expect_off(HostCall(SimpleNamespace(mult=0.5), {}))
+    dialect.expect_off(HostCall(SimpleNamespace(mult=None), {}))
+
+
+def test_a_setting_that_a_script_turns_on_is_refused(tmp_path):
+    mult = ("chosen=None", "chosen=None, mult=None")
+    passed = ("pipe, background)", "pipe, background, mult=opt.extent)")
+    assert "mult, unknown" in errors(fork(tmp_path, mult, passed, settings=", mult=mult"))[0]
+
+
+BINDING = """
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means3D, means2D, opacities, raster_settings):
+        return _C.rasterize(means3D, opacities, {forward})
+
+    @staticmethod
+    def backward(ctx, *grads):
+        grad2, grad1, grad3, z = _C.rasterize_gaussians_backward(*ctx.saved)
+        factor = torch.minimum(z, raster_settings.reach)
+        scaled = {backward} * factor
+        grads = (grad1, {means2D}, {opacities}, None)
+        return grads
+"""
+GRADIENTS = {
+    "on the screen": ({"means2D": "scaled"}, True),
+    "of opacities": ({"opacities": "scaled"}, False),
+    "and the picture": ({"forward": "raster_settings.reach"}, False),
+}
+
+
+@pytest.mark.parametrize("what", GRADIENTS)
+def test_a_setting_of_the_backward_pass_is_served_after_densification(tmp_path, what):
+    given, fits = GRADIENTS[what]
+    plain = {"forward": "0", "backward": "grad2", "means2D": "grad2", "opacities": "grad3"}
+    binding = BINDING.format_map(plain | given)
+    repo = fork(tmp_path, settings=", reach=opt.reach", kernel=";", binding=binding)
+    if not fits:
+        assert "reach, unknown" in errors(repo)[0]
+        return
+    assert errors(repo) == []
+    warned = str([each.found for each in ForkAdapter().match(repo).findings])
+    assert "the gradient on the screen, which reach changes" in warned
+    ForkAdapter().refuse(repo, [], stage="auto", device="cuda")
+    with pytest.raises(UsageError, match="joint"):
+        ForkAdapter().refuse(repo, [], stage="joint", device="cuda")
+
+
+POSED = """
+
+def render_posed(viewpoint_camera, pc, pipe, bg_color):
+    s = GaussianRasterizationSettings(theta=viewpoint_camera.theta)
+    rasterizer = GaussianRasterizer(raster_settings=s)
+    image, radii, touched = rasterizer(means3D=pc.get_xyz)
+    return {"render": image, "radii": radii}
+"""
+CHOICE = """
+    if args.posed:
+        from gaussian_renderer import render_posed as render
+    for iteration in"""
+
+
+@pytest.mark.parametrize("switch", [True, False])
+def test_a_drawing_function_for_an_option_that_is_off_is_not_reached(tmp_path, switch):
+    flag = 'parser.add_argument("--posed", ' + ('action="store_true")' if switch else "default=1)")
+    repo = fork(
+        tmp_path,
+        ('"radii": radii}', '"radii": radii}' + POSED),
+        ("\n    for iteration in", CHOICE),
+        ("    for name in ", f"    {flag}\n    for name in "),
+    )
+    assert errors(repo) == [] if switch else "theta, unknown" in errors(repo)[0]
+
+
+def test_checkpoints_have_other_names_too(tmp_path):
+    assert errors(fork(tmp_path, ("chkpnt", "ckpt"))) == []
+    for name in ("ckpt7.pth", "chkpnt9.pth", "cls8.pth"):
+        (tmp_path / name).touch()
+    assert {number for number, _ in ForkAdapter().saved_iterations(tmp_path)} == {7, 9}
+
+
+GETTER = """        if self._new is not None:
+            return self._new
+        return self._xyz
+"""
+SETS = "    def warp(self):\n        self._new = self.net()\n\n    def capture"
+
+
+@pytest.mark.parametrize("called", [False, True])
+def test_positions_may_be_others_where_no_script_sets_them(tmp_path, called):
+    repo = fork(
+        tmp_path,
+        ("        return self._xyz\n", GETTER),
+        ("sh_degree): ...", "sh_degree):\n        self._new = None"),
+        ("    def capture", SETS),
+        (STATEMENT, "gaussians.warp()" if called else STATEMENT),
+    )
+    assert ("computed" in str(errors(repo))) == called
 
 
 STATEMENT = "gaussians.thin_out(mask)"

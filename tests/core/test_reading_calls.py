@@ -52,4 +52,4 @@ def test_a_rasterizer_is_read_however_it_is_spelled(renderer):
     (found,) = read_calls(renderer, RENDERER, "render")
     assert (found.call.package, found.settings) == ("a_rasterizer", tuple(SETTINGS))
     assert found.names == ("image", "radii", "depth")
-    assert set(found.given) == {"means3D", "means2D", "opacities"}
+    assert set(found.given) == {"means3D", "means2D", "opacities", *SETTINGS}

@@ -126,6 +126,7 @@ def fork(
     arguments: str = "",
     package: str = "diff_gaussian_rasterization",
     kernel: str = "",
+    binding: str = "",
     script: str = "train.py",
 ) -> HostRepo:
     """A fork that an extra group and its methods' names tell from vanilla 3DGS.
@@ -138,6 +139,7 @@ def fork(
         arguments: of its call, besides vanilla's.
         package: the rasterizer's.
         kernel: CUDA source of the rasterizer; "" if it is not vendored.
+        binding: Python of the rasterizer, where it is vendored.
         script: name of the training script.
     """
     from miniatures.skeletons import SETTINGS
@@ -159,9 +161,9 @@ def fork(
     for old, new in changes:
         assert any(old in text for text in texts.values()), old
         texts = {path: text.replace(old, new) for path, text in texts.items()}
-    if kernel:
+    if kernel or binding:
         texts |= {
-            f"submodules/a/{package}/__init__.py": "",
+            f"submodules/a/{package}/__init__.py": binding,
             "submodules/a/forward.cu": KERNEL.replace("SUMS", kernel),
         }
     for name, text in texts.items():

@@ -23,8 +23,8 @@ from fragprune_plugins.hosts.graphdeco.call import (
     read_calls,
 )
 from fragprune_plugins.hosts.graphdeco.densifying import clones, needy, reaches, splits
-from fragprune_plugins.hosts.graphdeco.reading import read_flags, read_getters
-from fragprune_plugins.hosts.kernels import SURFEL, normal_sources
+from fragprune_plugins.hosts.graphdeco.reading import defaults, read_flags, read_getters
+from fragprune_plugins.hosts.kernels import SURFEL, normal_sources, vendored
 
 __all__ = [
     "CLONE",
@@ -37,6 +37,7 @@ __all__ = [
     "RasterizerCall",
     "clones",
     "default",
+    "defaults",
     "drawing_functions",
     "group_names",
     "needy",
@@ -46,4 +47,5 @@ __all__ = [
     "read_flags",
     "read_getters",
     "splits",
+    "vendored",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,12 @@ from fragprune_plugins.hosts.adapter import (
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_plugins.hosts.graphdeco.densifying import clones, splits
-from fragprune_plugins.hosts.graphdeco.reading import read_flags, read_getters
+from fragprune_plugins.hosts.graphdeco.reading import (
+    defaults,
+    read_flags,
+    read_getters,
+    training_scripts,
+)
 from fragprune_plugins.hosts.kernels import SPLAT, Kernel, read_kernels
 from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
@@ -163,7 +169,7 @@ class GraphdecoAdapter(ScriptAdapter):
         own_names: "module:name" of names that only this host's source mentions, not its ancestors'.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
-        checkpoints: how names of checkpoints begin, before the iteration.
+        checkpoints: how names of checkpoints begin, before the iteration; a regular expression.
         densifies_until: arguments with the iterations after which the host adds, relocates, prunes
             and resets no Gaussian; () if it does so to its end.
     """
@@ -193,7 +199,9 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check scripts and flags, the host's own names, the model, and the rasterizer."""
-        missing = [f"no {name}" for name in self.scripts if not (repo.root / name).is_file()]
+        missing = [
+            f"no {name}" for name in self.scripts_of(repo) if not (repo.root / name).is_file()
+        ]
         for module, name in (each.split(":") for each in self.own_names):
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
         packages = dict.fromkeys([self.package, *(each.package for each in self.calls)])
@@ -284,19 +292,24 @@ class GraphdecoAdapter(ScriptAdapter):
             or bool(repo.mentions([MODEL], ["SparseGaussianAdam"])),
         )
 
+    def scripts_of(self, repo: HostRepo) -> tuple[str, ...]:
+        """``scripts``; where a checkout has none of them, its own that train a GaussianModel."""
+        there = any((repo.root / name).is_file() for name in self.scripts)
+        return self.scripts if there else training_scripts(repo) or self.scripts
+
     def command_line(self, repo: HostRepo) -> CommandLine:
         """The flags of ``train.py``; the iteration count's default is read from the source.
 
         The last iteration takes no step.
         """
         return CommandLine(
-            scripts=self.scripts,
+            scripts=self.scripts_of(repo),
             iterations="--iterations",
             output=("-m", "--model_path"),
             source=("-s", "--source_path"),
             save_checkpoints="--checkpoint_iterations",
             resume="--start_checkpoint",
-            default_iterations=int(default(repo, "OptimizationParams", "iterations", 30_000)),
+            default_iterations=int(default(repo, "iterations", 30_000)),
             skipped=1,
             resolution=("-r", "--resolution"),
             images=("-i", "--images"),
@@ -417,17 +430,15 @@ class GraphdecoAdapter(ScriptAdapter):
         return output / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """Checkpoints and PLYs.
-
-        The host writes a checkpoint after the PLY of the same iteration.
-        """
+        """Checkpoints and PLYs. A host writes a checkpoint after the PLY of its iteration."""
         plys = {
             path: path.parent.name.removeprefix("iteration_")
             for path in output.glob("point_cloud/iteration_*/point_cloud.ply")
         }
         checkpoints = {
-            path: path.stem.removeprefix(self.checkpoints)
-            for path in output.glob(f"{self.checkpoints}*.pth")
+            path: match[1]
+            for path in output.glob("*.pth")
+            if (match := re.fullmatch(rf"(?:{self.checkpoints})(\d+)", path.stem))
         }
         found = [
             (path.stat().st_mtime_ns, int(number), path in checkpoints, path)
@@ -472,7 +483,7 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
         if isinstance(element, ast.Constant) and isinstance(element.value, int)
     }
     capped = any(isinstance(node, ast.Constant) and node.value == WIDEST for node in everything)
-    value = int(default(repo, "ModelParams", "_resolution", -1)) if asked is None else asked
+    value = int(default(repo, "_resolution", -1)) if asked is None else asked
     if not divisors or not capped or (value < 1 and value != -1):
         raise NotComparedError(
             f"-r {value}" if divisors and capped else repo.place(CAMERAS, "loadCam"),
@@ -485,49 +496,18 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     return Resolution(width=WIDEST if value == -1 else value, shrink_only=value == -1)
 
 
-def default(repo: HostRepo, group: str, name: str, otherwise: float) -> float:
-    """A number that an argument group's ``__init__`` assigns to ``self.name``; else ``otherwise``.
-
-    Args:
-        repo: the checkout.
-        group: class in ``arguments``, such as OptimizationParams.
-        name: the attribute.
-        otherwise: the result if the source has no such number.
-    """
-    function = repo.function("arguments", f"{group}.__init__")
-    for node in nodes(function):
-        if (
-            isinstance(node, ast.Assign)
-            and isinstance(node.targets[0], ast.Attribute)
-            and node.targets[0].attr == name
-            and isinstance(node.value, ast.Constant)
-            and isinstance(node.value.value, int | float)
-        ):
-            return node.value.value
-    return otherwise
+def default(repo: HostRepo, name: str, otherwise: float) -> float:
+    """A number that an argument group assigns to ``self.name``; else ``otherwise``."""
+    values = (getattr(each, "value", None) for each in defaults(repo, "arguments", name))
+    return next((each for each in values if isinstance(each, int | float)), otherwise)
 
 
 def numbers(repo: HostRepo, script: Path, name: str) -> list[int]:
-    """The default of an argument, of an argument group or of the script itself; [] without one.
-
-    Args:
-        repo: the checkout.
-        script: whose ``add_argument`` calls count.
-        name: the argument.
-    """
-    if value := default(repo, "OptimizationParams", name, 0):
-        return [int(value)]
-    tree = repo.tree(".".join(script.relative_to(repo.root).with_suffix("").parts))
-    for node in nodes(tree):
-        if (
-            isinstance(node, ast.Call)
-            and getattr(node.func, "attr", "") == "add_argument"
-            and any(
-                isinstance(each, ast.Constant) and each.value == f"--{name}" for each in node.args
-            )
-        ):
-            given = {each.arg: each.value for each in node.keywords}
-            with contextlib.suppress(KeyError, ValueError, TypeError):
-                value = ast.literal_eval(given["default"])
+    """The default of an argument, of an argument group or of the script; [] without one."""
+    module = ".".join(script.relative_to(repo.root).with_suffix("").parts)
+    for each in (*defaults(repo, "arguments", name), *defaults(repo, module, name)):
+        with contextlib.suppress(ValueError, TypeError):
+            value = ast.literal_eval(each)
+            if value != 0:  # an argument group's 0 leaves it to the script
                 return [int(each) for each in (value if isinstance(value, list) else [value])]
     return []

@@ -68,7 +68,7 @@ class CallInSource:
         line: where its result is assigned.
         names: of the unpacked values, in order; "" where one is no plain name. Empty if the result
             is not unpacked.
-        given: the arguments by name.
+        given: arguments and settings by name.
     """
 
     call: RasterizerCall
@@ -107,7 +107,7 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
         return []
     imported = _Imported(repo, module, body)
     made = [node for node in nodes(body) if imported.of(node, SETTINGS)]
-    names = _settings(made[0]) if made else ()  # type: ignore[arg-type]
+    names = _settings(made[0]) if made else {}  # type: ignore[arg-type]
     if not names:
         return []
     besides = frozenset(names) - set(SHARED)
@@ -115,20 +115,21 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
     return [
         CallInSource(
             RasterizerCall(besides, outputs, function, frozenset(given) - set(ARGUMENTS), package),
-            names,
+            tuple(names),
             line,
             unpacked,
-            given,
+            given | names,
         )
         for outputs, line, given, package, unpacked in drawn
         or [(None, body.lineno, {}, imported.package(made[0]), ())]
     ]
 
 
-def _settings(made: ast.Call) -> tuple[str, ...]:
-    """Names of the settings of a call: positions are those of the 3DGS rasterizer."""
+def _settings(made: ast.Call) -> dict[str, ast.expr]:
+    """The settings of a call by name: positions are those of the 3DGS rasterizer."""
     unnamed = [SHARED[i] if i < len(SHARED) else f"number {i + 1}" for i in range(len(made.args))]
-    return (*unnamed, *(each.arg for each in made.keywords if each.arg))
+    named = {each.arg: each.value for each in made.keywords if each.arg}
+    return dict(zip(unnamed, made.args, strict=True)) | named
 
 
 _Drawn = tuple[int | None, int, dict[str, ast.expr], str, tuple[str, ...]]

@@ -70,6 +70,27 @@ def computed(function: Function, attribute: str) -> str | None:
     return None if returned else "computed, it returns nothing"
 
 
+def training_scripts(repo: HostRepo) -> tuple[str, ...]:
+    """Scripts right in the checkout's folder that make one GaussianModel, and go backward."""
+    names = sorted(each.stem for each in repo.root.glob("*train*.py"))
+    trains = [n for n in names if len(repo.mentions([n], ("training_setup", "backward"))) == 2]
+    return tuple(f"{each}.py" for each in trains if len(repo.calls(each, "GaussianModel")) == 1)
+
+
+def defaults(repo: HostRepo, module: str, name: str) -> Iterator[ast.expr]:
+    """What the classes of a module first assign to ``self.name``, and defaults of that option."""
+    for node in nodes(repo.tree(module)):
+        if isinstance(node, ast.FunctionDef) and node.name == "__init__":
+            for each in ast.walk(node):
+                if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == f"self.{name}":
+                    yield each.value
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
+            given = {each.arg: each.value for each in node.keywords}
+            switch = getattr(given.get("action"), "value", "") == "store_true"
+            if any(getattr(each, "value", None) == f"--{name}" for each in node.args):
+                yield given.get("default", ast.Constant(False if switch else None))
+
+
 def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
     """An error for each training script that lacks a flag that we set, or reads no flags."""
     wanted = ("iterations", "output", "save_checkpoints", "resume")

@@ -1,0 +1,173 @@
+"""Reads what a fork's rasterizer returns, and what its settings do, from the sources beside it."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Literal
+
+from fragprune_plugins.adapting import HostRepo, graphdeco
+
+Role = Literal[
+    "image",
+    "radii",
+    "depth",
+    "invdepth",
+    "alpha",
+    "objects",
+    "count",
+    "weight",
+    "unproved",
+    "unread",
+]
+
+_DEPTH = re.compile(r"(\w+)\+=depths\[collected_id\[j\]\]\*alpha\*T;")
+_INVERSE = re.compile(r"(\w+)\+=\(1/depths\[collected_id\[j\]\]\)\*alpha\*T;")
+_WEIGHT = re.compile(r"(\w+)\+=alpha\*T;")
+_OBJECTS = re.compile(r"(\w+)\[ch\]\+=obj_features\[[^;]*\]\*alpha\*T;")
+_ADDED = re.compile(r"([{;])atomicAdd\(&\(?(\w+)\[collected_id\[j\]\]\)?,(alpha\*T|1\.?0?)\);")
+"""A sum for each Gaussian over its fragments, in a statement of its own."""
+_DRAWN = re.compile(r"if\(test_T<0\.0001\)\{done=true;continue;\}")
+"""Behind it, a fragment is one that is drawn."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """A value that a rasterizer returns.
+
+    Attributes:
+        name: that the source gives it.
+        role: what it is; "count" and "weight" are a Gaussian's drawn fragments and their sum of
+            alpha T, "unread" one that nobody reads, "unproved" one that only the numbers of the
+            host's own rasterizer can tell.
+        column: of one number per Gaussian, whether it is (P, 1), not (P,).
+        integer: likewise, whether it is int32.
+    """
+
+    name: str
+    role: Role
+    column: bool = False
+    integer: bool = False
+
+
+def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
+    """What a further value is, by its name and by the vendored kernel that makes it."""
+    late = "antialiasing" in call.settings and len(call.names) == 3
+    if late and call.call.package == "diff_gaussian_rasterization":
+        return Output(name, "invdepth")  # the rasterizer since August 2024
+    text = "".join(graphdeco.normal_sources(repo, call.call.package))
+    if role := _sum_for_gaussians(text, name):
+        made = re.search(rf"{name}=torch::\w+\(\{{\w+(,1)?\}}[^;]*;", text)
+        whole = made is not None and "kInt" in made[0]
+        return Output(name, role, column=bool(made and made[1]), integer=whole)
+    if "depth" in name:
+        for rule, known in ((_DEPTH, "depth"), (_INVERSE, "invdepth")):
+            if _written(text, rule, r"out_\w*depth\w*"):
+                return Output(name, known)  # type: ignore[arg-type]
+    elif re.search(r"alpha|acc|opac", name) and _written(text, _WEIGHT, r"out_(alpha|opac)\w*"):
+        return Output(name, "alpha")
+    elif "obj" in name and "sh_objs" in call.given and _OBJECTS.search(text):
+        return Output(name, "objects")
+    return Output(name, "unread")
+
+
+def _written(text: str, rule: re.Pattern[str], buffer: str) -> bool:
+    """Whether a sum goes into a buffer as it is, and nothing else does."""
+    found = rule.search(text)
+    stored = re.findall(rf"\b{buffer}\[pix_id\]=([^;]+);", text)
+    values = [each[-1] if isinstance(each, tuple) else each for each in stored]
+    return found is not None and bool(values) and set(values) == {found[1]}
+
+
+def _sum_for_gaussians(text: str, name: str) -> Literal["count", "weight"] | None:
+    """Whether a buffer of this name counts a Gaussian's drawn fragments, or sums their weights."""
+    added = [match for match in _ADDED.finditer(text) if match[2] == name]
+    if len(added) != 1 or len(re.findall(rf"atomic\w+\(&\(?{name}\[", text)) != 1:
+        return None
+    (found,) = added
+    behind = [match.end() for match in _DRAWN.finditer(text, 0, found.start())]
+    between = text[behind[-1] : found.end(1)] if behind else ""
+    if not behind or between.count("{") != between.count("}"):  # in a block: only some of them
+        return None
+    if found[3] != "alpha*T":
+        return "count"
+    return None if "T=test_T" in between else "weight"
+
+
+# -- settings --------------------------------------------------------------------------------------
+
+
+def is_off(value: ast.expr | None) -> bool:
+    """Whether an expression is None or False."""
+    return isinstance(value, ast.Constant) and value.value in (None, False)
+
+
+def off_by_default(repo: HostRepo, modules: Iterable[str], name: str) -> bool:
+    """Whether all that modules assign to ``self.name`` first, or an option's default, is off."""
+    values = [each for module in modules for each in graphdeco.defaults(repo, module, name)]
+    return bool(values) and all(map(is_off, values))
+
+
+def changed_gradients(repo: HostRepo, package: str, setting: str) -> frozenset[str] | None:
+    """The arguments whose gradients a setting changes, if the forward pass never gets it.
+
+    None where the picture may depend on it, or nothing was read. The Python of a vendored package
+    says it: ``forward`` lists what the kernels get, ``backward`` what becomes of their gradients.
+    """
+    for node in _binding(repo, package):
+        if isinstance(node, ast.ClassDef):
+            made = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
+            if {"forward", "backward"} <= made.keys():
+                forward, backward = made["forward"], made["backward"]
+                if _reads(forward, setting) or not _reads(backward, setting):
+                    return None
+                return _changed(forward, backward)
+    return None
+
+
+def _binding(repo: HostRepo, package: str) -> Iterator[ast.AST]:
+    """The Python of a vendored rasterizer, through which hosts call it."""
+    name = package.rpartition(".")[2]
+    for folder in graphdeco.vendored(repo, package):
+        with suppress(SyntaxError):
+            yield from ast.walk(ast.parse(repo.read(folder / name / "__init__.py")))
+
+
+def _reads(function: ast.FunctionDef, setting: str) -> bool:
+    return any(getattr(node, "attr", "") == setting for node in ast.walk(function))
+
+
+def _changed(forward: ast.FunctionDef, backward: ast.FunctionDef) -> frozenset[str] | None:
+    """Parameters of ``forward`` whose gradients are not what the kernels gave."""
+    given: set[str] = set()
+    for node in ast.walk(backward):
+        if isinstance(node, ast.Assign) and "_backward(" in ast.unparse(node.value):
+            target = node.targets[0]
+            given |= {getattr(each, "id", "") for each in getattr(target, "elts", [target])}
+    for node in ast.walk(backward):
+        if isinstance(node, ast.Assign | ast.AugAssign) and "_backward(" not in ast.unparse(node):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            given -= {ast.unparse(each).split("[")[0] for each in targets}
+    last = backward.body[-1]
+    returned = last.value if isinstance(last, ast.Return) else None
+    if isinstance(returned, ast.Name):
+        name = returned.id
+        returned = next(
+            (
+                node.value
+                for node in ast.walk(backward)
+                if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name
+            ),
+            None,
+        )
+    if not isinstance(returned, ast.Tuple):
+        return None
+    names = [each.arg for each in forward.args.args[1:]]
+    return frozenset(
+        name
+        for name, each in zip(names, returned.elts, strict=False)
+        if not is_off(each) and getattr(each, "id", "") not in given
+    )
