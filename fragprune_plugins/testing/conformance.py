@@ -138,10 +138,15 @@ def found_adapter(adapter: str | HostAdapter) -> HostAdapter:
     """
     if isinstance(adapter, HostAdapter):
         return adapter
-    installed = {each.name: each for each in load_plugins().adapters}
-    if adapter not in installed:
-        raise LookupError(f"adapter {adapter!r}: none of {', '.join(installed) or 'no adapters'}")
-    return installed[adapter]
+    if adapter not in _installed():
+        known = ", ".join(_installed()) or "no adapters"
+        raise LookupError(f"adapter {adapter!r}: none of {known}")
+    return _installed()[adapter]
+
+
+@cache
+def _installed() -> dict[str, HostAdapter]:
+    return {each.name: each for each in load_plugins().adapters}
 
 
 @cache

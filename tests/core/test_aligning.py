@@ -6,7 +6,7 @@ import contextlib
 
 import pytest
 import torch
-from core.sessions import Role, call, follow, state
+from core.sessions import Model, Role, call, follow, state
 
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.seams import RowTrace
@@ -83,6 +83,13 @@ def test_a_row_that_differs_in_one_inherited_group_is_no_copy(session):
 
     with pytest.raises(AlignmentError, match="not copies"):
         parents(session, model, torch.tensor([2]), body)
+
+
+@pytest.mark.parametrize("role", OF_MODELS)
+def test_a_model_that_is_not_followed_is_the_hosts_own_business(session, role):
+    seam = call(Model(3), role, lambda tensors: f"done with {tensors}", "these")
+    assert OF_MODELS[role](session, seam) == "done with these"
+    assert session.plugins.told == []
 
 
 def rearrange(session, model, trace, rows=None):

@@ -89,6 +89,16 @@ def test_a_model_saved_before_thresholds_open_is_warned_of(tmp_path, caplog, war
     assert all(f"step 3 of {session.settings.iterations}" in e.message for e in caplog.records)
 
 
+def test_thresholds_of_a_hosts_own_checkpoint_are_taken_up_as_they_were_saved():
+    saved = ThresholdStore.from_falloff(torch.tensor([0.1, 0.2]))
+    session, model = state(), Model(2)
+    session.take_up(model, saved.state_dict())
+    taken = session.models[model]
+    assert torch.equal(taken.store.logits, saved.logits)
+    assert taken.loaded() is session.adapter.means(model)
+    assert session.last() is model
+
+
 def test_thresholds_of_another_number_of_gaussians_are_not_taken_up():
     session, model = state(), Model(3)
     with pytest.raises(AlignmentError, match="saved thresholds"):

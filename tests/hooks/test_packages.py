@@ -7,12 +7,15 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from finetune import tiny
 
 from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.testing.fresh import fresh
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -118,43 +121,31 @@ def model(tmp_path: Path) -> Path:
     return path
 
 
+def invoked(site: str, folder: str, words: list[str]) -> str:
+    """What the command prints where a folder of packages comes first."""
+    sys.path.insert(0, site)
+    os.chdir(folder)
+    result = CliRunner().invoke(import_module("fragprune_plugins.workbench.commands").cli, words)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
 def test_one_package_adds_a_command_a_format_an_engine_and_a_log(tmp_path, model):
     site = tmp_path / "site"
     install(site, "mine", POINTS)
     (site / "mine.py").write_text(MODULE)
 
-    def call(*words: object) -> str:
-        return fragprune(*words, path=[site], cwd=tmp_path)
+    def call(line: str) -> str:
+        return fresh(invoked, str(site), str(tmp_path), line.split())
 
     assert "Count the Gaussians" in call("--help")
-    call("export", model, "--out", "model.mine")
-    assert json.loads(call("count", "model.mine", "--json")) == {"gaussians": 60}
-    words = (
-        "--engine",
-        "mine",
-        "--orbit",
-        "--seconds",
-        0.1,
-        "--resolution",
-        16,
-        "--out",
-        "grey",
-        "--json",
-    )
-    assert json.loads(call("render", "model.mine", *words))["engine"] == "mine"
-    words = (
-        "--iters",
-        3,
-        "--resolution",
-        16,
-        "--train",
-        "opacity",
-        "--out",
-        "p.mine",
-        "--log",
-        "lines:steps.txt",
-    )
-    call("finetune", "model.mine", "--self", *words)
+    call("export model.ply --out model.mine")
+    assert json.loads(call("count model.mine --json")) == {"gaussians": 60}
+    film = "--orbit --seconds 0.1 --resolution 16"
+    drawn = call(f"render model.mine --engine mine {film} --out grey --json")
+    assert json.loads(drawn)["engine"] == "mine"
+    short = "--iters 3 --resolution 16 --train opacity --log lines:steps.txt"
+    call(f"finetune model.mine --self --out p.mine {short}")
     assert (tmp_path / "steps.txt").read_text().split() == ["1", "2", "3"]
 
 
@@ -181,18 +172,8 @@ def test_an_adapter_and_a_slice_go_with_their_folders(tmp_path, model):
     adapters = json.loads(fragprune("adapters", "--json", path=path, cwd=copy))
     assert adapters["findings"] == []
     assert "mcmc" not in [each["name"] for each in adapters["adapters"]]
-    out = (
-        "--orbit",
-        "--seconds",
-        0.1,
-        "--resolution",
-        16,
-        "--engine",
-        "reference",
-        "--out",
-        tmp_path / "pictures",
-    )
-    fragprune("render", model, *out, path=path, cwd=copy)
+    out = f"--orbit --seconds 0.1 --resolution 16 --engine reference --out {tmp_path}/pictures"
+    fragprune("render", model, *out.split(), path=path, cwd=copy)
     linted = subprocess.run(
         [str(Path(sys.executable).with_name("lint-imports"))],
         capture_output=True,
