@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
+from dataclasses import fields
 from typing import TYPE_CHECKING, Final
 
 from fragprune_plugins.constants import TILE
@@ -135,49 +136,19 @@ def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:
 
 
 def options_of(inputs: RasterInputs) -> Options:
-    """The oracle's options for these inputs."""
-    return Options(
-        scale_modifier=inputs.scale_modifier,
-        dilation=inputs.dilation,
-        compensation=inputs.compensation,
-        near=inputs.near,
-        alpha_max=inputs.alpha_max,
-        stop=inputs.stop,
-        rim=inputs.rim,
-        cap_gradient=inputs.cap_gradient,
-        sample_offsets=inputs.sample_offsets,
-        absolute_gradient=inputs.absolute_gradient,
-    )
+    """The oracle's options for these inputs, which have the same names."""
+    shared = {each.name for each in fields(Options)} & vars(inputs).keys()
+    return Options(**{name: getattr(inputs, name) for name in shared})
 
 
 def camera_of(inputs: RasterInputs) -> Camera:
     """The oracle's camera for these inputs."""
-    view = inputs.view
-    return Camera(
-        width=view.width,
-        height=view.height,
-        tan_fov_x=view.tan_fov_x,
-        tan_fov_y=view.tan_fov_y,
-        viewmatrix=view.viewmatrix,
-        projmatrix=view.projmatrix,
-        campos=view.campos,
-        background=view.background,
-    )
+    return Camera(**vars(inputs.view))
 
 
 def gaussians_of(splats: Splats) -> Gaussians:
     """The oracle's Gaussians, sharing the tensors."""
-    return Gaussians(
-        means=splats.means,
-        opacities=splats.opacities,
-        scales=splats.scales,
-        rotations=splats.rotations,
-        cov3d=splats.cov3d,
-        sh=splats.sh,
-        colors=splats.colors,
-        sh_degree=splats.sh_degree,
-        features=splats.features,
-    )
+    return Gaussians(**vars(splats))
 
 
 def projected_of(footprints: Footprints) -> Projected:

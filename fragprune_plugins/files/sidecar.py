@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 
 from fragprune_plugins.errors import SidecarError
 from fragprune_plugins.files.atomic import (
@@ -186,9 +188,6 @@ def _address(model: Path, sha: str) -> Path:
 
 
 def _write(path: Path, store: ThresholdStore, info: SidecarInfo) -> None:
-    from safetensors import SafetensorError
-    from safetensors.torch import save_file
-
     expect_finite(store.numbers, str(path_beside(path)))
     state = store.state_dict()
     tensors = {k: v.cpu().contiguous() for k, v in state.items() if isinstance(v, torch.Tensor)}
@@ -254,8 +253,6 @@ def _remedy(model: Path) -> str:
 
 def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
     """Read a sidecar's store state and metadata, without a look at the model beside it."""
-    from safetensors import safe_open
-
     remedy = _remedy(model)
     door = Door(SidecarError, "unreadable", f"a file of format {FORMAT}", remedy, missing=remedy)
     with door.reading(path) as reading:

@@ -18,6 +18,7 @@ from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.session import Session
+from fragprune_plugins.plugins.loading import installed
 
 _kept = contextlib.ExitStack()
 
@@ -67,8 +68,6 @@ def prepared(session: Session, device: str) -> Iterator[None]:
 
 def _prepare(adapter: str, root: Path, package: str, device: str) -> None:
     """Prepare this process, a worker; it stays so to its end."""
-    from fragprune_plugins.plugins.loading import installed
-
     plugins = installed()
     chosen = next(each for each in plugins.adapters if each.name == adapter)
     drop_in = True if device == "cpu" else None

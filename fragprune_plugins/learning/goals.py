@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.pressure import (
@@ -20,9 +20,7 @@ from fragprune_plugins.learning.pressure import (
     PressureController,
     PressureRule,
 )
-
-if TYPE_CHECKING:
-    from fragprune_plugins.learning.targets import Target
+from fragprune_plugins.learning.targets import Target
 
 
 @dataclass(frozen=True)
@@ -107,8 +105,6 @@ class Fewer(Goal):
 
     def target(self) -> Target:
         """One shift of all thresholds meets the ratio late in the training."""
-        from fragprune_plugins.learning.targets import Target
-
         return Target(self.ratio)
 
 

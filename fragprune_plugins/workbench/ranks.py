@@ -13,6 +13,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fragprune_plugins.errors import RanksError
@@ -163,8 +164,6 @@ def joined(device: torch.device) -> Iterator[Ranks]:
     if not ranks.several:
         yield ranks
         return
-    from datetime import timedelta
-
     import torch
     import torch.distributed as dist
 
@@ -216,8 +215,6 @@ def speaks() -> bool:
 
 @functools.cache
 def _asks_first(address: str, port: str, attempt: str) -> bool:
-    from datetime import timedelta
-
     from torch.distributed import TCPStore  # type: ignore[attr-defined]
 
     try:

@@ -161,7 +161,7 @@ def test_the_target_is_what_the_model_shows_as_it_came_in(scene, falloff):
             ("--self", "--data", "scene", "--cameras", "c.json"),
             ("--data with --cameras", "Drop one of the two"),
         ),
-        (("--self", "--control"), ("--self with --control", "Drop --control")),
+        (("--self", "--control"), ("--self with --control", "Drop one of the two")),
     ],
 )
 def test_what_contradicts_itself_is_refused_with_a_remedy(scene, tmp_path, options, words):

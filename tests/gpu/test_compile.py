@@ -9,8 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from fragprune_plugins.engines.cuda import kernels
-from fragprune_plugins.engines.cuda.frame import MACROS, VARIANTS, unblend_macros
+from fragprune_plugins.engines.cuda.frame import MACROS, unblend_macros
 from fragprune_plugins.slicing import structs
+from fragprune_plugins.workbench.doctor.compiling import VARIANTS, resources
 
 ARCHITECTURES = (
     90,
@@ -48,7 +49,7 @@ def nvrtc() -> kernels.Nvrtc:
 
 
 def check(image: kernels.Image) -> None:
-    found = kernels.resources(image.log)
+    found = resources(image.log)
     assert found
     for name, needs in found.items():
         assert (needs.stack, needs.spills) == (0, 0), (name, needs)

@@ -14,6 +14,7 @@ from fragprune_plugins.engines.cuda import driver, kernels, self_check
 from fragprune_plugins.engines.cuda.self_check import Verdict
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.workbench.commands import cli
+from fragprune_plugins.workbench.doctor import work
 
 
 class Compiler:
@@ -81,7 +82,7 @@ def test_a_gpu_is_checked_each_time_and_what_failed_told_from_what_could_not_run
     monkeypatch: pytest.MonkeyPatch, verdict: Verdict, status: int, agrees: bool | None, said: str
 ) -> None:
     monkeypatch.setattr(driver, "missing", lambda: None)
-    monkeypatch.setattr(driver, "describe", lambda: {"available": True, "reason": None})
+    monkeypatch.setattr(work, "_cuda_engine", lambda: {"available": True, "reason": None})
     monkeypatch.setattr(self_check, "check_in_subprocess", lambda device: verdict)
     code, report = invoke()
     assert (code, report["gpu"]["agrees"]) == (status, agrees)

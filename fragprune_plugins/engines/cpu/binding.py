@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fragprune_plugins import native
+from fragprune_plugins.errors import EngineError
 
 API_VERSION: Final = 10
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
@@ -315,8 +316,6 @@ def library() -> Library:
     Raises:
         EngineError: there is none; the message gives the reason.
     """
-    from fragprune_plugins.errors import EngineError
-
     answer = _answer()
     if isinstance(answer, Library):
         return answer

@@ -174,22 +174,3 @@ class Driver:
                 "Run again with CUDA_LAUNCH_BLOCKING=1 to find the kernel that failed.",
             )
         return results[0] if results else None
-
-
-def describe() -> dict[str, Any]:
-    """What ``fragprune doctor`` prints: how kernels reach the GPU, or why they cannot."""
-    try:
-        found = kernels.compiler()
-    except kernels.Unavailable:
-        route = None
-    else:
-        route = f"{found.name} {found.version}"
-    seen = torch.cuda.is_available()
-    return {
-        "available": missing() is None,
-        "compiler": route,
-        "device": torch.cuda.get_device_name() if seen else None,
-        "capability": ".".join(map(str, torch.cuda.get_device_capability())) if seen else None,
-        "kept": str(kernels.cache_folder()),
-        "reason": missing(),
-    }

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from fragprune_plugins.engines.cuda.driver import Driver
 from fragprune_plugins.engines.cuda.frame import (
     Device,
     Drawing,
@@ -85,8 +86,6 @@ class CudaEngine:
         packed: bool = False,
     ) -> None:
         if device is None:
-            from fragprune_plugins.engines.cuda.driver import Driver
-
             device = Driver()
         self.device = device
         self._deterministic, self._packed = deterministic, packed

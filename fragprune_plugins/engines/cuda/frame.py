@@ -51,10 +51,6 @@ _GEOMETRY: Final = frozenset(
 )
 
 
-def _fields(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
-    return tuple((name, kind) for name in names.split())
-
-
 class Frame(ctypes.Structure):
     """fp::Frame: the argument of a forward pass's kernels."""
 
@@ -63,12 +59,14 @@ class Frame(ctypes.Structure):
         ("outputs", binding.Outputs),
         ("spread", ctypes.c_void_p),
         ("capacity", ctypes.c_uint32),
-        *_fields(ctypes.c_int32, "tiles_x tiles_y tile_passes"),
-        *_fields(ctypes.c_void_p, "counters project_words emit_words depth_histogram"),
-        *_fields(ctypes.c_void_p, "tile_histogram ranges"),
-        *_fields(ctypes.c_void_p, "brushes rects tiles first_slot depth_keys depth_ids"),
-        *_fields(ctypes.c_void_p, "entry_keys entry_values owners reached transmittance"),
-        *_fields(ctypes.c_void_p, "stop weights"),
+        ("tiles_x", ctypes.c_int32),
+        ("tiles_y", ctypes.c_int32),
+        ("tile_passes", ctypes.c_int32),
+        *binding.pointers("counters project_words emit_words depth_histogram"),
+        *binding.pointers("tile_histogram ranges"),
+        *binding.pointers("brushes rects tiles first_slot depth_keys depth_ids"),
+        *binding.pointers("entry_keys entry_values owners reached transmittance"),
+        *binding.pointers("stop weights"),
     )
 
 
@@ -79,7 +77,7 @@ class Sort(ctypes.Structure):
         ("count", ctypes.c_void_p),
         ("capacity", ctypes.c_uint32),
         ("shift", ctypes.c_int32),
-        *_fields(ctypes.c_void_p, "histogram words ticket keys values sorted_keys sorted_values"),
+        *binding.pointers("histogram words ticket keys values sorted_keys sorted_values"),
     )
 
 
@@ -90,7 +88,7 @@ class Undraw(ctypes.Structure):
         ("frame", Frame),
         ("by", binding.OutputGrads),
         ("to", binding.InputGrads),
-        *_fields(ctypes.c_void_p, "by_fragments background sums"),
+        *binding.pointers("by_fragments background sums"),
         ("ceiling", ctypes.c_float),
     )
 
@@ -150,22 +148,6 @@ def unblend_macros(
         "FP_OFFSETS": int(offsets),
         "FP_FEATURES": features,
     }
-
-
-_TRAINED: Final = frozenset(("means", "hook", "opacities", "scales", "rotations", "sh"))
-
-VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
-    ("scene", {"FP_PACKED": 0}),
-    ("blend", blend_macros()),
-    ("blend", blend_macros(counts=True)),
-    ("blend", blend_macros(stop=True)),
-    *(
-        ("unblend", unblend_macros(frozenset(wanted), sh_turns=True, invdepth=invdepth))
-        for wanted in (_TRAINED, _TRAINED | {"thresholds"}, {"opacities", "thresholds"})
-        for invdepth in (False, True)
-    ),
-)
-"""Sources with macros that training and fine-tuning usually ask for, to be built beforehand."""
 
 
 class Device(Hashable, Protocol):

@@ -19,6 +19,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from filelock import FileLock, Timeout
+
 from fragprune_plugins import native
 
 ENVIRONMENT: Final = "FRAGPRUNE_CUDA"
@@ -58,23 +60,6 @@ class Image:
 
     code: bytes
     log: str
-
-
-@dataclass(frozen=True)
-class Resources:
-    """The resources of a multiprocessor that a kernel needs.
-
-    Attributes:
-        registers: per thread.
-        stack: bytes of local memory per thread, for arrays that did not fit into registers.
-        spills: bytes stored to local memory and loaded again.
-        shared: bytes of shared memory per block.
-    """
-
-    registers: int
-    stack: int
-    spills: int
-    shared: int
 
 
 class Compiler(Protocol):
@@ -332,8 +317,6 @@ def _one_at_a_time(path: Path) -> Iterator[None]:
 
     Without locks two processes may write the same file in turn. Neither reads a partial file.
     """
-    from filelock import FileLock, Timeout
-
     with ExitStack() as held:
         # read-only; held by a process that hangs; file systems without locks
         with suppress(OSError, Timeout, NotImplementedError):
@@ -360,20 +343,3 @@ def _write(path: Path, image: Image) -> None:
     with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
         file.write(f"{hashlib.sha256(rest).hexdigest()}\n{len(log)}\n".encode() + rest)
     os.replace(file.name, path)
-
-
-def resources(log: str) -> dict[str, Resources]:
-    """The resources of each kernel, from the report of ptxas -v."""
-    found = {}
-    for part in re.split(r"Compiling entry function '", log)[1:]:
-        name = part.split("'", 1)[0]
-        stack, stores, loads = re.findall(r"(\d+) bytes (?:stack|spill)", part)[:3]
-        registers = re.search(r"Used (\d+) registers", part)
-        shared = re.search(r"(\d+) bytes smem", part)
-        found[name] = Resources(
-            registers=int(registers.group(1)) if registers else 0,
-            stack=int(stack),
-            spills=int(stores) + int(loads),
-            shared=int(shared.group(1)) if shared else 0,
-        )
-    return found

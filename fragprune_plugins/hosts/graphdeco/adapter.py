@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fragprune_plugins.errors import NotComparedError
+from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.adapter import (
     CHECKPOINT_KEY,
     GROUPS,
@@ -33,6 +34,7 @@ from fragprune_plugins.hosts.kernels import SPLAT, Kernel, read_kernels
 from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import Function, HostRepo, nodes
+from fragprune_plugins.types import RasterInputs, Splats, View
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -108,8 +110,6 @@ class GraphdecoDialect(Dialect):
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call. The host's matrices are already transposed for row vectors."""
         import torch
-
-        from fragprune_plugins.types import RasterInputs, Splats, View
 
         s = call.settings
         sh, dc = call.get("shs"), call.get("dc")
@@ -349,8 +349,6 @@ class GraphdecoAdapter(ScriptAdapter):
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
         """Write the tuple of ``captured``."""
         import torch
-
-        from fragprune_plugins.files.atomic import replacing
 
         capture = self.captured(ply)
         with replacing(target) as temporary:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from fragprune_plugins.constants import NEAR
 from fragprune_plugins.hosts.adapter import HostCall
+from fragprune_plugins.learning.losses import WINDOW, ssim_map
 
 
 def rasterizer(
@@ -167,7 +168,6 @@ def compute_relocation(
 
 def fused_ssim() -> dict[str, ModuleType]:
     """``fused_ssim.fused_ssim``, which hosts of 2024 and later import for their loss."""
-    from fragprune_plugins.learning.losses import WINDOW, ssim_map
 
     def similarity(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
         """Mean SSIM of images (B, C, H, W); "valid" leaves out pixels near the border."""

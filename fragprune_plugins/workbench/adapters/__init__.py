@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 
 
 @click.command("adapters", cls=Command)
@@ -15,6 +15,4 @@ def command() -> Report:
     Example:
       fragprune adapters --json
     """
-    from fragprune_plugins.workbench.adapters.work import adapters
-
-    return adapters()
+    return work_of(__name__)

@@ -6,8 +6,9 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import (
+    CAMERAS_APART,
     CAMERAS_HELP,
     FILE,
     MODEL,
@@ -16,7 +17,7 @@ from fragprune_plugins.workbench.commands.options import (
 )
 
 
-@click.command("audit", cls=Command)
+@click.command("audit", cls=Command, rules=[CAMERAS_APART])
 @click.argument("model", type=MODEL)
 @click.option("--cameras", type=FILE, help=f"{CAMERAS_HELP}, if there is one.")
 @click.option("--data", type=FILE, help="Scene folder whose cameras look; no image is needed.")
@@ -56,6 +57,4 @@ def command(**options: Any) -> Report:
       fragprune audit statue.ply --out audit
       fragprune audit point_cloud.ply --cameras cameras.json --out audit
     """
-    from fragprune_plugins.workbench.audit.work import audit
-
-    return audit(**options)
+    return work_of(__name__, **options)

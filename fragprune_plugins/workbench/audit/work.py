@@ -15,7 +15,7 @@ from fragprune_plugins.workbench.audit.audit import audit as measured
 from fragprune_plugins.workbench.audit.placing import Placed, Side, place
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
-from fragprune_plugins.workbench.commands.options import EngineOptions, expect_one
+from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
@@ -40,7 +40,6 @@ def audit(
     engine: EngineOptions,
 ) -> Report:
     """Do what ``fragprune audit`` promises; its options are the arguments."""
-    expect_one(("--cameras", cameras), ("--data", data), (f"--{side}", side))
     rasterizer, device = open_engine(engine)
     loaded = load(model, truncation=not no_truncation, device=device)
     if out is not None:

@@ -6,12 +6,13 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import (
     FILE,
     MODEL,
     engine_options,
 )
+from fragprune_plugins.workbench.commands.rules import Alone, Needs
 
 
 def _sizes(
@@ -27,7 +28,13 @@ def _sizes(
     return sizes
 
 
-@click.command("bench", cls=Command)
+RULES = (
+    Alone(("--gaussians", "MODEL"), "options that have an effect"),
+    Needs("--cameras", ("MODEL",), "a model to draw from them"),
+)
+
+
+@click.command("bench", cls=Command, rules=RULES)
 @click.argument("model", type=MODEL, required=False)
 @click.option("--cameras", type=FILE, help="With MODEL: file of cameras; the first one draws.")
 @click.option(
@@ -61,6 +68,4 @@ def command(**options: Any) -> Report:
       fragprune bench --size 320x240 --size 3840x2160 --gaussians 10000 --gaussians 3000000
       fragprune bench point_cloud.ply --cameras cameras.json --size 1280x720
     """
-    from fragprune_plugins.workbench.bench.work import bench
-
-    return bench(**options)
+    return work_of(__name__, **options)

@@ -18,7 +18,7 @@ from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import Case, Pass, measure, scaling, translation
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
-from fragprune_plugins.workbench.commands.options import EngineOptions, given
+from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
@@ -45,7 +45,6 @@ def bench(
     engine: EngineOptions,
 ) -> Report:
     """Do what ``fragprune bench`` promises; its options are the arguments."""
-    _expect_used(model)
     rasterizer, device = open_engine(engine)
     before = load_average()
     scenes = (
@@ -80,18 +79,6 @@ def bench(
 
 def _say(text: str) -> None:
     click.echo(text, err=True)
-
-
-def _expect_used(model: Path | None) -> None:
-    """Refuse options that would change nothing."""
-    why, unused = ("a generated scene", "cameras") if model is None else ("MODEL", "gaussians")
-    if unused in given():
-        raise UsageError(
-            "options",
-            f"--{unused} with {why}",
-            "options that have an effect",
-            f"Remove --{unused}.",
-        )
 
 
 def _generated(gaussians: tuple[int, ...], sizes: list[Size], device: torch.device) -> list[Scene]:

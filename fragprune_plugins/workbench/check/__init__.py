@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import FILE
 
 
@@ -35,6 +35,4 @@ def command(**options: Any) -> Report:
       fragprune check gsplat                                    (an installed package)
       fragprune check ~/forks --all                             (a table)
     """
-    from fragprune_plugins.workbench.check.work import check
-
-    return check(**options)
+    return work_of(__name__, **options)

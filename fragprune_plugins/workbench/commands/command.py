@@ -6,8 +6,9 @@ import contextlib
 import difflib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import click
@@ -23,6 +24,7 @@ from fragprune_plugins.errors import (
 )
 from fragprune_plugins.files.records import strict
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
+from fragprune_plugins.workbench.commands.rules import Rules
 from fragprune_plugins.workbench.ranks import launched, speaks
 
 JSON = "fragprune.json"
@@ -51,10 +53,16 @@ class Command(click.Command):
 
     A ``FragpruneError`` gives exit code 1, a usage error 2, Ctrl-C 130, SIGTERM during learning
     143. Any other exception keeps its traceback.
+
+    Args:
+        rules: which of its options exclude or need each other; checked before anything is done.
+        args: of click's class, as ``kwargs``.
+        kwargs: likewise.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, rules: Rules = (), **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.rules = rules
         self.params.append(
             click.Option(
                 ["--json", "as_json"], is_flag=True, help="Print one JSON object on stdout."
@@ -81,6 +89,8 @@ class Command(click.Command):
         """Run the command, print its report or error, and exit with its code."""
         as_json = ctx.meta[JSON] = bool(ctx.params.pop("as_json"))
         try:
+            for rule in self.rules:
+                rule.check(ctx)
             with _machine_stated(ctx.command_path):
                 report: Report | None = super().invoke(ctx)
         except FragpruneError as error:
@@ -93,6 +103,17 @@ class Command(click.Command):
             ctx.exit(0)
         click.echo(json.dumps(strict(report.data)) if as_json else printable(report.text))
         ctx.exit(report.exit_code)
+
+
+def work_of(package: str, **options: Any) -> Report:
+    """Do a command's work: the function of the package's name in ``work.py`` beside it.
+
+    It is imported on use, so that ``fragprune --help`` needs no torch.
+    """
+    work: Callable[..., Report] = getattr(
+        import_module(f"{package}.work"), package.rpartition(".")[2]
+    )
+    return work(**options)
 
 
 class Group(click.Group):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any, get_args
 
 import click
@@ -34,6 +33,7 @@ from fragprune_plugins.learning.schedule import (
 )
 from fragprune_plugins.types import Rim
 from fragprune_plugins.workbench.commands.options import Number, together
+from fragprune_plugins.workbench.commands.rules import Alone, apart
 
 _OPTIONS = (
     click.option(
@@ -92,6 +92,20 @@ _OPTIONS = (
     ),
 )
 
+LEARNING_APART = (
+    Alone(("--quick", "--iters")),
+    Alone(
+        ("--control", "--portable", "--target-speedup", "--target-time", "--max-drop"), "one goal"
+    ),
+    Alone(("--control", "--pressure"), "one goal"),
+    *apart("--pressure", "--target-speedup", "--target-time", "--max-drop", expected="one goal"),
+    Alone(
+        ("--log", "--max-drop"),
+        "one training, whose steps are written once: --max-drop makes up to eight",
+    ),
+)
+"""Rules of commands with these options."""
+
 _OF_FINETUNE = (
     click.option(
         "--target-time",
@@ -122,7 +136,7 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
         every_goal: offer also goals that a host's training cannot meet.
 
     Raises:
-        UsageError: options contradict each other, or a value is out of range.
+        UsageError: a value is out of range.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -142,8 +156,6 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
             max_drop: float | None = None,
             **kwargs: Any,
         ) -> Any:
-            if quick and iters is not None:
-                raise UsageError("options", "--quick with --iters", "one of the two", "Remove one.")
             itself = kwargs.get("itself", False)
             default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
             views = kwargs.pop("views_per_step", 1)
@@ -196,23 +208,19 @@ def _goal(
     portable: bool,
     control: bool,
 ) -> Goal:
-    """The one goal that options name; raises UsageError if they name two."""
-    spelled: dict[str, Callable[[], Goal] | None] = {
-        "--control": Control if control else None,
-        "--portable": partial(Portable, pressure) if portable else None,
-    }
-    numbers: tuple[tuple[str, Any, float | None], ...] = (
-        ("--pressure", Pressure, None if portable else pressure),
-        ("--target-speedup", Fewer, target_speedup),
-        ("--target-time", Faster, target_time),
-        ("--max-drop", AtMost, max_drop),
+    """The one goal that options name; ``LEARNING_APART`` sees to it that they name no two."""
+    numbers: tuple[tuple[Any, float | None], ...] = (
+        (Fewer, target_speedup),
+        (Faster, target_time),
+        (AtMost, max_drop),
     )
-    spelled |= {flag: None if n is None else partial(kind, n) for flag, kind, n in numbers}
-    asked = {flag: goal for flag, goal in spelled.items() if goal is not None}
-    if len(asked) > 1:
-        one, other, *_ = asked
-        raise UsageError("options", f"{one} with {other}", "one goal", "Remove one.")
-    return next(iter(asked.values()), Pressure)()
+    for kind, number in numbers:
+        if number is not None:
+            goal: Goal = kind(number)
+            return goal
+    if control:
+        return Control()
+    return Portable(pressure) if portable else Pressure(pressure)
 
 
 def resuming_options(kept: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

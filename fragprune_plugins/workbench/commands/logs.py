@@ -20,7 +20,6 @@ from tqdm import tqdm
 
 from fragprune_plugins.errors import OutputError, UsageError
 from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.learning.goals import AtMost
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins, installed
 from fragprune_plugins.plugins.points import load, offered
@@ -232,11 +231,7 @@ def _places(
 
 
 def log_option(function: Function) -> Function:
-    """The option ``--log``: the steps that the command takes are written there.
-
-    Raises:
-        UsageError: the command makes several trainings.
-    """
+    """The option ``--log``: the steps that the command takes are written there."""
 
     @click.option(
         "--log",
@@ -251,13 +246,6 @@ def log_option(function: Function) -> Function:
     def logged(*args: Any, logs: list[tuple[EntryPoint, str]], **kwargs: Any) -> Any:
         if not logs or not launched().first:
             return function(*args, **kwargs)
-        if isinstance(getattr(kwargs.get("settings"), "goal", None), AtMost):
-            raise UsageError(
-                "options",
-                "--log with --max-drop",
-                "one training, whose steps are written once: --max-drop makes up to eight",
-                "Log a fine-tuning with the --pressure that --max-drop finds.",
-            )
         with logging_steps([load(kind, type)(place) for kind, place in logs]):
             return function(*args, **kwargs)
 

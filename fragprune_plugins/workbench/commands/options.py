@@ -15,6 +15,7 @@ import click
 from click.core import ParameterSource
 
 from fragprune_plugins.errors import ModelFileError, UsageError, printable
+from fragprune_plugins.workbench.commands.rules import Alone
 from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.scenes.output import newest_model
 
@@ -171,6 +172,8 @@ CAMERAS_HELP = (
     "Default: the cameras.json that the training of MODEL wrote"
 )
 
+CAMERAS_APART = Alone(("--cameras", "--data", "--orbit", "--inside"), "one source of cameras")
+
 TRAINED_ON = "Default: the photographs that MODEL was trained on, by the cfg_args of its host."
 
 
@@ -258,17 +261,13 @@ def own_picture_options(function: Function) -> Function:
     """``--self``, ``--cameras`` and ``--orbit``, for what is compared with a model's own pictures.
 
     A command gets ``itself``, whether one of them was given, and ``cameras``, of a file or None.
-
-    Raises:
-        UsageError: several options name cameras.
+    ``CAMERAS_APART`` are its rules.
     """
 
     @functools.wraps(function)
     def with_own_pictures(
         *args: Any, itself: bool, cameras: Path | None, orbit: bool, **kwargs: Any
     ) -> Any:
-        data = kwargs["scene"].data
-        expect_one(("--cameras", cameras), ("--data", data), ("--orbit", orbit))
         itself = itself or orbit or cameras is not None
         return function(*args, itself=itself, cameras=cameras, **kwargs)
 
@@ -296,20 +295,6 @@ def given() -> frozenset[str]:
         for name in context.params
         if context.get_parameter_source(name) is not ParameterSource.DEFAULT
     )
-
-
-def expect_one(*options: tuple[str, object], none: bool = True) -> None:
-    """Raise UsageError if more than one of some options was given, or none of them.
-
-    Args:
-        options: name and value of each; None and False are values of options not given.
-        none: whether it is fine to give none of them.
-    """
-    found = [name for name, value in options if value is not None and value is not False]
-    if len(found) > 1 or not (found or none):
-        names = [name for name, _ in options]
-        one = f"one of {', '.join(names[:-1])} and {names[-1]}"
-        raise UsageError("options", " with ".join(found) or "none of them", one, "Pass one.")
 
 
 truncation_option = click.option(

@@ -6,8 +6,9 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import (
+    CAMERAS_APART,
     DATA_HELP,
     FILE,
     MODEL,
@@ -19,7 +20,7 @@ from fragprune_plugins.workbench.commands.options import (
 )
 
 
-@click.command("compare", cls=Command)
+@click.command("compare", cls=Command, rules=[CAMERAS_APART])
 @click.argument("a", type=MODEL)
 @click.argument("b", type=MODEL)
 @scene_options(
@@ -55,6 +56,4 @@ def command(**options: Any) -> Report:
       fragprune compare point_cloud.ply pruned.ply --data scene --enlarge 4 --threads 1
       fragprune compare statue.ply pruned.ply --orbit
     """
-    from fragprune_plugins.workbench.compare.work import compare
-
-    return compare(**options)
+    return work_of(__name__, **options)

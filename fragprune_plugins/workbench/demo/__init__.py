@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import FILE, engine_options
 
 
@@ -37,6 +37,4 @@ def command(**options: Any) -> Report:
     Example:
       fragprune demo --out fragprune-demo
     """
-    from fragprune_plugins.workbench.demo.work import demo
-
-    return demo(**options)
+    return work_of(__name__, **options)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from PIL import Image
+
 from fragprune_plugins.files.atomic import replacing, writable_folder
 
 ROOM = Path(__file__).with_name("room")
@@ -28,8 +30,6 @@ def make_scene(
     Raises:
         OutputError: the folder cannot be written.
     """
-    from PIL import Image
-
     images, sparse = writable_folder(folder / "images"), writable_folder(folder / "sparse" / "0")
     for photograph in sorted((ROOM / "images").iterdir())[:views]:
         with replacing(images / photograph.name) as path:

@@ -10,10 +10,11 @@ import torch
 
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cuda import driver, kernels, self_check
-from fragprune_plugins.engines.cuda.frame import MACROS, VARIANTS
+from fragprune_plugins.engines.cuda.frame import MACROS
 from fragprune_plugins.errors import EngineError, UsageError
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.doctor.compiling import VARIANTS, resources
 
 _PACKAGES = ("fragprune-plugins", "torch", "numpy", "pluggy", "wrapt", "plyfile", "scikit-image")
 
@@ -26,7 +27,7 @@ def examine() -> Report:
     native = binding.describe()
     # This comes first, because a GPU may allow only one process.
     verdict = self_check.check_in_subprocess("cuda") if driver.missing() is None else None
-    gpu = driver.describe()
+    gpu = _cuda_engine()
     gpu["agrees"] = None if verdict is None else _AGREES[verdict.outcome]
     gpu["check"] = None if verdict is None else str(verdict)
     plugins = load_plugins()
@@ -83,7 +84,7 @@ def build(architectures: str) -> Report:
             target = kernels.target_of(code, compiler.architectures)
             for source, macros in VARIANTS:
                 image, had = kernels.image_of(source, {**MACROS, **macros}, target, compiler)
-                for name, needs in kernels.resources(image.log).items():
+                for name, needs in resources(image.log).items():
                     built.append({"target": target, "kernel": name, "kept": had, **vars(needs)})
     except kernels.Unavailable as why:
         raise EngineError(
@@ -108,3 +109,22 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def _cuda_engine() -> dict[str, Any]:
+    """How kernels reach the GPU, or why they cannot."""
+    try:
+        found = kernels.compiler()
+    except kernels.Unavailable:
+        route = None
+    else:
+        route = f"{found.name} {found.version}"
+    seen = torch.cuda.is_available()
+    return {
+        "available": driver.missing() is None,
+        "compiler": route,
+        "device": torch.cuda.get_device_name() if seen else None,
+        "capability": ".".join(map(str, torch.cuda.get_device_capability())) if seen else None,
+        "kept": str(kernels.cache_folder()),
+        "reason": driver.missing(),
+    }

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from fragprune_plugins.constants import TRANSMITTANCE_MIN
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import MODEL, Number, OutFile, truncation_option
 from fragprune_plugins.workbench.models import formats
 
@@ -53,6 +53,4 @@ def command(**options: Any) -> Report:
       fragprune export model.spz --out model.ply --no-truncation
       fragprune export model.ply --out faster.ply --stop 0.01
     """
-    from fragprune_plugins.workbench.export.work import export
-
-    return export(**options)
+    return work_of(__name__, **options)

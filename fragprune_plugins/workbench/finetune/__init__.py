@@ -6,9 +6,18 @@ from typing import Any, Literal
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report, first_process_prints
+from fragprune_plugins.workbench.commands.command import (
+    Command,
+    Report,
+    first_process_prints,
+    work_of,
+)
 from fragprune_plugins.workbench.commands.config import config_option
-from fragprune_plugins.workbench.commands.learning import learning_options, resuming_options
+from fragprune_plugins.workbench.commands.learning import (
+    LEARNING_APART,
+    learning_options,
+    resuming_options,
+)
 from fragprune_plugins.workbench.commands.logs import log_option
 from fragprune_plugins.workbench.commands.options import (
     FILE,
@@ -18,6 +27,7 @@ from fragprune_plugins.workbench.commands.options import (
     scene_options,
     shard_option,
 )
+from fragprune_plugins.workbench.commands.rules import Alone, Needs, apart
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.ranks import launched
 
@@ -39,7 +49,24 @@ def _share(
     return share
 
 
-@click.command("finetune", cls=Command)
+_PARTS = "options that each process can follow with a part of the Gaussians"
+
+RULES = (
+    *LEARNING_APART,
+    Alone(("--data", "--cameras"), "one source of cameras"),
+    Needs("--cameras", ("--self",), "the model's own pictures, which those cameras show"),
+    Alone(("--self", "--max-drop"), "photographs, and with them a control to lose against"),
+    Alone(
+        ("--self", "--control"),
+        "something to learn: without truncation the model is its own target already",
+    ),
+    Alone(("--self", "--keep auto"), "photographs, whose error says what can be spared"),
+    *apart("--shard-gaussians", "--self", "--portable", expected=_PARTS),
+    *apart("--shard-gaussians", "--max-drop", "--keep", "--drop-invisible", expected=_PARTS),
+)
+
+
+@click.command("finetune", cls=Command, rules=RULES)
 @click.argument("model", type=MODEL)
 @click.option(
     "--out",
@@ -130,6 +157,4 @@ def command(**options: Any) -> Report | None:
       fragprune finetune statue.spz --self --out pruned.spz
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply
     """
-    from fragprune_plugins.workbench.finetune.work import Asked, finetune
-
-    return finetune(Asked(**options))
+    return work_of(__name__, **options)

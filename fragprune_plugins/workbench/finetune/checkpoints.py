@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from fragprune_plugins.errors import CheckpointError, SidecarError
@@ -37,9 +39,6 @@ def save(path: Path, tensors: dict[str, Tensor], values: dict[str, Any]) -> None
         DivergedError: a tensor holds NaN or infinity.
         OutputError: the file cannot be written. The one before stays.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import save_file
-
     expect_finite({k: each for k, each in tensors.items() if k != "curves"}, str(path))
     content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with replacing(path, durable=True) as new:
@@ -57,8 +56,6 @@ def load(
     Raises:
         CheckpointError: it cannot be read, or holds NaN or infinity.
     """
-    from safetensors import safe_open
-
     with _DOOR.reading(path) as reading, safe_open(reading.path, framework="pt") as file:
         metadata = file.metadata()
         if metadata["format"] != FORMAT:

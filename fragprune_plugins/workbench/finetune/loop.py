@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.losses import photometric_loss
@@ -205,8 +206,6 @@ class Training:
             keeper: writes checkpoints.
             progress: draw a bar on stderr.
         """
-        from tqdm import tqdm
-
         self.keeper, settings, total = keeper, self.settings, self.settings.iterations
         steps = order(self.dataset.train, total, settings.views_per_step, settings.seed)
         with (

@@ -11,11 +11,10 @@ import click
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.learning.goals import AtMost, Control
+from fragprune_plugins.learning.goals import AtMost
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
@@ -87,15 +86,15 @@ class _Opened:
     configuration: dict[str, Any]
 
 
-def finetune(asked: Asked) -> Report | None:
-    """Fine-tune; the report, in the first process.
+def finetune(**options: Any) -> Report | None:
+    """Fine-tune, with the fields of ``Asked``; the report, in the first process.
 
     Raises:
-        UsageError: options contradict each other, or ``out`` is no place for the result.
+        UsageError: ``out`` is no place for the result, or one process divides the model.
     """
-    _require_sense(asked)
+    asked = Asked(**options)
     if asked.shard:
-        _require_shards(asked)
+        require_several()
     if launched().first:
         require_place(asked.out, asked.model, thresholds=asked.settings.goal.learns)
         lock = locked(asked.out, wait=0, what="run")
@@ -234,70 +233,3 @@ def _drop_invisible(over: Finetuned, dataset: Dataset, engine: Engine) -> Finetu
     models.save(out, left)
     dropped = dropping(out, size, len(result.model), len(left.model))
     return replace(over, result=left, saved=left.model, dropped=dropped)
-
-
-def _require_sense(asked: Asked) -> None:
-    """Prove, before any work, that it is clear what MODEL must look like.
-
-    Raises:
-        UsageError: nothing says so, two things do, or an option needs photographs.
-    """
-    itself, goal = asked.itself, asked.settings.goal
-    refusals = (
-        (
-            not itself and asked.cameras is not None,
-            "--cameras without --self",
-            "photographs, or the model's own pictures from those cameras",
-            "Add --self, or pass --data FOLDER instead of --cameras.",
-        ),
-        (
-            asked.scene.data is not None and asked.cameras is not None,
-            "--data with --cameras",
-            "one source of cameras",
-            "Drop one of the two.",
-        ),
-        (
-            itself and isinstance(goal, AtMost),
-            "--self with --max-drop",
-            "photographs, and with them a control to lose against",
-            "Drop --max-drop; --pressure steers what --self may lose.",
-        ),
-        (
-            itself and isinstance(goal, Control),
-            "--self with --control",
-            "something to learn: without truncation the model is its own target already",
-            "Drop --control; what it came in as is the comparison.",
-        ),
-        (
-            itself and asked.keep == "auto",
-            "--self with --keep auto",
-            "photographs, whose error says what can be spared",
-            "Pass a share, such as --keep 0.9.",
-        ),
-    )
-    for refused, found, expected, remedy in refusals:
-        if refused:
-            raise UsageError("options", found, expected, remedy)
-
-
-def _require_shards(asked: Asked) -> None:
-    """Check that Gaussians which are divided among processes can learn what is asked for.
-
-    Raises:
-        UsageError: there is one process, or an option needs the whole model.
-    """
-    require_several()
-    given = {
-        "--self": asked.itself,
-        "--portable": asked.settings.goal.on_area,
-        "--max-drop": isinstance(asked.settings.goal, AtMost),
-        "--keep": asked.keep is not None,
-        "--drop-invisible": asked.drop,
-    }
-    if found := [name for name, is_given in given.items() if is_given]:
-        raise UsageError(
-            "options",
-            f"--shard-gaussians with {', '.join(found)}",
-            "options that each process can follow with a part of the Gaussians",
-            "Leave one of them out.",
-        )

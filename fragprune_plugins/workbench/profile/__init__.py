@@ -6,8 +6,9 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import (
+    CAMERAS_APART,
     FILE,
     MODEL,
     engine_options,
@@ -18,7 +19,7 @@ from fragprune_plugins.workbench.commands.options import (
 )
 
 
-@click.command("profile", cls=Command)
+@click.command("profile", cls=Command, rules=[CAMERAS_APART])
 @click.argument("model", type=MODEL)
 @scene_options()
 @own_picture_options
@@ -40,6 +41,4 @@ def command(**options: Any) -> Report:
       fragprune profile out                          (the output folder of a training)
       fragprune profile pruned.ply --cameras cameras.json
     """
-    from fragprune_plugins.workbench.profile.work import profile
-
-    return profile(**options)
+    return work_of(__name__, **options)

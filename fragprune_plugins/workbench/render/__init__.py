@@ -6,8 +6,14 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report, first_process_prints
+from fragprune_plugins.workbench.commands.command import (
+    Command,
+    Report,
+    first_process_prints,
+    work_of,
+)
 from fragprune_plugins.workbench.commands.options import (
+    CAMERAS_APART,
     CAMERAS_HELP,
     FILE,
     MODEL,
@@ -18,6 +24,7 @@ from fragprune_plugins.workbench.commands.options import (
     truncation_option,
     views_option,
 )
+from fragprune_plugins.workbench.commands.rules import Needs, apart
 
 
 def _direction(
@@ -33,7 +40,17 @@ def _direction(
     return x, y, z
 
 
-@click.command("render", cls=Command)
+_PHOTOGRAPHS = "a scene folder, which says what its images are and which are held out"
+
+RULES = (
+    CAMERAS_APART,
+    Needs("--images", ("--data",), _PHOTOGRAPHS),
+    Needs("--views", ("--data",), _PHOTOGRAPHS),
+    *apart("--out *.mp4", "--heatmap", "--shard-gaussians", expected="a folder for --out"),
+)
+
+
+@click.command("render", cls=Command, rules=RULES)
 @click.argument("model", type=MODEL)
 @click.option("--cameras", type=FILE, help=f"{CAMERAS_HELP}.")
 @click.option(
@@ -80,6 +97,4 @@ def command(**options: Any) -> Report | None:
       fragprune render statue.ply --orbit --out statue.mp4
       fragprune render pruned.ply --cameras camera_path.json --out flight.mp4 --seconds 20
     """
-    from fragprune_plugins.workbench.render.work import render
-
-    return render(**options)
+    return work_of(__name__, **options)

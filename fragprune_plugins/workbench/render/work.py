@@ -28,7 +28,6 @@ from fragprune_plugins.workbench.commands.opening import (
 from fragprune_plugins.workbench.commands.options import (
     EngineOptions,
     SceneOptions,
-    expect_one,
     require_several,
 )
 from fragprune_plugins.workbench.distributed.processes import part_of
@@ -65,13 +64,10 @@ def render(
 ) -> Report | None:
     """Do what ``fragprune render`` promises; its options are the arguments."""
     film = out.suffix.lower() == ".mp4"
-    expect_one(("--cameras", cameras), ("--data", scene.data), ("--orbit", orbit))
-    _expect_place(out, film=film, heatmap=heatmap, shard=shard)
+    _expect_place(out, film=film, shard=shard)
     if scene.data is None and not orbit:
         cameras = cameras or cameras_of(model)
         _expect_cameras(cameras)
-    if scene.data is None:
-        _refuse_options_of_data(scene, views)
     rasterizer, device = open_engine(engine)
     writable_folder(out.parent if film else out)
     whole = load(model, truncation=not no_truncation, device="cpu" if shard else device)
@@ -120,15 +116,10 @@ def _report(figures: dict[str, Any], wrote: str, fragments: list[float]) -> Repo
     )
 
 
-def _expect_place(out: Path, *, film: bool, heatmap: bool, shard: bool) -> None:
+def _expect_place(out: Path, *, film: bool, shard: bool) -> None:
     """Check, before any work, that ``out`` can be what was asked for."""
     if shard:
         require_several()
-    for option, given in (("--heatmap", heatmap), ("--shard-gaussians", shard)):
-        if film and given:
-            raise UsageError(
-                "options", f"{option} with a film", "a folder for --out", "Name a folder."
-            )
     if out.suffix.lower() in _NO_FOLDER:
         raise UsageError(
             "--out", str(out), "a folder for PNG files, or a film in .mp4", "Choose another name."
@@ -145,21 +136,6 @@ def _expect_cameras(cameras: Path | None) -> None:
             "cameras to draw from",
             "Pass --cameras FILE, --data FOLDER or --orbit.",
         )
-
-
-def _refuse_options_of_data(scene: SceneOptions, views: str) -> None:
-    """Refuse options that choose among photographs where there are only cameras."""
-    asked = {"--images": "images" in scene.given, f"--views {views}": "views" in scene.given}
-    if views == "all":
-        asked.pop("--views all")
-    for option, given in asked.items():
-        if given:
-            raise UsageError(
-                "options",
-                f"{option} without --data",
-                "a scene folder, which says what its images are and which are held out",
-                f"Pass --data FOLDER, or remove {option}.",
-            )
 
 
 def _views(

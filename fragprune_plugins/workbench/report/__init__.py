@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import FILE, OutFile, engine_options
 
 
@@ -29,6 +29,4 @@ def command(**options: Any) -> Report:
     Example:
       fragprune report out --data scene
     """
-    from fragprune_plugins.workbench.report.work import report
-
-    return report(**options)
+    return work_of(__name__, **options)

@@ -6,14 +6,28 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.config import config_option
-from fragprune_plugins.workbench.commands.learning import again_option, learning_options
+from fragprune_plugins.workbench.commands.learning import (
+    LEARNING_APART,
+    again_option,
+    learning_options,
+)
 from fragprune_plugins.workbench.commands.logs import log_option
 from fragprune_plugins.workbench.commands.options import engine_options
+from fragprune_plugins.workbench.commands.rules import Needs
+
+RULES = (
+    *LEARNING_APART,
+    Needs(
+        "--from-iter",
+        ("--stage finetune", "--stage joint"),
+        "--stage finetune or joint, which learn inside one run",
+    ),
+)
 
 
-@click.command("run", cls=Command, context_settings={"allow_interspersed_args": False})
+@click.command("run", cls=Command, rules=RULES, context_settings={"allow_interspersed_args": False})
 @click.argument("host_command", nargs=-1, type=click.UNPROCESSED, metavar="-- python train.py ...")
 @click.option("--adapter", help="Name of the host's adapter; default: detected from its source.")
 @click.option(
@@ -68,6 +82,4 @@ def command(**options: Any) -> Report:
       fragprune run --stage joint -- python train.py -s scene -m out   (no added iterations)
       fragprune run -- python render.py -m out                       (renders with thresholds)
     """
-    from fragprune_plugins.workbench.run.work import run
-
-    return run(**options)
+    return work_of(__name__, **options)

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.errors import FragpruneError, UsageError
+from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.files import records
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
@@ -46,7 +46,6 @@ def run(
     trust: bool,
 ) -> Report:
     """Do what ``fragprune run`` promises; its options are the arguments."""
-    _expect_possible(stage, from_iter)
     bound_threads(engine.threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     options = launch.RunOptions(
@@ -79,17 +78,6 @@ def run(
         more = {"curves": summary.curves, "photographs": photographs}
         records.leave(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data, not_compared))
-
-
-def _expect_possible(stage: str, from_iter: int | None) -> None:
-    """Refuse options that a host's run cannot follow."""
-    if from_iter is not None and stage not in ("finetune", "joint"):
-        raise UsageError(
-            "--from-iter",
-            f"--stage {stage}",
-            "--stage finetune or joint, which learn inside one run",
-            "Add one of them, or remove --from-iter.",
-        )
 
 
 def _figures(

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import torch
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError
@@ -167,8 +168,6 @@ def interpolate(a: View, b: View, t: float) -> View:
         b: where ``t`` is 1.
         t: in [0, 1].
     """
-    from scipy.spatial.transform import Rotation, Slerp
-
     one, other = (view.viewmatrix.detach().double().cpu() for view in (a, b))
     ends = Rotation.from_matrix([one[:3, :3].T.numpy(), other[:3, :3].T.numpy()])
     rotation = torch.from_numpy(Slerp([0.0, 1.0], ends)(t).as_matrix())

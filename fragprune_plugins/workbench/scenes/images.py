@@ -6,14 +6,12 @@ import contextlib
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from PIL import Image
 
 from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import Door
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 PIXELS_MAX = 160_000_000
 """Most pixels of a photograph; cameras reach 151 million. Pillow itself refuses 179 million."""
@@ -58,14 +56,12 @@ def find_image(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[Image]:
+def opened(path: Path) -> Iterator[Image.Image]:
     """Open an image for the length of a block; its pixels are read on use.
 
     Raises:
         DatasetError: the file is missing, no image, or too large; or the block raised.
     """
-    from PIL import Image
-
     with DOOR.reading(path) as reading, warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # PIXELS_MAX decides
         with Image.open(reading.file, formats=_FORMATS) as image:

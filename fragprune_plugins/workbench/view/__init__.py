@@ -6,11 +6,11 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report
-from fragprune_plugins.workbench.commands.options import CAMERAS_HELP, FILE, MODEL
+from fragprune_plugins.workbench.commands.command import Command, Report, work_of
+from fragprune_plugins.workbench.commands.options import CAMERAS_APART, CAMERAS_HELP, FILE, MODEL
 
 
-@click.command("view", cls=Command)
+@click.command("view", cls=Command, rules=[CAMERAS_APART])
 @click.argument("model", type=MODEL)
 @click.argument("other", type=MODEL, required=False)
 @click.option(
@@ -46,6 +46,4 @@ def command(**options: Any) -> Report:
       fragprune view pruned.ply --out page.html
       fragprune view out                                (the output folder of a training)
     """
-    from fragprune_plugins.workbench.view.work import view
-
-    return view(**options)
+    return work_of(__name__, **options)

@@ -13,7 +13,6 @@ from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import replacing, writable_folder
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of
-from fragprune_plugins.workbench.commands.options import expect_one
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
@@ -42,7 +41,6 @@ def view(
     no_browser: bool,
 ) -> Report:
     """Do what ``fragprune view`` promises; its options are the arguments."""
-    expect_one(("--data", data), ("--cameras", cameras))
     single = out is not None and out.suffix.lower() == ".html"
     if out is not None:
         _expect_our_page(out if single else out / "index.html")
