@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -225,6 +226,12 @@ def test_a_launcher_is_known_by_the_environment(monkeypatch, size, rank, expecte
     assert launched() == expected
 
 
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 LAST_THREADS = """
 import os, sys, torch
 from fragprune_plugins.workbench.ranks import joined
@@ -243,18 +250,18 @@ def test_no_thread_of_the_group_outlives_it(tmp_path):
 
     Fresh processes: what the group was kept alive by is imported here already.
     """
-    script = tmp_path / "script.py"
-    script.write_text(LAST_THREADS)
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
-    line = [*launcher, "--nproc_per_node", "2", str(script), str(tmp_path)]
-    done = subprocess.run(
-        line,
-        capture_output=True,
-        text=True,
-        timeout=200,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    assert done.returncode == 0, done.stderr
+    meet = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "2"}
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", LAST_THREADS, str(tmp_path)],
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **meet, "RANK": rank, "OMP_NUM_THREADS": "1"},
+        )
+        for rank in "01"
+    ]
+    said = [each.communicate(timeout=200)[1] for each in started]
+    assert [each.returncode for each in started] == [0, 0], said
     assert [(tmp_path / rank).read_text() for rank in "01"] == ["1", "1"]
 
 
