@@ -123,6 +123,7 @@ class ForkDialect(GraphdecoDialect):
     Attributes:
         values: what each rasterizer returns, by its package.
         fields: names of each rasterizer's settings, likewise.
+        blended: by package, the argument with further channels.
         off: settings and arguments that must be None, False or empty.
         scaled: settings that change the gradient on the screen, which ours ignores.
         own_distances: its simple_knn returns more than that of 3DGS, and has no stand-in.
@@ -130,6 +131,7 @@ class ForkDialect(GraphdecoDialect):
 
     values: Mapping[str, tuple[Output, ...]] = field(default_factory=dict)
     fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    blended: Mapping[str, str] = field(default_factory=dict)
     off: frozenset[str] = frozenset()
     scaled: frozenset[str] = frozenset()
     own_distances: bool = False
@@ -181,7 +183,7 @@ class ForkDialect(GraphdecoDialect):
             view = call.settings.viewmatrix
             channels.append(call["means3D"] @ view[:3, 2:3] + view[3, 2])
         if "objects" in roles:
-            channels.append(call["sh_objs"].flatten(1))
+            channels.append(call[self.blended[call.entry.split(":")[0]]].flatten(1))
         return torch.cat(channels, dim=1) if channels else None
 
     def _with(self, inputs: RasterInputs, channels: Tensor | None, first: int) -> RasterInputs:
@@ -355,6 +357,7 @@ class ForkAdapter(GraphdecoAdapter):
             sparse_adam=bool(repo.mentions(["train", MODEL], ["SparseGaussianAdam"])),
             values=fork.outputs,
             fields=fork.settings,
+            blended=fork.blended,
             off=fork.off,
             scaled=fork.scaled,
             own_distances=not plain_distances(repo),

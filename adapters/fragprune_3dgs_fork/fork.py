@@ -11,6 +11,7 @@ from weakref import WeakKeyDictionary
 
 from fragprune_3dgs_fork.rasterizer import (
     Output,
+    blended_argument,
     changed_gradients,
     is_off,
     meaning,
@@ -30,13 +31,14 @@ _MAKES = re.compile(r"__init__|capture\w*|(restore|create|load|init|set)_?\w*|\w
 _OF_MODELS = re.compile(r"^scene\.\w*model\w*$")
 _MODELS = re.compile(r"\b(gaussians?|pc|model)$")
 """What scripts call a model."""
+_CAMERA = re.compile(r"view|cam")
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 NEUTRAL = {"antialiasing", "confidence"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
-SERVED = {"dc", "sh_objs"}
+SERVED = {"dc"}
 """Further arguments that the engines know."""
 
 _PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|opac)")
@@ -74,6 +76,7 @@ class Fork:
         outputs: by package, what its rasterizer returns.
         still: methods of the model that scripts call, and that change it.
         setups: methods that make the optimizer.
+        blended: by package, the argument with channels that are blended beside the colours.
         off: settings and arguments of the rasterizer that are None or False by default.
         scaled: settings that change the gradient on the screen alone, in its backward pass.
     """
@@ -85,6 +88,7 @@ class Fork:
     outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)
     still: tuple[str, ...] = ()
     setups: tuple[str, ...] = ()
+    blended: dict[str, str] = field(default_factory=dict)
     off: frozenset[str] = frozenset()
     scaled: frozenset[str] = frozenset()
 
@@ -95,12 +99,17 @@ class Fork:
 
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
-        scripts = (each.removesuffix(".py") for each in self.scripts)
+        scripts = (_module(each) for each in self.scripts)
         return off_by_default(self.repo, ("arguments", MODEL, *scripts), name)
 
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
         """Add an error."""
         self.findings.append(Finding("error", code, where, found, expected))
+
+    @property
+    def errors(self) -> list[Finding]:
+        """Why it cannot be served."""
+        return [each for each in self.findings if each.level == "error"]
 
     @property
     def packages(self) -> tuple[str, ...]:
@@ -123,7 +132,7 @@ class Fork:
     @cached_property
     def modules(self) -> tuple[str, ...]:
         """The scripts and the checkout's own modules that they import, without model and draws."""
-        waiting = [script.removesuffix(".py").replace("/", ".") for script in self.scripts]
+        waiting = [_module(script) for script in self.scripts]
         seen: dict[str, None] = {}
         while waiting:
             module = waiting.pop(0)
@@ -151,39 +160,69 @@ _known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
 
 
 def read_fork(repo: HostRepo) -> Fork:
-    """Read a checkout, once."""
+    """Read a checkout, once; of several scripts only those that can be served, if one can."""
     if repo not in _known:
-        fork = _known[repo] = Fork(repo)
-        _read_scripts(fork)
-        if fork.scripts:
-            _read_methods(fork)
-            _read_draws(fork)
-            _read_outputs(fork)
-            _read_changes(fork)
+        fork = _read(repo, _candidates(repo))
+        if fork.errors and len(fork.scripts) > 1:
+            alone = {script: _read(repo, (script,)) for script in fork.scripts}
+            if served := tuple(script for script, each in alone.items() if not each.errors):
+                fork = _read(repo, served)
+                for script in alone.keys() - {*served}:
+                    why = f"{script}, which is not served: {alone[script].errors[0].found}"
+                    fork.warn("script", script, why)
+        _known[repo] = fork
     return _known[repo]
+
+
+def _read(repo: HostRepo, scripts: tuple[str, ...]) -> Fork:
+    fork = Fork(repo)
+    _read_scripts(fork, scripts)
+    if fork.scripts:
+        _read_methods(fork)
+        _read_draws(fork)
+        _read_outputs(fork)
+        _read_changes(fork)
+    return fork
+
+
+def _module(script: str) -> str:
+    """The module that a script is, of a path below the checkout."""
+    return script.removesuffix(".py").replace("/", ".")
 
 
 # -- scripts ---------------------------------------------------------------------------------------
 
 
-def _read_scripts(fork: Fork) -> None:
-    """The training scripts of the model class: they make it, draw, and go backward."""
+def _candidates(repo: HostRepo) -> tuple[str, ...]:
+    """Scripts that train: right in the checkout, the usual one first, or in folders of it."""
+    for pattern in ("*train*.py", "*/*train*.py"):
+        files = sorted(repo.root.glob(pattern), key=lambda each: (each.stem != "train", each))
+        names = [
+            each.relative_to(repo.root).as_posix() for each in files if each.stem.isidentifier()
+        ]
+        trees = ((name, repo.tree(_module(name))) for name in names)
+        trains = {"backward", "training_setup"}
+        if found := tuple(name for name, tree in trees if tree and trains <= _mentioned(tree)):
+            return found
+    return ()
+
+
+def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
+    """Of these scripts, the training scripts of the model class: they make it once."""
     repo, others = fork.repo, []
-    files = sorted(repo.root.glob("*train*.py"), key=lambda each: (each.stem != "train", each.stem))
-    for file in files:
-        tree = repo.tree(file.stem) if file.stem.isidentifier() else None
-        if tree is None or not {"backward", "training_setup"} <= _mentioned(tree):
-            continue
+    for script in scripts:
+        tree = repo.tree(_module(script))
+        assert tree is not None  # it is a candidate
         made = [
             name
             for node in ast.walk(tree)
             if isinstance(node, ast.Call)
-            and (name := getattr(node.func, "id", "")).endswith(("GaussianModel", "Model"))
+            and (name := getattr(node.func, "id", "")).endswith("Model")
         ]
         if made == [CLASS] and not _in_loop(tree, CLASS):
-            fork.scripts += (file.name,)
+            fork.scripts += (script,)
         elif made:
-            others.append(f"{file.name} makes {', '.join(dict.fromkeys(made))}")
+            others.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
         if made.count(CLASS) > 1 or _in_loop(tree, CLASS):
             others[-1] += ", several at once"
     if not fork.scripts:
@@ -195,8 +234,12 @@ def _read_scripts(fork: Fork) -> None:
 
 def _check_script(fork: Fork, script: str) -> None:
     """A script must restore what it captures, under the name that we look for."""
-    tree = fork.repo.tree(script.removesuffix(".py"))
+    tree = fork.repo.tree(_module(script))
     text = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)} if tree else set()
+    removes = [] if tree is None else re.findall(r"rmtree\(\w+\.model_path.*", ast.unparse(tree))
+    if removes:
+        found = f"it removes its output folder, {removes[0][:40]}"
+        fork.refuse("script", script, found, "one that stage 2 finds stage 1 in")
     missing = [
         name
         for name in ("capture", "restore", "update_learning_rate")
@@ -216,7 +259,7 @@ def _check_script(fork: Fork, script: str) -> None:
 def rests_after_densification(fork: Fork) -> bool:
     """Whether scripts change the model only where they ask for ``densify_until_iter``."""
     for script in fork.scripts:
-        tree = fork.repo.tree(script.removesuffix(".py"))
+        tree = fork.repo.tree(_module(script))
         inside = {
             id(inner)
             for node in (ast.walk(tree) if tree else ())
@@ -368,13 +411,13 @@ def _read_changes(fork: Fork) -> None:
             at = fork.repo.at(module, line)
             fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
-        trained = fork.repo.tree(script.removesuffix(".py"))
+        trained = fork.repo.tree(_module(script))
         for node in ast.walk(trained) if trained else ():
             if isinstance(node, ast.Assign) and re.match(
                 r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(", ast.unparse(node.value)
             ):
                 what = f"what {ast.unparse(node.targets[0])} of {script} trains"
-                at = fork.repo.at(script.removesuffix(".py"), node.lineno)
+                at = fork.repo.at(_module(script), node.lineno)
                 fork.warn("optimizer", at, f"stage 2 does not freeze {what}")
 
 
@@ -453,7 +496,9 @@ def _read_draws(fork: Fork) -> None:
         model = next((each for each in _MODEL_ARGUMENTS if each in parameters), "")
         at = f"{RENDERER}:{name} ({fork.repo.place(RENDERER, name)})"
         calls = tuple(graphdeco.read_calls(fork.repo, RENDERER, name))
-        if not model or not parameters or parameters[0] == model:
+        others = [each for each in parameters if each != model]
+        camera = next((each for each in others if _CAMERA.match(each)), next(iter(others), ""))
+        if not model or not camera or parameters.index(model) < parameters.index(camera):
             fork.refuse(
                 "rasterizer-call", at, f"arguments {', '.join(parameters)}", "a camera and a model"
             )
@@ -461,7 +506,7 @@ def _read_draws(fork: Fork) -> None:
         if not calls or not all(call.names for call in calls):
             fork.refuse("rasterizer-call", at, "a result that is not unpacked", "its values")
             continue
-        fork.draws += (Draw(RENDERER, name, parameters[0], model, calls),)
+        fork.draws += (Draw(RENDERER, name, camera, model, calls),)
         for call in calls:
             _check_call(fork, at, name, call)
         if body is not None and (selected := _selected(body)):
@@ -488,7 +533,9 @@ def _needs_option(fork: Fork, test: ast.expr) -> bool:
 
 def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
     """Settings and arguments besides the known ones: off, or without a part in the picture."""
-    further = [*(call.call.besides - NEUTRAL), *(call.call.arguments - SERVED)]
+    if blended := blended_argument(fork.repo, call):
+        fork.blended[call.call.package] = blended
+    further = [*(call.call.besides - NEUTRAL), *(call.call.arguments - SERVED - {blended})]
     unknown = {each for each in further if not _stays_off(fork, function, call.given.get(each))}
     fork.off |= {*further} - unknown
     for name in sorted(unknown & call.call.besides):

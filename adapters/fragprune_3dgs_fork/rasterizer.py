@@ -27,7 +27,8 @@ Role = Literal[
 _DEPTH = re.compile(r"(\w+)\+=depths\[collected_id\[j\]\]\*alpha\*T;")
 _INVERSE = re.compile(r"(\w+)\+=\(1/depths\[collected_id\[j\]\]\)\*alpha\*T;")
 _WEIGHT = re.compile(r"(\w+)\+=alpha\*T;")
-_OBJECTS = re.compile(r"(\w+)\[ch\]\+=obj_features\[[^;]*\]\*alpha\*T;")
+_BLENDED = re.compile(r"(\w+)\[ch\]\+=\w+\[collected_id\[j\]\*\w+\+ch\]\*alpha\*T;")
+"""A sum over the ray for each channel."""
 _ADDED = re.compile(r"([{;])atomicAdd\(&\(?(\w+)\[collected_id\[j\]\]\)?,(alpha\*T|1\.?0?)\);")
 """A sum for each Gaussian over its fragments, in a statement of its own."""
 _DRAWN = re.compile(r"if\(test_T<0\.0001\)\{done=true;continue;\}")
@@ -69,7 +70,7 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
                 return Output(name, known)  # type: ignore[arg-type]
     elif re.search(r"alpha|acc|opac", name) and _written(text, _WEIGHT, r"out_(alpha|opac)\w*"):
         return Output(name, "alpha")
-    elif "obj" in name and "sh_objs" in call.given and _OBJECTS.search(text):
+    elif blended_argument(repo, call) and _words(name) & _words(_blended(text)):
         return Output(name, "objects")
     return Output(name, "unread")
 
@@ -80,6 +81,28 @@ def _written(text: str, rule: re.Pattern[str], buffer: str) -> bool:
     stored = re.findall(rf"\b{buffer}\[pix_id\]=([^;]+);", text)
     values = [each[-1] if isinstance(each, tuple) else each for each in stored]
     return found is not None and bool(values) and set(values) == {found[1]}
+
+
+def blended_argument(repo: HostRepo, call: graphdeco.CallInSource) -> str:
+    """The argument with channels that are blended beside the colours, without a background.
+
+    "" if there is none, or if several could be it.
+    """
+    further = sorted(call.call.arguments - {"dc"})
+    text = "".join(graphdeco.normal_sources(repo, call.call.package))
+    return further[0] if len(further) == 1 and _blended(text) else ""
+
+
+def _blended(text: str) -> str:
+    """What a kernel calls the picture of the channels that it blends; "" unless there is one."""
+    sums = {match[1] for match in _BLENDED.finditer(text)}
+    stored = re.findall(r"\bout_(\w+)\[ch\*H\*W\+pix_id\]=(\w+)\[ch\];", text)
+    found = {out for out, value in stored if value in sums}
+    return found.pop() if len(found) == 1 else ""
+
+
+def _words(name: str) -> set[str]:
+    return {word.rstrip("s") for word in name.split("_")}
 
 
 def _sum_for_gaussians(text: str, name: str) -> Literal["count", "weight"] | None:

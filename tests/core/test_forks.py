@@ -22,7 +22,10 @@ def errors(repo):
 DEPTH = "D += depths[collected_id[j]] * alpha * T; out_depth[pix_id] = D;"
 WEIGHT = "weight += alpha * T; out_alpha[pix_id] = weight;"
 INVERSE = "E += (1 / depths[collected_id[j]]) * alpha * T; out_invdepth[pix_id] = E;"
-OBJECTS = "O[ch] += obj_features[collected_id[j] * OBJECTS + ch] * alpha * T;"
+OBJECTS = """
+O[ch] += obj_features[collected_id[j] * OBJECTS + ch] * alpha * T;
+out_objects[ch * H * W + pix_id] = O[ch];
+"""
 USED = ('package["render"]', 'package["render"] + package["{}"]')
 
 SERVED = {
@@ -73,11 +76,16 @@ def test_a_value_that_no_proof_can_tell_is_refused(tmp_path):
     assert "median_depth, read in train.py:" in errors(repo)[0]
 
 
-def test_objects_are_known_by_argument_and_kernel(tmp_path):
+@pytest.mark.parametrize("name", ["sh_objs", "semantics"])
+def test_blended_channels_are_known_by_argument_and_kernel(tmp_path, name):
     used, values = (USED[0], USED[1].format("objects")), "image, radii, objects"
-    given = {"values": values, "arguments": ", sh_objs=pc.get_objects"}
-    assert errors(fork(tmp_path / "known", used, **given, kernel=OBJECTS)) == []
+    given = {"values": values, "arguments": f", {name}=pc.get_objects"}
+    known = fork(tmp_path / "known", used, **given, kernel=OBJECTS)
+    assert errors(known) == []
+    assert ForkAdapter().dialect(known).blended == {"diff_gaussian_rasterization": name}
     assert errors(fork(tmp_path / "unknown", used, **given))
+    lit = OBJECTS.replace("= O[ch]", "= O[ch] + T * bg[ch]")
+    assert errors(fork(tmp_path / "lit", used, **given, kernel=lit))
 
 
 DRAWN = "if (test_T < 0.0001f) { done = true; continue; }"
@@ -212,6 +220,26 @@ def test_a_drawing_function_for_an_option_that_is_off_is_not_reached(tmp_path, s
     assert errors(repo) == [] if switch else "theta, unknown" in errors(repo)[0]
 
 
+def test_of_several_scripts_those_are_served_that_can_be(tmp_path):
+    fork(tmp_path, script="training/train.py")
+    text = (tmp_path / "training/train.py").read_text()
+    other = text.replace("loss.backward()", "loss.backward() + more.backward()")
+    (tmp_path / "training/train_more.py").write_text(other)
+    repo = HostRepo(tmp_path)
+    assert errors(repo) == []
+    assert ForkAdapter().command_line(repo).scripts == ("training/train.py",)
+    warned = [each.found for each in ForkAdapter().match(repo).findings if each.level == "warning"]
+    assert warned[0].startswith("training/train_more.py, which is not served: 2 places")
+
+
+def test_the_camera_is_found_by_its_name(tmp_path):
+    changes = [("def render(viewpoint_camera", "def render(iteration, viewpoint_camera")]
+    repo = fork(tmp_path, *changes, ("render(view,", "render(iteration, view,"))
+    assert errors(repo) == []
+    (view,) = [each for each in ForkAdapter().seams_for(repo) if each.role is Role.VIEW]
+    assert view.needs == ("viewpoint_camera", "pc")
+
+
 def test_checkpoints_have_other_names_too(tmp_path):
     assert errors(fork(tmp_path, ("chkpnt", "ckpt"))) == []
     for name in ("ckpt7.pth", "chkpnt9.pth", "cls8.pth"):
@@ -266,6 +294,11 @@ REFUSED = {
         {},
         [("        loss.backward()\n", "        loss.backward()\n        depth_loss.backward()\n")],
         "2 places that go backward",
+    ),
+    "a removed folder": (
+        {},
+        [("    scene = Scene(", "    shutil.rmtree(opt.model_path)\n    scene = Scene(")],
+        "removes its output folder",
     ),
     "a lost state": ({}, [("self.optimizer.state_dict()", "None")], "no optimizer's state"),
     "values changed by the script": (
