@@ -293,10 +293,11 @@ class ForkAdapter(GraphdecoAdapter):
             why, plainly = plain.reasons[0], "a plain 3DGS model"
             return [Finding("error", "not-plain", MODEL, why, plainly)]
         fork = read_fork(repo)
+        served = replace(self.command_line(repo), scripts=fork.scripts)
         return [
             *fork.findings,
             *read_getters(fork),
-            *(graphdeco.read_flags(repo, self.command_line(repo)) if fork.scripts else ()),
+            *(graphdeco.read_flags(repo, served) if fork.scripts else ()),
             *self._groups(repo),
         ]
 
@@ -364,8 +365,33 @@ class ForkAdapter(GraphdecoAdapter):
         )
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """The flags of 3DGS, for the training scripts that were read."""
-        return replace(super().command_line(repo), scripts=read_fork(repo).scripts or self.scripts)
+        """The flags of 3DGS, for the training scripts that were read, the served ones first."""
+        fork = read_fork(repo)
+        return replace(
+            super().command_line(repo), scripts=(*fork.scripts, *fork.unserved) or self.scripts
+        )
+
+    def _expect_served(self, repo: HostRepo, script: Path) -> None:
+        fork = read_fork(repo)
+        name = script.resolve().relative_to(repo.root.resolve()).as_posix()
+        if name in fork.unserved:
+            raise UsageError(
+                name,
+                fork.unserved[name],
+                f"a script that is served: {', '.join(fork.scripts)}",
+                "Prune its PLY: fragprune finetune.",
+            )
+
+    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
+        """The same script.
+
+        Raises:
+            UsageError: it is not served.
+        """
+        for root in script.resolve().parents[:2]:  # the checkout, or a folder of it
+            if (repo := HostRepo(root)).tree(MODEL) is not None:
+                self._expect_served(repo, script)
+        return super().resumed_by(script, arguments)
 
     def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
         """Refuse trained exposures, which checkpoints of 3DGS lack, and joint learning where our
@@ -391,6 +417,7 @@ class ForkAdapter(GraphdecoAdapter):
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """As 3DGS tells, if scripts change the model only until then; else unknown."""
+        self._expect_served(repo, script)
         known = rests_after_densification(read_fork(repo))
         return super().densified(repo, script, arguments) if known else None
 

@@ -25,6 +25,11 @@ PRIMITIVES = {"_prune_optimizer", "cat_tensors_to_optimizer", "replace_tensor_to
 """Methods that change rows or values of parameters inside the optimizer."""
 CHECKPOINT = r"(?:chkpnt|ckpt|checkpoint)[_-]?"
 """How names of checkpoints begin, before the iteration."""
+_NEVER = {
+    r"\brmtree\(\w+\.model_path": "it removes its output folder",
+    r"\bProcess\((.*\W)?target=|\bmp\.spawn\(": "it trains in processes of its own",
+}
+"""What a script must not do."""
 STATISTICS = {"oneupSHdegree", "add_densification_stats"}
 _MAKES = re.compile(r"__init__|capture\w*|(restore|create|load|init|set)_?\w*|\w*setup\w*")
 """Methods that make a model, before it is trained."""
@@ -72,6 +77,7 @@ class Fork:
         repo: the checkout.
         findings: errors, why it cannot be served; warnings, what is not proved.
         scripts: training scripts, the usual one first.
+        unserved: the others that train such a model, with the reason.
         draws: the drawing functions that these reach.
         outputs: by package, what its rasterizer returns.
         still: methods of the model that scripts call, and that change it.
@@ -84,6 +90,7 @@ class Fork:
     repo: HostRepo
     findings: list[Finding] = field(default_factory=list)
     scripts: tuple[str, ...] = ()
+    unserved: dict[str, str] = field(default_factory=dict)
     draws: tuple[Draw, ...] = ()
     outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)
     still: tuple[str, ...] = ()
@@ -167,8 +174,9 @@ def read_fork(repo: HostRepo) -> Fork:
             alone = {script: _read(repo, (script,)) for script in fork.scripts}
             if served := tuple(script for script, each in alone.items() if not each.errors):
                 fork = _read(repo, served)
-                for script in alone.keys() - {*served}:
-                    why = f"{script}, which is not served: {alone[script].errors[0].found}"
+                for script in (each for each in alone if each not in served):
+                    fork.unserved[script] = alone[script].errors[0].found
+                    why = f"{script}, which is not served: {fork.unserved[script]}"
                     fork.warn("script", script, why)
         _known[repo] = fork
     return _known[repo]
@@ -236,10 +244,10 @@ def _check_script(fork: Fork, script: str) -> None:
     """A script must restore what it captures, under the name that we look for."""
     tree = fork.repo.tree(_module(script))
     text = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)} if tree else set()
-    removes = [] if tree is None else re.findall(r"rmtree\(\w+\.model_path.*", ast.unparse(tree))
-    if removes:
-        found = f"it removes its output folder, {removes[0][:40]}"
-        fork.refuse("script", script, found, "one that stage 2 finds stage 1 in")
+    source = ast.unparse(tree) if tree else ""
+    for pattern, found in _NEVER.items():
+        if re.search(pattern, source):
+            fork.refuse("script", script, found, "one process that keeps its files")
     missing = [
         name
         for name in ("capture", "restore", "update_learning_rate")

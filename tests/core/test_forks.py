@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -227,7 +228,12 @@ def test_of_several_scripts_those_are_served_that_can_be(tmp_path):
     (tmp_path / "training/train_more.py").write_text(other)
     repo = HostRepo(tmp_path)
     assert errors(repo) == []
-    assert ForkAdapter().command_line(repo).scripts == ("training/train.py",)
+    scripts = [tmp_path / each for each in ForkAdapter().command_line(repo).scripts]
+    assert [each.name for each in scripts] == ["train.py", "train_more.py"]
+    assert ForkAdapter().resumed_by(scripts[0], []) == (scripts[0], [])
+    for refused in (ForkAdapter().resumed_by, partial(ForkAdapter().densified, repo)):
+        with pytest.raises(UsageError, match="2 places"):
+            refused(scripts[1], [])
     warned = [each.found for each in ForkAdapter().match(repo).findings if each.level == "warning"]
     assert warned[0].startswith("training/train_more.py, which is not served: 2 places")
 
@@ -299,6 +305,16 @@ REFUSED = {
         {},
         [("    scene = Scene(", "    shutil.rmtree(opt.model_path)\n    scene = Scene(")],
         "removes its output folder",
+    ),
+    "processes": (
+        {},
+        [
+            (
+                "    scene = Scene(",
+                "    mp.Process(name=n, target=train).start()\n    scene = Scene(",
+            )
+        ],
+        "processes of its own",
     ),
     "a lost state": ({}, [("self.optimizer.state_dict()", "None")], "no optimizer's state"),
     "values changed by the script": (
