@@ -16,7 +16,9 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 from typing import Any
@@ -31,7 +33,7 @@ from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.cpu_only import cpu_only
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.plugins.loading import GROUP, load_plugins
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench import demo
 
@@ -376,6 +378,12 @@ def imported(path: Path, packages: Sequence[str] = ()) -> Iterator[None]:
                 del sys.modules[name]
 
 
+@cache
+def _entries() -> tuple[EntryPoint, ...]:
+    """Of installed plugins: to look them up takes as long as to load them."""
+    return tuple(entry_points(group=GROUP))
+
+
 @contextlib.contextmanager
 def running(
     settings: Settings | None = None,
@@ -398,7 +406,7 @@ def running(
         active: False leaves the session's activation to the caller.
         options: of the session; by default it uses our stand-ins.
     """
-    loaded = load_plugins()
+    loaded = load_plugins(_entries())
     for index, plugin in enumerate(plugins or ()):
         loaded.register(plugin, f"test-{index}")
     settings, driver = settings or Settings(iterations=20), driver or Host()
