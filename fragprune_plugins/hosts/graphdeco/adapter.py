@@ -503,9 +503,9 @@ def default(repo: HostRepo, name: str, otherwise: float) -> float:
 def numbers(repo: HostRepo, script: Path, name: str) -> list[int]:
     """The default of an argument, of an argument group or of the script; [] without one."""
     module = ".".join(script.relative_to(repo.root).with_suffix("").parts)
+    read: list[list[int]] = []
     for each in (*defaults(repo, "arguments", name), *defaults(repo, module, name)):
         with contextlib.suppress(ValueError, TypeError):
             value = ast.literal_eval(each)
-            if value != 0:  # an argument group's 0 leaves it to the script
-                return [int(each) for each in (value if isinstance(value, list) else [value])]
-    return []
+            read.append([int(each) for each in (value if isinstance(value, list) else [value])])
+    return next(filter(any, read), read[0] if read else [])  # a group's 0 leaves it to the script
