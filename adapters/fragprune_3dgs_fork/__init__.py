@@ -398,8 +398,16 @@ class ForkAdapter(GraphdecoAdapter):
         gradient on the screen is another.
 
         Raises:
-            UsageError: ``--train_test_exp``, or ``--stage joint``.
+            UsageError: these, or an option under which the host draws by another function.
         """
+        for name in read_fork(repo).options:
+            if f"--{name}" in arguments:
+                raise UsageError(
+                    f"--{name}",
+                    "a drawing function that was not read",
+                    f"those that {', '.join(read_fork(repo).scripts)} draws by without it",
+                    "Leave it out, or prune its PLY: fragprune finetune.",
+                )
         if stage == "joint" and (scaled := read_fork(repo).scaled):
             raise UsageError(
                 "--stage joint",

@@ -83,6 +83,7 @@ class Fork:
         still: methods of the model that scripts call, and that change it.
         setups: methods that make the optimizer.
         blended: by package, the argument with channels that are blended beside the colours.
+        options: off by default, under which scripts draw by other functions.
         off: settings and arguments of the rasterizer that are None or False by default.
         scaled: settings that change the gradient on the screen alone, in its backward pass.
     """
@@ -96,6 +97,7 @@ class Fork:
     still: tuple[str, ...] = ()
     setups: tuple[str, ...] = ()
     blended: dict[str, str] = field(default_factory=dict)
+    options: frozenset[str] = frozenset()
     off: frozenset[str] = frozenset()
     scaled: frozenset[str] = frozenset()
 
@@ -531,6 +533,9 @@ def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
             yield name
     for each in ast.iter_child_nodes(node):
         if isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test):
+            drawn = graphdeco.drawing_functions(fork.repo, RENDERER)
+            if not _mentioned(each).isdisjoint(drawn):
+                fork.options |= {node.test.attr}  # type: ignore[attr-defined]
             continue
         yield from _reached(fork, each)
 

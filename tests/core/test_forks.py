@@ -218,7 +218,13 @@ def test_a_drawing_function_for_an_option_that_is_off_is_not_reached(tmp_path, s
         ("\n    for iteration in", CHOICE),
         ("    for name in ", f"    {flag}\n    for name in "),
     )
-    assert errors(repo) == [] if switch else "theta, unknown" in errors(repo)[0]
+    if not switch:
+        assert "theta, unknown" in errors(repo)[0]
+        return
+    assert errors(repo) == []
+    ForkAdapter().refuse(repo, ["--eval"], stage="auto", device="cuda")
+    with pytest.raises(UsageError, match="a drawing function that was not read"):
+        ForkAdapter().refuse(repo, ["--posed"], stage="auto", device="cuda")
 
 
 def test_of_several_scripts_those_are_served_that_can_be(tmp_path):
