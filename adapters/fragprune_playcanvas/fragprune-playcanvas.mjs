@@ -7,13 +7,15 @@
  *     await installCutoffs(app, entity, { cutoffs }) // or Uint8Array: a code per row of the file
  *
  * A code c is the threshold 255^(c/256 - 1) of the falloff exp(-q/2), q the squared distance in
- * standard deviations; code 0 changes nothing. Codes travel in extra streams of the engine, and two
- * shader chunks of `app.scene.gsplat.material` get one condition each. Other entities, and a file
- * without cutoffs, stay as they are.
+ * standard deviations; code 0 changes nothing. Codes travel in extra streams of the engine, and shader
+ * chunks of `app.scene.gsplat.material` get one condition each, in GLSL or in WGSL. Other entities, and
+ * a file without cutoffs, stay as they are.
  */
 import * as pc from 'playcanvas';
 
-const SUPPORTED = '2.20 to 2.23, WebGL 2';
+const SUPPORTED = '2.20 to 2.23, WebGL 2 and WebGPU';
+const pascal = (name) => name[0].toUpperCase() + name.slice(1);
+
 const COLUMN = 'trunc_threshold';
 const CODES = 'fragprune_codes'; // our own column, so that the engine moves it with the rows
 const STREAM = 'fragpruneCutoff'; // codes of an entity's rows
@@ -22,11 +24,79 @@ const EXTRA = 'fragprune_cutoff'; // of a SOG's meta.json
 const BUFFER = 'fragpruneCode'; // codes of all splats of the scene, in the engine's work buffer
 const LIMIT = 'fragpruneLimit'; // squared radius of a splat's ellipse in units of gaussianUV
 
-const SPLAT_MODIFIER = `
+const LIMIT_PER_STEP = (Math.log(255) / 1024).toFixed(10); // the engine's kernel is exp(-4 A): A = Q / 8
+
+// What differs between the languages of shaders: the engine's lines that change, and our own.
+const GLSL = {
+    modifier: `
 void modifySplatCenter(inout vec3 center) {}
-void modifySplatRotationScale(vec3 from, vec3 to, inout vec4 rotation, inout vec3 scale) {}
+void modifySplatRotationScale(vec3 before, vec3 after, inout vec4 rotation, inout vec3 scale) {}
 void modifySplatColor(vec3 center, inout vec4 color) {}
-`;
+`,
+    modifierStart: 'void modifySplatColor(vec3 center, inout vec4 color) {',
+    ofImage: (texel) => `uint(${texel}.r * 255.0 + 0.5)`,
+    kind: 'void',
+    writeSplat: `
+uint ${BUFFER} = 0u;
+void writeSplat(vec3 center, vec4 rotation, vec3 scale, vec4 color) {
+    engineWriteSplat(center, rotation, scale, color);
+    write${pascal(BUFFER)}(uvec4(${BUFFER}, 0u, 0u, 0u));
+}`,
+    discard: ['if (A > 1.0)', `if (A > min(1.0, get${pascal(LIMIT)}()))`],
+    // The engine has set uv to its own extent.
+    clipCorner: `
+void clipCorner(inout SplatCorner corner, float alpha) {
+    engineClipCorner(corner, alpha);
+    float limit = float(256u - load${pascal(BUFFER)}().r) * ${LIMIT_PER_STEP};
+    float extent = max(abs(corner.uv.x), abs(corner.uv.y));
+    float shrink = min(1.0, sqrt(limit) / max(extent, 1e-6));
+    corner.offset *= shrink;
+    corner.uv *= shrink;
+    set${pascal(LIMIT)}(limit);
+}`
+};
+
+const WGSL = {
+    modifier: `
+fn modifySplatCenter(center: ptr<function, vec3f>) {}
+fn modifySplatRotationScale(before: vec3f, after: vec3f, rotation: ptr<function, vec4f>, scale: ptr<function, vec3f>) {}
+fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {}
+`,
+    modifierStart: 'fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {',
+    ofImage: (texel) => `u32(${texel}.r * 255.0 + 0.5)`,
+    kind: 'fn',
+    writeSplat: `
+var<private> ${BUFFER}: u32 = 0u;
+fn writeSplat(center: vec3f, rotation: vec4f, scale: vec3f, color: vec4f) {
+    engineWriteSplat(center, rotation, scale, color);
+    write${pascal(BUFFER)}(vec4u(${BUFFER}, 0u, 0u, 0u));
+}`,
+    discard: ['if (A > half(1.0))', `if (A > min(half(1.0), half(get${pascal(LIMIT)}())))`],
+    clipCorner: `
+fn clipCorner(corner: ptr<function, SplatCorner>, alpha: half) {
+    engineClipCorner(corner, alpha);
+    let extent = max(abs(f32(corner.uv.x)), abs(f32(corner.uv.y)));
+    let shrink = min(1.0, sqrt(${LIMIT}Of()) / max(extent, 1e-6));
+    corner.offset *= shrink;
+    corner.uv *= half(shrink);
+}`,
+    // Of a splat, in the vertex stage and in the compute stage that projects for the GPU's sort. Shadows
+    // have this chunk without the varying.
+    modifySplatColor: `
+#ifdef GSPLAT_USER_VARYINGS
+fn ${LIMIT}Of() -> f32 { return f32(256u - load${pascal(BUFFER)}().r) * ${LIMIT_PER_STEP}; }
+#endif
+fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
+    engineModifySplatColor(center, color);
+#ifdef GSPLAT_USER_VARYINGS
+    set${pascal(LIMIT)}(${LIMIT}Of());
+#endif
+}`,
+    // The corner of a splat that was projected: what it carries is read before the corner is placed.
+    corner: ['let cornerClipped = cornerUV * f32(clip);', `
+#include "gsplatUserCacheReadVS"
+    let cornerClipped = cornerUV * min(f32(clip), sqrt(output.user_${LIMIT}));`]
+};
 
 function fail(found, remedy) {
     return new Error(`fragprune: ${found} (PlayCanvas ${pc.version}; supported: ${SUPPORTED}). ${remedy}`);
@@ -55,11 +125,11 @@ export function encode(threshold) {
  * @param {object} [options]
  * @param {Uint8Array} [options.cutoffs] - A code per row, in the order of the file; default: those
  * that the file holds, a PLY in its column trunc_threshold, a SOG in its extras.
- * @param {string} [options.modifier] - GLSL of your own work buffer modifier, if you have one: a
- * component takes one modifier, and this is where ours and yours become one.
+ * @param {string} [options.modifier] - Your own work buffer modifier, if you have one, in the device's
+ * language, GLSL or WGSL: a component takes one modifier, and this is where ours and yours become one.
  * @returns {Promise<boolean>} Whether there are cutoffs; if not, nothing is changed.
  */
-export async function installCutoffs(app, entity, { cutoffs, modifier = SPLAT_MODIFIER } = {}) {
+export async function installCutoffs(app, entity, { cutoffs, modifier } = {}) {
     const component = entity.gsplat;
     if (!component) throw fail('the entity has no gsplat component', 'Add it first.');
     check(app, component);
@@ -76,9 +146,10 @@ export async function installCutoffs(app, entity, { cutoffs, modifier = SPLAT_MO
     const image = cutoffs ? null : await imageOf(asset, resource);
     const codes = image ? null : codesOf(resource, cutoffs);
     if (!image && !codes) return false;
-    const code = image ? `uint(load${pascal(IMAGE)}().r * 255.0 + 0.5)` : `load${pascal(STREAM)}().r`;
-    const header = 'void modifySplatColor(vec3 center, inout vec4 color) {';
-    const glsl = replaceOnce(modifier, header, `${header}\n    ${BUFFER} = ${code};`, 'the modifier');
+    const language = languageOf(app);
+    const code = image ? language.ofImage(`load${pascal(IMAGE)}()`) : `load${pascal(STREAM)}().r`;
+    const start = language.modifierStart;
+    const modified = replaceOnce(modifier ?? language.modifier, start, `${start}\n    ${BUFFER} = ${code};`, 'the modifier');
     installShaders(app);
     const [name, format] = image ? [IMAGE, pc.PIXELFORMAT_RGBA8] : [STREAM, pc.PIXELFORMAT_R8U];
     resource.format.addExtraStreams([{ name, format, storage: pc.GSPLAT_STREAM_INSTANCE }]);
@@ -92,11 +163,9 @@ export async function installCutoffs(app, entity, { cutoffs, modifier = SPLAT_MO
         texture.lock().fill(0).set(codes);
         texture.unlock();
     }
-    component.setWorkBufferModifier({ glsl });
+    component.setWorkBufferModifier({ [app.graphicsDevice.isWebGPU ? 'wgsl' : 'glsl']: modified });
     return true;
 }
-
-const pascal = (name) => name[0].toUpperCase() + name.slice(1);
 
 /** Refuse what cannot work, before anything is changed. */
 function check(app, component) {
@@ -111,7 +180,13 @@ function check(app, component) {
     };
     const missing = Object.keys(needed).filter((name) => !needed[name]);
     if (missing.length) throw fail(`no ${missing.join(', ')}`, 'Use a supported engine.');
-    if (!app.graphicsDevice.isWebGL2) throw fail('the device is not WebGL 2', 'Create it with deviceTypes: ["webgl2"].');
+    const { isWebGL2, isWebGPU } = app.graphicsDevice;
+    if (!isWebGL2 && !isWebGPU) throw fail('the device is neither', 'Create it with deviceTypes: ["webgpu", "webgl2"].');
+    const bytes = app.graphicsDevice.wgpu?.limits.maxColorAttachmentBytesPerSample;
+    if (bytes < 33 && gsplat.dataFormat === pc.GSPLATDATA_LARGE) {
+        throw fail(`the device writes ${bytes} bytes at once, and large data with codes takes 33`,
+            'Set app.scene.gsplat.dataFormat to GSPLATDATA_COMPACT.');
+    }
     if (!component.unified) throw fail('the component has unified: false', 'Leave it at its default, true.');
 }
 
@@ -182,42 +257,38 @@ async function unzipped(bytes, wanted) {
     throw fail(`the SOG has no ${wanted}`, 'Write it again.');
 }
 
+const languageOf = (app) => (app.graphicsDevice.isWebGPU ? WGSL : GLSL);
+
 const installed = new WeakSet();
 
 /** Once per scene: codes in the work buffer, and quads that end at the cutoff. */
 function installShaders(app) {
     const { material, format, varyings } = app.scene.gsplat;
     if (installed.has(material)) return;
-    const chunks = material.getShaderChunks(pc.SHADERLANGUAGE_GLSL);
-    const engine = pc.ShaderChunks.get(app.graphicsDevice, pc.SHADERLANGUAGE_GLSL);
-    const source = (name) => chunks.get(name) ?? engine.get(name);
+    const language = languageOf(app);
+    const kind = language === WGSL ? pc.SHADERLANGUAGE_WGSL : pc.SHADERLANGUAGE_GLSL;
+    const chunks = material.getShaderChunks(kind);
+    const engine = pc.ShaderChunks.get(app.graphicsDevice, kind);
+    const source = (chunk) => chunks.get(chunk) ?? engine.get(chunk);
+    // The engine's function gets another name, and ours calls it.
+    const wrapped = (text, name, where) =>
+        replaceOnce(text, `${language.kind} ${name}(`, `${language.kind} engine${pascal(name)}(`, where) + language[name];
 
     // Splats of other entities get code 0 here, which changes nothing.
-    const write = replaceOnce(format.getWriteCode(), 'void writeSplat(', 'void engineWriteSplat(', 'writeSplat');
-    const common = replaceOnce(source('gsplatCommonVS'), 'void clipCorner(', 'void engineClipCorner(', 'gsplatCommonVS');
-    const fragment = replaceOnce(source('gsplatPS'), 'if (A > 1.0)', `if (A > min(1.0, get${pascal(LIMIT)}()))`, 'gsplatPS');
+    const write = wrapped(format.getWriteCode(), 'writeSplat', 'the write code');
+    const changed = {
+        gsplatCommonVS: wrapped(source('gsplatCommonVS'), 'clipCorner', 'gsplatCommonVS'),
+        gsplatPS: replaceOnce(source('gsplatPS'), ...language.discard, 'gsplatPS')
+    };
+    if (language === WGSL) {
+        changed.gsplatModifyVS = wrapped(source('gsplatModifyVS'), 'modifySplatColor', 'gsplatModifyVS');
+        changed.gsplatHybridVS = replaceOnce(source('gsplatHybridVS'), ...language.corner, 'gsplatHybridVS');
+    }
 
     format.addExtraStreams([{ name: BUFFER, format: pc.PIXELFORMAT_R8U }]);
-    format.setWriteCode(`
-uint ${BUFFER} = 0u;
-${write}
-void writeSplat(vec3 center, vec4 rotation, vec3 scale, vec4 color) {
-    engineWriteSplat(center, rotation, scale, color);
-    write${pascal(BUFFER)}(uvec4(${BUFFER}, 0u, 0u, 0u));
-}`, '');
+    format.setWriteCode(write, write);
     varyings.add([{ name: LIMIT, type: pc.TYPE_FLOAT32, components: 1 }]);
-    // The engine's kernel is exp(-4 A), so A = Q / 8 at the cutoff. It has set uv to its own extent.
-    chunks.set('gsplatCommonVS', `${common}
-void clipCorner(inout SplatCorner corner, float alpha) {
-    engineClipCorner(corner, alpha);
-    float limit = float(256u - load${pascal(BUFFER)}().r) * ${(Math.log(255) / 1024).toFixed(10)};
-    float extent = max(abs(corner.uv.x), abs(corner.uv.y));
-    float shrink = min(1.0, sqrt(limit) / max(extent, 1e-6));
-    corner.offset *= shrink;
-    corner.uv *= shrink;
-    set${pascal(LIMIT)}(limit);
-}`);
-    chunks.set('gsplatPS', fragment);
+    for (const [chunk, text] of Object.entries(changed)) chunks.set(chunk, text);
     material.update();
     installed.add(material);
 }

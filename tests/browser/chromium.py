@@ -36,6 +36,10 @@ FLAGS = (
     "--disable-sync",
     "--use-angle=swiftshader",  # WebGL in software: the same on every machine
     "--enable-unsafe-swiftshader",
+    "--enable-unsafe-webgpu",  # WebGPU likewise; without Vulkan its first canvas ends the device
+    "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan",
+    "--use-vulkan=swiftshader",
 )
 
 

@@ -98,12 +98,14 @@ def drawing(
 
     Args:
         browser: from ``chromium``.
-        engine: "playcanvas" or "spark".
+        engine: "playcanvas" on WebGL 2, "playcanvas-webgpu", "playcanvas-webgpu-cpu" with the
+            renderer that sorts on the CPU, or "spark".
         model: PLY, or what the engine reads besides.
         view: the camera; its principal point is the centre, and both focal lengths are equal.
         errors: the page may report some; else they raise AssertionError.
         options: of ``playcanvas.js`` or ``spark.js``.
     """
+    engine, *device = engine.split("-")
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         (root / "node_modules").symlink_to(engines() / "node_modules")
@@ -116,6 +118,8 @@ def drawing(
             "width": view.width,
             "height": view.height,
             "camera": _camera(view),
+            "webgpu": "webgpu" in device,
+            "sorting": "cpu" if "cpu" in device else "auto",
             **options,
         }
         with served(root) as address, opened(browser, address + "page.html") as tab:

@@ -1,16 +1,35 @@
-// One splat in PlayCanvas. options: model, width, height, camera {matrix, fovY}; bridge; cutoffs;
-// modifier, chunks: GLSL of the page's own; component, data: of the component and the asset; late:
+// One splat in PlayCanvas. options: model, width, height, camera {matrix, fovY}; webgpu: a device of that
+// kind, not WebGL 2; sorting: "cpu" there, too; bytes: a limit of that device; bridge; cutoffs; modifier, chunks: shaders of the page's own; component, data: of the component and the asset; late:
 // the asset has loaded before the bridge comes; plain: draw as the 3DGS rasterizer does as far as the
 // engine's own settings go; second: a place for the same splat without cutoffs, where "hidden" says
 // which of the two is there instead of at the origin, and "first" whether it is made first.
 import * as pc from 'playcanvas';
 
-const KERNEL = '(exp(x * -4.0) - EXP4) * INV_EXP4'; // fades to 0 at the quad's edge
+// The kernel that fades to 0 at the quad's edge, the one that does not, and a fragment that adds 1: red 1
+// and alpha 0 are blended as a sum.
+const GLSL = {
+    faded: '(exp(x * -4.0) - EXP4) * INV_EXP4',
+    kernel: 'exp(x * -4.0)',
+    one: 'void main(void) { gl_FragColor = vec4(1.0, 0.0, 0.0, 0.0); }'
+};
+const WGSL = {
+    faded: '(exp(x * half(-4.0)) - EXP4) * INV_EXP4',
+    kernel: 'exp(x * half(-4.0))',
+    one: `@fragment fn fragmentMain(input: FragmentInput) -> FragmentOutput {
+        var output: FragmentOutput;
+        output.color = vec4f(1.0, 0.0, 0.0, 0.0);
+        return output;
+    }`
+};
 
 export async function start(canvas, options) {
     const { width, height, camera } = options;
     Object.assign(canvas, { width, height });
-    const device = await pc.createGraphicsDevice(canvas, { deviceTypes: ['webgl2'], antialias: false, alpha: false });
+    const deviceTypes = [options.webgpu ? 'webgpu' : 'webgl2'];
+    const device = await pc.createGraphicsDevice(canvas, { deviceTypes, antialias: false, alpha: false });
+    if (device.isWebGPU !== !!options.webgpu) throw new Error(`no ${deviceTypes}`);
+    const [shaders, language] = options.webgpu ? [WGSL, pc.SHADERLANGUAGE_WGSL] : [GLSL, pc.SHADERLANGUAGE_GLSL];
+    if (options.bytes) Object.defineProperty(device.wgpu, 'limits', { value: { maxColorAttachmentBytesPerSample: options.bytes } });
     const set = new pc.AppOptions();
     set.graphicsDevice = device;
     set.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem];
@@ -22,8 +41,9 @@ export async function start(canvas, options) {
     app.start();
 
     const material = app.scene.gsplat.material;
-    const chunks = material.getShaderChunks(pc.SHADERLANGUAGE_GLSL);
+    const chunks = material.getShaderChunks(language);
     for (const [name, text] of Object.entries(options.chunks ?? {})) chunks.set(name, text);
+    if (options.sorting === 'cpu') app.scene.gsplat.renderer = pc.GSPLAT_RENDERER_RASTER_CPU_SORT;
     if (options.plain) {
         app.scene.gsplat.dataFormat = pc.GSPLATDATA_LARGE;
         app.scene.gsplat.minPixelSize = 0;
@@ -65,10 +85,10 @@ export async function start(canvas, options) {
     }
     await loaded;
     if (options.plain) {
-        const engine = pc.ShaderChunks.get(device, pc.SHADERLANGUAGE_GLSL);
+        const engine = pc.ShaderChunks.get(device, language);
         const text = chunks.get('gsplatPS') ?? engine.get('gsplatPS');
-        if (!text.includes(KERNEL)) throw new Error('another kernel');
-        chunks.set('gsplatPS', text.replace(KERNEL, 'exp(x * -4.0)'));
+        if (!text.includes(shaders.faded)) throw new Error('another kernel');
+        chunks.set('gsplatPS', text.replace(shaders.faded, shaders.kernel));
         material.update();
     }
 
@@ -88,21 +108,22 @@ export async function start(canvas, options) {
         app,
         async picture() {
             await frame();
+            if (options.webgpu) return copied(canvas);
             const pixels = new Uint8Array(width * height * 4);
             gl.bindFramebuffer(gl.FRAMEBUFFER, null);
             gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
             return pixels;
         },
-        async quads() { // every fragment adds 1: red 1 and alpha 0 are blended as a sum
+        async quads() {
             const held = chunks.get('gsplatPS');
-            chunks.set('gsplatPS', 'void main(void) { gl_FragColor = vec4(1.0, 0.0, 0.0, 0.0); }');
+            chunks.set('gsplatPS', shaders.one);
             material.update();
             const texture = new pc.Texture(device, { width, height, format: pc.PIXELFORMAT_RGBA32F, mipmaps: false });
             const renderTarget = new pc.RenderTarget({ colorBuffer: texture, depth: true });
             eye.camera.clearColor = new pc.Color(0, 0, 0, 0);
             eye.camera.renderTarget = renderTarget;
             for (let i = 0; i < 3; i++) await frame();
-            const sums = await texture.read(0, 0, width, height, { renderTarget });
+            const sums = await texture.read(0, 0, width, height, { renderTarget, immediate: true });
             eye.camera.renderTarget = null;
             if (held) chunks.set('gsplatPS', held); else chunks.delete('gsplatPS');
             material.update();
@@ -115,13 +136,23 @@ export async function start(canvas, options) {
             app.on('framerender', began);
             for (let i = 0; i < count + 1; i++) {
                 await frame();
-                gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+                if (options.webgpu) await device.wgpu.queue.onSubmittedWorkDone();
+                else gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
                 times.push(performance.now() - from);
             }
             app.off('framerender', began);
             return times.slice(1);
         }
     };
+}
+
+// What a canvas shows, as WebGL's readPixels gives it: bottom row first.
+function copied(canvas) {
+    const { width, height } = canvas;
+    const context = new OffscreenCanvas(width, height).getContext('2d');
+    context.setTransform(1, 0, 0, -1, 0, height);
+    context.drawImage(canvas, 0, 0);
+    return context.getImageData(0, 0, width, height).data;
 }
 
 function total(sums) {
