@@ -15,7 +15,10 @@ const GLSL = {
 const WGSL = {
     faded: '(exp(x * half(-4.0)) - EXP4) * INV_EXP4',
     kernel: 'exp(x * half(-4.0))',
-    one: `@fragment fn fragmentMain(input: FragmentInput) -> FragmentOutput {
+    one: `
+    varying gaussianUV: half2;
+    @fragment
+    fn fragmentMain(input: FragmentInput) -> FragmentOutput {
         var output: FragmentOutput;
         output.color = vec4f(1.0, 0.0, 0.0, 0.0);
         return output;
