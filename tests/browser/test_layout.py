@@ -77,10 +77,11 @@ def test_a_phone_scrolls_no_page_sideways(shown, name):
     with shown(**PHONE, is_mobile=True, has_touch=True) as tab:
         tab.page.wait_for_timeout(500)
         wide = tab.run(
-            """() => [document.documentElement.scrollWidth,
+            """width => [document.documentElement.scrollWidth,
                 [...document.querySelectorAll("body *")]
-                    .filter(each => each.getBoundingClientRect().right > innerWidth + 1)
-                    .map(each => each.tagName + "." + each.className).slice(0, 5)]"""
+                    .filter(each => each.getBoundingClientRect().right > width + 1)
+                    .map(each => each.tagName + "." + each.className).slice(0, 5)]""",
+            PHONE["width"],
         )
         assert wide[0] <= PHONE["width"], wide[1]
 
@@ -133,19 +134,25 @@ FAINT = """(least) => {
     const dark = matchMedia("(prefers-color-scheme: dark)").matches;
     const ground = element => {
         const layers = [];
-        for (let at = element; at; at = at.parentElement) layers.unshift(colour(getComputedStyle(at).backgroundColor));
-        return layers.reduce((below, top) => over(top, below), dark ? [18, 18, 18] : [255, 255, 255]);
+        for (let at = element; at; at = at.parentElement)
+            layers.unshift(colour(getComputedStyle(at).backgroundColor));
+        const canvas = dark ? [18, 18, 18] : [255, 255, 255];
+        return layers.reduce((below, top) => over(top, below), canvas);
     };
     const found = new Map();
     const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+    const seen = { opacityProperty: true, visibilityProperty: true };
     while (walker.nextNode()) {
-        const element = walker.currentNode.parentElement, words = walker.currentNode.textContent.trim();
-        if (!words || !element.checkVisibility({ opacityProperty: true, visibilityProperty: true })) continue;
-        if (["SCRIPT", "STYLE"].includes(element.tagName)) continue;
-        const below = ground(element), text = over(colour(getComputedStyle(element).color), below);
+        const element = walker.currentNode.parentElement;
+        const words = walker.currentNode.textContent.trim();
+        if (!words || ["SCRIPT", "STYLE"].includes(element.tagName)) continue;
+        if (!element.checkVisibility(seen)) continue;
+        const { color, fontSize } = getComputedStyle(element);
+        const below = ground(element), text = over(colour(color), below);
         const [low, high] = [light(below), light(text)].sort((a, b) => a - b);
-        const ratio = (high + 0.05) / (low + 0.05), large = parseFloat(getComputedStyle(element).fontSize) >= 24;
-        if (ratio < (large ? 3 : least)) found.set(`${element.tagName}.${element.className} ${ratio.toFixed(2)}`, words.slice(0, 30));
+        const ratio = (high + 0.05) / (low + 0.05);
+        if (ratio < (parseFloat(fontSize) >= 24 ? 3 : least))
+            found.set(`${element.tagName} ${element.className}`, `${ratio.toFixed(2)} ${words}`);
     }
     return [...found].map(each => each.join(": "));
 }"""
