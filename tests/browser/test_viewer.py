@@ -286,8 +286,8 @@ def test_one_page_from_disk_is_small_and_shows_the_same(browser, tmp_path):
     save_site(tmp_path / "raw", site)
     with served(tmp_path / "raw") as raw:
         for address in (raw, (tmp_path / "page.html").as_uri()):
-            with opened(browser, address) as tab:
-                tab.page.wait_for_function("() => window.viewer && viewer.counted")
+            with opened(browser, address, width=320, height=240) as tab:
+                tab.page.wait_for_function("() => window.viewer && viewer.layers.length === 2")
                 hold(tab, view)
                 shown[address] = [frame(tab, view, layer).image for layer in (0, 1)]
                 assert tab.errors == tab.strangers == []
