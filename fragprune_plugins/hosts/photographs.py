@@ -70,11 +70,6 @@ class Photographs:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Photographs:
-        """Rebuild from ``as_dict``. Records of earlier versions have a divisor as resolution."""
-        size = values["resolution"]
-        return cls(
-            Path(values["folder"]),
-            Resolution(**size) if isinstance(size, dict) else Resolution(divide=size),
-            values["white_background"],
-            values.get("images", "images"),
-        )
+        """Rebuild from ``as_dict``."""
+        size = Resolution(**values["resolution"])
+        return cls(Path(values["folder"]), size, values["white_background"], values["images"])

@@ -101,8 +101,3 @@ def test_a_command_that_holds_nothing_out_is_refused():
 def test_photographs_survive_a_record(size, tmp_path):
     read = Photographs(tmp_path, size, True, "images_2")
     assert Photographs.from_dict(read.as_dict()) == read
-
-
-def test_records_of_earlier_versions_have_a_divisor(tmp_path):
-    old = {"folder": str(tmp_path), "resolution": 4, "white_background": False}
-    assert Photographs.from_dict(old) == Photographs(tmp_path, Resolution(divide=4))

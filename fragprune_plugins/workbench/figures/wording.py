@@ -50,7 +50,7 @@ _DIFFERENCES = ("psnr", "ssim", "lpips")
 """Figures whose change is a difference; that of others is a ratio."""
 
 _OPTIONAL = ("lpips", "entries_per_pixel")
-"""Figures that an installation, an engine or an older record may lack."""
+"""Figures that an installation or an engine may lack."""
 
 
 def describe(columns: Mapping[str, dict[str, Any]]) -> str:
@@ -79,8 +79,6 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
     itself = reports[-1].get("target") == ITSELF
     for label, key, digits in _ROWS:
         if key in _OPTIONAL and not all(_known(each.get(key)) for each in reports):
-            continue
-        if any(key not in report for report in reports):  # records of version 0.1 have no area
             continue
         if key == "psnr" and itself:  # before, it is infinite: null in a record
             equal = ["equal" if each is reports[0] else f"{each[key]:.2f}" for each in reports]

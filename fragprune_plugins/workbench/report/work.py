@@ -204,7 +204,6 @@ def _settings(record: Record) -> list[list[str]]:
     keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
     facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
     facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
-    facts = portable(facts, record.path.parent)  # records of earlier versions have whole paths
     return [
         [key, f"{value:.4g}" if isinstance(value, float) else str(value)]
         for key, value in facts.items()
