@@ -149,7 +149,7 @@ class Fork:
             if module in seen or tree is None or module.split(".")[0] == RENDERER:
                 continue
             seen[module] = None
-            for node in ast.walk(tree):
+            for node in graphdeco.nodes(tree):
                 if isinstance(node, ast.Import):
                     waiting += [each.name for each in node.names]
                 elif isinstance(node, ast.ImportFrom):
@@ -225,7 +225,7 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         assert tree is not None  # it is a candidate
         made = [
             name
-            for node in ast.walk(tree)
+            for node in graphdeco.nodes(tree)
             if isinstance(node, ast.Call)
             and (name := getattr(node.func, "id", "")).endswith("Model")
         ]
@@ -245,7 +245,9 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
 def _check_script(fork: Fork, script: str) -> None:
     """A script must restore what it captures, under the name that we look for."""
     tree = fork.repo.tree(_module(script))
-    text = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)} if tree else set()
+    text = (
+        {n.value for n in graphdeco.nodes(tree) if isinstance(n, ast.Constant)} if tree else set()
+    )
     source = ast.unparse(tree) if tree else ""
     for pattern, found in _NEVER.items():
         if re.search(pattern, source):
@@ -272,10 +274,10 @@ def rests_after_densification(fork: Fork) -> bool:
         tree = fork.repo.tree(_module(script))
         inside = {
             id(inner)
-            for node in (ast.walk(tree) if tree else ())
+            for node in graphdeco.nodes(tree)
             if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
             for each in node.body
-            for inner in ast.walk(each)
+            for inner in graphdeco.nodes(each)
         }
         for node, name in _method_calls(tree) if tree else ():
             if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
@@ -297,14 +299,14 @@ def _mentioned(tree: ast.AST) -> frozenset[str]:
     """Names, attributes and imports in a tree."""
     return frozenset(
         getattr(node, kind)
-        for node in ast.walk(tree)
+        for node in graphdeco.nodes(tree)
         for kind in ("id", "attr", "name")
         if isinstance(getattr(node, kind, None), str)
     )
 
 
 def _method_calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
-    for node in ast.walk(tree):
+    for node in graphdeco.nodes(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             yield node, node.func.attr
 
@@ -338,11 +340,14 @@ def _read_methods(fork: Fork) -> None:
     fork.setups = tuple(
         name
         for name, body in methods.items()
-        if any(_target(node) == "optimizer" for node in ast.walk(body)) and name != "__init__"
+        if any(_target(node) == "optimizer" for node in graphdeco.nodes(body))
+        and name != "__init__"
     )
     called: dict[str, None] = {}
     for module, tree in fork.trees():
-        statements = {id(each.value) for each in ast.walk(tree) if isinstance(each, ast.Expr)}
+        statements = {
+            id(each.value) for each in graphdeco.nodes(tree) if isinstance(each, ast.Expr)
+        }
         for node, name in _method_calls(tree):
             if name in changing and _MODELS.search(ast.unparse(node.func.value)):  # type: ignore[attr-defined]
                 called[name] = None
@@ -364,7 +369,7 @@ def _read_methods(fork: Fork) -> None:
 def plain_distances(repo: HostRepo) -> bool:
     """Whether ``distCUDA2`` gives one tensor, as that of 3DGS does; forks also get neighbours."""
     tree = repo.tree(MODEL)
-    for node in ast.walk(tree) if tree else ():
+    for node in graphdeco.nodes(tree):
         several = isinstance(node, ast.Subscript) or (
             isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple)
         )
@@ -379,7 +384,7 @@ def _returns_state(capture: Function) -> bool:
         isinstance(node, ast.Return)
         and isinstance(node.value, ast.Tuple | ast.List)
         and any("optimizer.state_dict()" in ast.unparse(each) for each in node.value.elts)
-        for node in ast.walk(capture)
+        for node in graphdeco.nodes(capture)
     )
 
 
@@ -393,7 +398,7 @@ def _target(node: ast.AST) -> str:
 
 def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
     """Lines that assign a parameter of a model, or change its values in place."""
-    for node in ast.walk(body):
+    for node in graphdeco.nodes(body):
         targets: list[ast.expr] = []
         if isinstance(node, ast.Assign):
             targets = node.targets
@@ -422,7 +427,7 @@ def _read_changes(fork: Fork) -> None:
             fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
         trained = fork.repo.tree(_module(script))
-        for node in ast.walk(trained) if trained else ():
+        for node in graphdeco.nodes(trained):
             if isinstance(node, ast.Assign) and re.match(
                 r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(", ast.unparse(node.value)
             ):
@@ -447,7 +452,7 @@ def read_getters(fork: Fork) -> list[Finding]:
     made = {
         _target(node)
         for name in (reached & methods.keys()) - {"__init__"}
-        for node in ast.walk(methods[name])
+        for node in graphdeco.nodes(methods[name])
         if isinstance(node, ast.Assign) and not is_off(node.value)
     }
     unset = {each for each in _guards(methods) if fork.is_off(each)} - made
@@ -464,7 +469,7 @@ def _guards(methods: dict[str, Function]) -> set[str]:
         ast.unparse(node.test)
         for name, body in methods.items()
         if name.startswith("get_")
-        for node in ast.walk(body)
+        for node in graphdeco.nodes(body)
         if isinstance(node, ast.If)
     ]
     return {name for test in tests for name in re.findall(r"self\.(\w+) is not None", test)}

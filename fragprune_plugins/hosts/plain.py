@@ -182,8 +182,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 def _of_kernel(repo: HostRepo) -> Iterator[str]:
     """Differences of vendored rasterizers that the drawing functions import."""
     for module in _renderers(repo):
-        tree = repo.tree(module)
-        for node in nodes(tree):
+        for node in nodes(repo.tree(module)):
             if isinstance(node, ast.ImportFrom) and any(RASTERIZER in a.name for a in node.names):
                 for finding in read_kernels(repo, repo.absolute(module, node), SPLAT):
                     if finding.level == "error":

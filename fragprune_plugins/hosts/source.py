@@ -182,13 +182,8 @@ class HostRepo:
 
     def calls(self, module: str, name: str) -> list[ast.Call]:
         """Every call of a bare name in a module, in source order."""
-        return [
-            node
-            for node in nodes(self.tree(module))
-            if isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Name)
-            and node.func.id == name
-        ]
+        made = (node for node in nodes(self.tree(module)) if isinstance(node, ast.Call))
+        return [each for each in made if getattr(each.func, "id", "") == name]
 
     def absolute(self, module: str, node: ast.ImportFrom) -> str:
         """The absolute dotted name of a ``from ... import`` in a module."""

@@ -20,7 +20,8 @@ from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 ROLES = ("image", "radii", "objects", "alpha", "depth", "invdepth", "unread")
-DIALECT = ForkDialect("p", (), 2, values={"p": tuple(Output(each, each) for each in ROLES)})
+VALUES = {"p": tuple(Output(each, each) for each in ROLES)}
+DIALECT = ForkDialect("p", (), 2, values=VALUES, blended={"p": "sh_objs"})
 OBJECTS = 19
 
 

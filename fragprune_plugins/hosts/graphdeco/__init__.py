@@ -25,6 +25,7 @@ from fragprune_plugins.hosts.graphdeco.call import (
 from fragprune_plugins.hosts.graphdeco.densifying import clones, needy, reaches, splits
 from fragprune_plugins.hosts.graphdeco.reading import defaults, read_flags, read_getters
 from fragprune_plugins.hosts.kernels import SURFEL, normal_sources, vendored
+from fragprune_plugins.hosts.source import nodes
 
 __all__ = [
     "CLONE",
@@ -41,6 +42,7 @@ __all__ = [
     "drawing_functions",
     "group_names",
     "needy",
+    "nodes",
     "normal_sources",
     "reaches",
     "read_calls",

@@ -133,8 +133,7 @@ def _strings(tree: ast.Module) -> Iterator[str]:
 
 def _of_groups(repo: HostRepo) -> Iterator[str]:
     """Flags that the argument groups make of their attributes; ``_name`` also makes ``-n``."""
-    tree = repo.tree("arguments")
-    for node in nodes(tree):
+    for node in nodes(repo.tree("arguments")):
         targets = node.targets if isinstance(node, ast.Assign) else []
         for each in targets:
             if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
