@@ -23,8 +23,8 @@ class Learning:
     """Initial learning rate of threshold logits."""
     opacity_lr: float = Settings.opacity_lr
     """Initial learning rate of opacity logits."""
-    stop: float | None = None
-    """Share of a pixel's light at which it stops; None keeps what the model has."""
+    stop: float | Literal["auto"] | None = Settings.stop
+    """Share of a pixel's light at which it stops; auto is the usual one, None adds none."""
     rim: Literal["hard", "soft"] | None = None
     """How thresholds cut; None keeps what the model has."""
 

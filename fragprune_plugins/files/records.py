@@ -25,7 +25,7 @@ DOOR = Door(
 CONTROL = "control"
 """The goal of a control, as settings in records have it."""
 
-_OF_CONTROLS = ("train", "opacity_lr", "stop", "seed", "views_per_step")
+_OF_CONTROLS = ("train", "opacity_lr", "seed", "views_per_step")
 _SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
 
 
@@ -141,8 +141,8 @@ def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | 
     """Find the measurement of a fine-tuning's control; None if no file records it.
 
     The control started from the same model, with the same iterations, views in each step, seed and
-    settings, and kept as many Gaussians, but without truncation. Files that are not records are
-    ignored.
+    settings, and kept as many Gaussians, but without truncation and without a stop of its own.
+    Files that are not records are ignored.
 
     Args:
         data: of the fine-tuning, including "before", "iterations" and "settings".
@@ -164,6 +164,7 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
         mine.get("goal", CONTROL) != CONTROL
         and theirs.get("goal") == CONTROL
         and all(mine[key] == theirs.get(key) for key in _OF_CONTROLS)
+        and theirs.get("stop") in (None, "auto")
         and other["iterations"] == data["iterations"]
         and other.get("keep") == data.get("keep")
         and begun

@@ -18,6 +18,9 @@ Train = Literal["opacity", "appearance", "all"]
 FINETUNE_ITERATIONS = 5000
 QUICK_ITERATIONS = 1000
 ITERATIONS_MAX = 10**9
+USUAL_STOP = 0.01
+"""Share of a pixel's light; docs/results.md has the runs that chose it."""
+
 _DEFAULT_GOAL = Pressure()
 _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
 
@@ -58,7 +61,8 @@ class Settings:
         itself: True where the model's own pictures are the target. The default pressure is
             ``OWN_PRESSURE`` then, and no warm-up comes first, for it would have nothing to learn.
         stop: the share of a pixel's light at which the model is drawn and trained from the first
-            step on that counts, see ``RasterInputs``; None keeps what the model has.
+            step on that counts, see ``RasterInputs``. "auto" is ``USUAL_STOP`` where thresholds
+            learn from photographs and the model has no stop of its own. None adds none.
         rim: how thresholds cut, "hard" or "soft", see ``RasterInputs``; None keeps what the model
             has.
         seed: of the order of views in ``finetune``; hosts have their own.
@@ -75,7 +79,7 @@ class Settings:
     threshold_lr: float = 0.05
     opacity_lr: float = 0.01
     itself: bool = False
-    stop: float | None = None
+    stop: float | Literal["auto"] | None = "auto"
     rim: Rim | None = None
     seed: int = 0
     views_per_step: int = 1
@@ -94,7 +98,7 @@ class Settings:
             ("threshold_lr", rate, "a number, 0 or more"),
             ("opacity_lr", rate, "a number, 0 or more"),
             ("itself", lambda value: isinstance(value, bool), "True or False"),
-            ("stop", _is_stop, "1e-4 to 1, a share of a pixel's light (0.01 is usual), or None"),
+            ("stop", _is_stop, "1e-4 to 1, a share of a pixel's light, 'auto' or None"),
             ("rim", (None, *get_args(Rim)).__contains__, "hard, soft or None"),
             ("seed", lambda value: type(value) is int, "a whole number"),
             ("views_per_step", whole(1, ITERATIONS_MAX), "a whole number, 1 or more"),
@@ -104,7 +108,7 @@ class Settings:
                 where = name.replace("_", " ")
                 raise UsageError(where, repr(value)[:80], expected, "Correct it.")
         for name in ("stop", "rim"):
-            if self.goal.on_area and getattr(self, name) is not None:
+            if self.goal.on_area and getattr(self, name) not in (None, "auto"):
                 raise UsageError(
                     "options",
                     f"a {self.goal.name} model with a {name}",
@@ -132,6 +136,12 @@ class Settings:
         own = _RECIPES[self.train].elasticity if elasticity is None else elasticity
         return self.goal.pressure(own, self.itself)
 
+    def stop_of(self, own: float | None) -> float | None:
+        """The stop at which a model is drawn that came with its own, or with None."""
+        if self.stop != "auto":
+            return own if self.stop is None else self.stop
+        return USUAL_STOP if own is None and self.goal.learns and not self.itself else own
+
     @property
     def warmup(self) -> int:
         """Steps that train without truncation before thresholds open."""
@@ -151,7 +161,7 @@ class Settings:
 
 
 def _is_stop(value: Any) -> bool:
-    return value is None or (type(value) in (int, float) and is_stop(value))
+    return value in (None, "auto") or (type(value) in (int, float) and is_stop(value))
 
 
 def steps_of(views: int, views_per_step: int) -> int:

@@ -25,6 +25,7 @@ from tqdm import tqdm
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.reference import fragments
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.types import Splats, View, one_line
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
 from fragprune_plugins.workbench.figures.extents import (
@@ -69,9 +70,6 @@ REASONS = ("behind what is opaque", "at the rim, beyond 2 sigma", "of faint Gaus
 
 AS_IT_IS = "as it is"
 UNTRUNCATED = "without its thresholds and stop"
-
-STOP = 0.01
-"""The stop that is tried on a model without one."""
 
 _COUNTS = ("fragments_per_pixel", "evaluated_per_pixel")
 
@@ -351,7 +349,7 @@ def _candidates(model: Model, splats: Splats) -> dict[str, Candidate]:
         thresholds = thresholds if own is None else torch.maximum(own, thresholds)
         found[cut.name] = Candidate(model, cut=thresholds)
     if model.stop is None:
-        found[f"a stop at {STOP:g}"] = Candidate(model.with_stop(STOP))
+        found[f"a stop at {USUAL_STOP:g}"] = Candidate(model.with_stop(USUAL_STOP))
     if model.pruned:
         found[UNTRUNCATED] = Candidate(model.untruncated())
     return found

@@ -28,12 +28,31 @@ from fragprune_plugins.learning.pressure import (
 from fragprune_plugins.learning.schedule import (
     FINETUNE_ITERATIONS,
     QUICK_ITERATIONS,
+    USUAL_STOP,
     Settings,
     steps_of,
 )
 from fragprune_plugins.types import Rim
 from fragprune_plugins.workbench.commands.options import Number, together
 from fragprune_plugins.workbench.commands.rules import Alone, apart
+
+
+class _Stop(click.ParamType[float | str | None]):
+    """Type of an option for a stop: a share of light, auto, or off, which is None."""
+
+    name = "share"
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
+        """As --help has it."""
+        return "SHARE|auto|off"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str | None:
+        """The option's value; a usage error if it is none of the three."""
+        words = {"auto": "auto", "off": None}
+        return words[value] if value in words else click.FLOAT.convert(value, param, ctx)
+
 
 _OPTIONS = (
     click.option(
@@ -73,11 +92,12 @@ _OPTIONS = (
     ),
     click.option(
         "--stop",
-        type=float,
-        metavar="SHARE",
-        help="Draw and train with a stop: a pixel draws the fragment that leaves less than this "
-        "share of its light, and ends there. 0.01 is usual. Without it, the model's own; else the "
-        "rule of 3DGS. Works with --control, too.",
+        type=_Stop(),
+        default="auto",
+        show_default=True,
+        help="A pixel draws the fragment that leaves less than this share of its light, and ends "
+        f"there. auto: the model's own; else {USUAL_STOP:g} where thresholds learn from "
+        "photographs. off: add none. A number also works with --control.",
     ),
     click.option(
         "--rim",
@@ -149,7 +169,7 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
             pressure: float | None,
             target_speedup: float | None,
             portable: bool,
-            stop: float | None,
+            stop: Any,
             rim: Rim | None,
             control: bool,
             target_time: float | None = None,
