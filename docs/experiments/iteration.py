@@ -50,6 +50,7 @@ from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench.machine import describe_machine
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph
 
 FALLOFF = 0.06
@@ -160,7 +161,7 @@ def profile(
             scene = replace(make_scene(gaussians), thresholds=store)
             plan = Schedule(settings, warmup=0)
             with watched(now) as clock:
-                loop.finetune(scene, data, settings, schedule=plan, engine="cpu")
+                finetune(scene, data, settings, schedule=plan, engine="cpu")
             kept = clock.steps[SKIPPED:]
             names = (*STAGES, "user", "system", "faults")
             row = {n: 1e3 * statistics.median(step.get(n, 0.0) for step in kept) for n in names}

@@ -189,9 +189,7 @@ class Stage2:
         self._pictures, self._visited = [], (len(self._before), len(self._after))
         self._open |= self.plan.learn
         if self.plan.counted:
-            self.store.ruled(
-                stop=self.settings.stop_of(self.store.stop), rim=self.settings.rim
-            )
+            self.store.ruled(stop=self.settings.stop_of(self.store.stop), rim=self.settings.rim)
         if self.plan.learn and self.settings.goal.learns:
             if not self.store.opened:
                 known = opacities()

@@ -221,6 +221,16 @@ def test_a_control_of_one_view_a_step_is_none_for_two(scene, tmp_path):
     assert run_json(*arguments, "--out", tmp_path / "one.ply")["control"]
 
 
+def test_a_control_with_a_stop_is_none_and_one_without_is_of_every_stop(scene, tmp_path):
+    data, path, _ = scene
+    arguments = ("finetune", path, "--data", data, "--iters", 3)
+    run_json(*arguments, "--out", tmp_path / "stopped.ply", "--control", "--stop", 0.01)
+    assert run_json(*arguments, "--out", tmp_path / "none.ply")["control"] is None
+    run_json(*arguments, "--out", tmp_path / "control.ply", "--control")
+    for stop in ("off", "auto", 0.02):
+        assert run_json(*arguments, "--out", tmp_path / f"{stop}.ply", "--stop", stop)["control"]
+
+
 def test_a_target_and_a_control(scene, tmp_path):
     data, path, _ = scene
     out = tmp_path / "out.ply"

@@ -25,7 +25,7 @@ from fragprune_plugins.learning.pressure import (
     Observation,
     PressureController,
 )
-from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings
+from fragprune_plugins.learning.schedule import USUAL_STOP, JointSchedule, Schedule, Settings
 
 
 @given(st.integers(2, 10_000), st.sampled_from(["opacity", "appearance", "all"]))
@@ -76,6 +76,7 @@ def test_joint_learning_begins_at_its_step_and_leaves_the_opacity_rate_alone(ste
         {"opacity_lr": "fast"},
         {"itself": 1},
         {"stop": 2.0},
+        {"stop": "on"},
         {"seed": "x"},
         {"views_per_step": 0},
         {"goal": Portable(), "train": "opacity"},
@@ -86,6 +87,27 @@ def test_settings_out_of_range_are_usage_errors_that_name_them(wrong):
     with pytest.raises(UsageError) as caught:
         Settings(**wrong)
     assert len(wrong) > 1 or next(iter(wrong)).replace("_", " ") == caught.value.where
+
+
+@pytest.mark.parametrize(
+    ("settings", "of_plain_models", "of_models_with_002"),
+    [
+        ({}, USUAL_STOP, 0.02),
+        ({"goal": Fewer(2)}, USUAL_STOP, 0.02),
+        ({"goal": Control()}, None, 0.02),
+        ({"goal": Portable()}, None, 0.02),
+        ({"itself": True}, None, 0.02),
+        ({"stop": None}, None, 0.02),
+        ({"stop": 0.05}, 0.05, 0.05),
+        ({"stop": 0.05, "goal": Control()}, 0.05, 0.05),
+    ],
+)
+def test_models_that_learn_thresholds_from_photographs_get_the_usual_stop(
+    settings, of_plain_models, of_models_with_002
+):
+    stop_of = Settings(**settings).stop_of
+    assert stop_of(None) == of_plain_models
+    assert stop_of(0.02) == of_models_with_002
 
 
 @pytest.mark.parametrize(

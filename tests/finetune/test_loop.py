@@ -12,7 +12,7 @@ from finetune import tiny
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
 from fragprune_plugins.learning.goals import Control, Faster, Fewer, Pressure
-from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.schedule import USUAL_STOP, Settings
 from fragprune_plugins.learning.targets import calibrate
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
@@ -126,6 +126,14 @@ def test_rules_are_trained_with_from_the_first_step_and_kept(model, dataset, tru
     again = finetune(result, dataset, Settings(iterations=1), engine=engine)
     assert engine.seen[0] == (0.2, "soft", True)
     assert again.model.rules == {"stop": 0.2, "rim": "soft"}
+
+
+@pytest.mark.parametrize("stop", [None, "auto"])
+def test_the_usual_stop_is_drawn_from_the_first_step_and_goes_with_the_model(model, dataset, stop):
+    engine, usual = Noting(), USUAL_STOP if stop else None
+    result = finetune(model, dataset, Settings(iterations=2, stop=stop), engine=engine)
+    assert [seen[0] for seen in engine.seen if seen[2]] == 2 * [usual]
+    assert result.model.stop == usual
 
 
 @pytest.mark.parametrize("target", [1.4, 2.0])
