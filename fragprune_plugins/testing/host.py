@@ -409,7 +409,7 @@ def running(
     loaded = load_plugins(_entries())
     for index, plugin in enumerate(plugins or ()):
         loaded.register(plugin, f"test-{index}")
-    settings, driver = settings or Settings(iterations=20), driver or Host()
+    settings, driver = settings or Settings(iterations=20, stop=None), driver or Host()
     repo = HostRepo(path, driver.package)
     session = Session(adapter, repo, loaded, settings, **({"drop_in": True} | options))
     with imported(path, packages_of(adapter, driver)), cpu_only():
@@ -440,7 +440,7 @@ def alone(*, driver: Host, **options: Any) -> Iterator[Running]:
 
 def joint(settings: Settings | None = None, **options: Any) -> Any:
     """The host under a session that learns from the first step and freezes nothing."""
-    settings = settings or Settings(iterations=20)
+    settings = settings or Settings(iterations=20, stop=None)
     schedule = JointSchedule(settings, 1)
     return running(settings, freeze=False, schedule=schedule, **options)
 

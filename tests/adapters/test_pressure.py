@@ -146,8 +146,9 @@ def test_a_target_is_met_over_all_pictures_of_all_views(adapter):
         rasterize, store = engine.rasterize, host.store(model)
 
         def counting(inputs, thresholds):
-            pair = [rasterize(inputs, each).fragments_per_pixel for each in (None, store.values)]
-            counts.append(torch.stack(pair).detach())
+            plain = rasterize(replace(inputs, stop=None), None)
+            pair = plain, rasterize(inputs, store.values)
+            counts.append(torch.stack([each.fragments_per_pixel for each in pair]).detach())
             return rasterize(inputs, thresholds)
 
         engine.rasterize = counting

@@ -49,7 +49,7 @@ class Never(Schedule):
 
 def host_run(scene, out, wrapped):
     """25 iterations with our drop-in; with the session around them or not."""
-    settings = Settings(iterations=25, train="opacity")
+    settings = Settings(iterations=25, train="opacity", stop=None)
     session = Session(
         Vanilla3DGS(),
         HostRepo(HOST),

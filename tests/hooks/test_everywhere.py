@@ -145,7 +145,7 @@ def dataset(tmp_path_factory):
 
 
 def test_finetune_learns_by_a_plugins_schedule(model, dataset, plug):
-    settings = Settings(iterations=5)
+    settings = Settings(iterations=5, stop=None)
     opened = finetune(
         model, dataset, settings, schedule=Never().fragprune_create_schedule(settings)
     )

@@ -250,7 +250,7 @@ def test_hook_fragprune_saved(tmp_path):
 
 def test_hook_fragprune_finished():
     recorder = Recorder()
-    with joint(Settings(iterations=20, seed=3), plugins=[recorder]) as host:
+    with joint(Settings(iterations=20, stop=None, seed=3), plugins=[recorder]) as host:
         host.step(host.model(), host.camera(), 1)
         summary = host.finish()
     assert recorder.of("finished") == [(summary,)]

@@ -59,7 +59,7 @@ def _no_trace(case: Case) -> None:
     for cut in (True, False):
         fixed = FixedThresholds()
         with joint(
-            Settings(iterations=9, goal=Pressure(0.0)), plugins=[fixed], **case.options()
+            Settings(iterations=9, goal=Pressure(0.0), stop=None), plugins=[fixed], **case.options()
         ) as host:
             model, camera = host.model(24), host.camera()
             open_all(host, model)

@@ -25,7 +25,7 @@ class NeverLearning(Schedule):
 
 def neutral_is_the_host(case: Case) -> str:
     """If nothing learns, parameters and random streams are the host's own, to the bit."""
-    never = NeverLearning(Settings(iterations=20))
+    never = NeverLearning(Settings(iterations=20, stop=None))
     with alone(**case.options()) as host:
         own = _lifetime(host)
     with running(never.settings, schedule=never, freeze=False, **case.options()) as host:
@@ -73,7 +73,7 @@ def _opened_changes_nothing(case: Case) -> tuple[int, int]:
     """Newly opened thresholds change no pixel, and gradients only by rounding."""
     pictures, gradients = [], []
     for opened in (False, True):
-        with joint(Settings(iterations=9, goal=Pressure(0.0)), **case.options()) as host:
+        with joint(Settings(iterations=9, goal=Pressure(0.0), stop=None), **case.options()) as host:
             model, camera = host.model(40), host.camera()
             if opened:
                 host.store(model).open(host.adapter.opacities(model))

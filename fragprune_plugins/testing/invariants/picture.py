@@ -57,7 +57,7 @@ def _drawn_by(
 ) -> tuple[dict[str, Tensor], Tensor]:
     """One engine's picture and gradients under the mask, and drawn fragments (H, W)."""
     fixed = FixedThresholds()
-    settings = Settings(iterations=9, goal=Pressure(0.0))
+    settings = Settings(iterations=9, goal=Pressure(0.0), stop=None)
     with joint(settings, plugins=[fixed], engine=engine, **case.options()) as host:
         model, camera = host.model(24, seed=seed), host.camera(33, 17)
         store = open_all(host, model)
