@@ -255,7 +255,9 @@ def test_a_target_time_is_met_where_frames_take_what_is_measured(
     engine, times = create_engine("cpu"), []
     for each in (model, result.model):
         drawn = [
-            engine.rasterize(RasterInputs(shot.view, each.splats(), planes=()), each.falloff)
+            engine.rasterize(
+                RasterInputs(shot.view, each.splats(), planes=(), **each.rules), each.falloff
+            )
             for shot in dataset.train
         ]
         times.append(sum(map(ms_of, drawn)))
