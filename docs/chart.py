@@ -37,7 +37,7 @@ def main() -> None:
     axes.set_yticks(range(len(held)), [name for name, *_ in held])
     axes.invert_yaxis()
     axes.axvline(1, color="0.4", linewidth=1)
-    axes.set_xlim(0, 3.1)
+    axes.set_xlim(0, 4)
     axes.set_title("Beside the bars: PSNR against the same training without pruning", loc="left")
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles[:2], labels[:2], frameon=False, loc="outside lower center", ncols=2)
