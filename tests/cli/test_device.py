@@ -15,6 +15,7 @@ from finetune import tiny
 
 from fragprune_plugins import engines
 from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -88,9 +89,7 @@ def test_what_was_learned_there_is_saved_here(scene, engine):
 def test_a_run_is_measured_there(scene, engine):
     data, path, _, _ = scene
     photographs = {
-        "folder": str(data),
-        "resolution": 1,
-        "white_background": False,
+        **Photographs(data).as_dict(),
         "models": [str(path)] * 2,
         "drawing": {},
     }

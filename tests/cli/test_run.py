@@ -6,7 +6,6 @@ import json
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,8 +15,8 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 from PIL import Image
 
+from fragprune_plugins import load
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
@@ -74,8 +73,8 @@ def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_pa
 
 def test_a_host_trains_with_the_usual_stop_and_its_model_keeps_it(trained):
     _, found, _ = trained
-    assert read_ply(Path(found["model_before"])).stop is None
-    assert read_ply(Path(found["model_after"])).stop == USUAL_STOP
+    assert load(found["model_before"]).stop is None
+    assert load(found["model_after"]).stop == USUAL_STOP
 
 
 def test_the_host_and_the_engine_take_as_many_threads_as_they_are_given(

@@ -143,7 +143,7 @@ def test_a_place_that_cannot_be_written_is_stated_and_the_old_sidecar_stays(
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("safetensors.torch.save_file", full)
+    monkeypatch.setattr(sidecar, "save_file", full)
     with pytest.raises(OutputError, match="No space left"):
         sidecar.save(model, ThresholdStore(6))
     assert path.read_bytes() == before

@@ -75,6 +75,7 @@ FIGURES = {
     "lpips": None,
     "fragments_per_pixel": 20.0,
     "evaluated_per_pixel": 40.0,
+    "area_per_pixel": 60.0,
     "gaussians": 3,
     "frame_ms": 1.5,
     "frame_ms_se": 0.1,
