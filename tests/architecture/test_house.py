@@ -33,7 +33,7 @@ BOUNDS = {
     "members of an adapter": (24, 24),
     "members of a dialect": (7, 7),
     "members with one user": (4, 5),
-    "options": (51, 45),
+    "options": (45, 45),
 }
 
 

@@ -119,8 +119,9 @@ def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(model
     report = run_json("audit", tmp_path / "run", *out)
     assert (report["cameras"]["kind"], report["model"]) == ("given", str(path))
     assert report["maps"]["views"][0]["width"] == 1100  # of 3300: thrice less, not to be too large
-    asked = run_json("audit", path, "--orbit", "--views", 1, "--resolution", 16, *out)
-    assert asked["cameras"]["kind"] == "orbit"
+    for side in ("orbit", "inside"):
+        asked = run_json("audit", path, f"--{side}", "--views", 1, "--resolution", 16, *out)
+        assert asked["cameras"]["kind"] == side
 
 
 def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
@@ -137,10 +138,11 @@ def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
     assert plain["fragments_per_pixel"] == report["cuts"][-1]["fragments_per_pixel"]
 
 
-def test_two_sources_of_cameras_are_refused(model, tmp_path):
-    result = run("audit", model, "--data", tmp_path, "--orbit", "--out", tmp_path / "out")
+@pytest.mark.parametrize("side", ["--orbit", "--inside"])
+def test_two_sources_of_cameras_are_refused(model, tmp_path, side):
+    result = run("audit", model, "--data", tmp_path, side, "--out", tmp_path / "out")
     assert result.exit_code == 2
-    assert "--data with --orbit" in result.stderr
+    assert f"--data with {side}" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

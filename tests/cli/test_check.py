@@ -155,11 +155,12 @@ def test_unknown_folders_and_adapters_are_stated_failures(host, tmp_path):
         assert found in json.loads(result.stdout)["error"]["found"]
 
 
-def test_a_folder_of_checkouts_is_a_table(tmp_path):
+def test_several_checkouts_are_a_table(tmp_path):
     skeleton(tmp_path / "a")
     skeleton(tmp_path / "b", groups=("xyz", "color"))
     (tmp_path / "empty").mkdir()
-    result = run("check", tmp_path, "--all")
+    hosts = [tmp_path / name for name in ("a", "b", "empty")]
+    result = run("check", *hosts)
     rows = [line.split(" | ") for line in result.stdout.splitlines() if line.startswith("| ")][1:]
     assert [(row[0], row[1]) for row in rows] == [
         ("| a", "fits"),
@@ -167,7 +168,7 @@ def test_a_folder_of_checkouts_is_a_table(tmp_path):
         ("| empty", "never"),
     ]
     assert "groups beyond: color" in rows[1][-1]
-    counts = json.loads(run("check", tmp_path, "--all", "--json").stdout)["counts"]
+    counts = json.loads(run("check", *hosts, "--json").stdout)["counts"]
     assert (counts["fits"], counts["never"]) == (1, 2)
 
 

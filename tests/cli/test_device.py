@@ -52,7 +52,7 @@ COMMANDS = {
         *(path, "--data", data, "--out", out / "small.ply", "--iters", 20),
         *("--target-speedup", 1.3),
     ),
-    "render": lambda data, path, cameras, out: (path, "--data", data, "--out", out, "--heatmap"),
+    "render": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
     "render cameras": lambda data, path, cameras, out: (path, "--cameras", cameras, "--out", out),
     "profile": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
     "compare": lambda data, path, cameras, out: (path, path, "--data", data, "--out", out),

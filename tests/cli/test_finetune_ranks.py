@@ -232,14 +232,25 @@ def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):
     assert "Start them with torchrun" in result.stderr
 
 
+OFTEN = """
+from fragprune_plugins.workbench.commands import main
+from fragprune_plugins.workbench.finetune import resuming
+
+resuming.EVERY = 0.001
+main()
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [2, 4])
 def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(scene, tmp_path, size):
     """The same, with the real launcher, whose exit code is 1 then."""
     out, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
-    launcher += ["--nproc_per_node", str(size), "-m", "fragprune_plugins"]
-    line = [*launcher, *map(str, words(scene, out, "--iters", 300, "--checkpoint-every", 0.001))]
+    script = tmp_path / "often.py"
+    script.write_text(OFTEN)
+    launcher += ["--nproc_per_node", str(size), str(script)]
+    line = [*launcher, *map(str, words(scene, out, "--iters", 300))]
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run_:
         children = Path(f"/proc/{run_.pid}/task/{run_.pid}/children")
         while not out.with_suffix(".fragprune-unfinished").exists():

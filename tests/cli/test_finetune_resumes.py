@@ -37,7 +37,7 @@ def killed(step, *arguments):
                 os.kill(os.getpid(), signal.SIGKILL)
             return begin(stage, opacities)
 
-        loop.Stage2.begin = dying
+        loop.Stage2.begin, resuming.EVERY = dying, 0.001
         with contextlib.suppress(BaseException):
             run(*arguments)
         os._exit(0)
@@ -47,7 +47,7 @@ def killed(step, *arguments):
 def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path):
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
     assert run(*words(scene, whole)).exit_code == 0
-    arguments = words(scene, out, "--checkpoint-every", 0.001)
+    arguments = words(scene, out)
     killed(7, *arguments)
     killed(19, *arguments)
     assert not out.exists()
@@ -121,7 +121,7 @@ def test_what_is_not_the_same_is_not_finished(scene, tmp_path, change):
 
 def test_another_command_is_refused_while_one_is_unfinished(scene, tmp_path):
     out = tmp_path / "out.ply"
-    killed(9, *words(scene, out, "--checkpoint-every", 0.001))
+    killed(9, *words(scene, out))
     other = words(scene, out, "--pressure", 1e-3)
     refused = run(*other)
     assert refused.exit_code == 1

@@ -51,7 +51,7 @@ def test_every_rule_names_options_that_a_command_has():
         word
         for each in commands
         for param in each.params
-        for word in (*param.opts, param.human_readable_name)
+        for word in (*param.opts, *param.secondary_opts, param.human_readable_name)
     }
     for command in commands:
         for rule in getattr(command, "rules", ()):

@@ -118,6 +118,8 @@ def fragprune(*words: object, path: list[Path], cwd: Path) -> str:
 def model(tmp_path: Path) -> Path:
     path = tmp_path / "model.ply"
     write_ply(path, tiny.random_model())
+    cameras = tiny.transforms(["a"], tiny.cameras()[:1]) | {"w": 20, "h": 12}
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
     return path
 
 
@@ -141,8 +143,7 @@ def test_one_package_adds_a_command_a_format_an_engine_and_a_log(tmp_path, model
     assert "Count the Gaussians" in call("--help")
     call("export model.ply --out model.mine")
     assert json.loads(call("count model.mine --json")) == {"gaussians": 60}
-    film = "--orbit --seconds 0.1 --resolution 16"
-    drawn = call(f"render model.mine --engine mine {film} --out grey --json")
+    drawn = call("render model.mine --engine mine --cameras cameras.json --out grey --json")
     assert json.loads(drawn)["engine"] == "mine"
     short = "--iters 3 --resolution 16 --train opacity --log lines:steps.txt"
     call(f"finetune model.mine --self --out p.mine {short}")
@@ -172,8 +173,8 @@ def test_an_adapter_and_a_slice_go_with_their_folders(tmp_path, model):
     adapters = json.loads(fragprune("adapters", "--json", path=path, cwd=copy))
     assert adapters["findings"] == []
     assert "mcmc" not in [each["name"] for each in adapters["adapters"]]
-    out = f"--orbit --seconds 0.1 --resolution 16 --engine reference --out {tmp_path}/pictures"
-    fragprune("render", model, *out.split(), path=path, cwd=copy)
+    words = ("--cameras", tmp_path / "cameras.json", "--engine", "reference", "--out", "pictures")
+    fragprune("render", model, *words, path=path, cwd=copy)
     linted = subprocess.run(
         [str(Path(sys.executable).with_name("lint-imports"))],
         capture_output=True,

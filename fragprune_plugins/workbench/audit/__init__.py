@@ -21,8 +21,9 @@ from fragprune_plugins.workbench.commands.options import (
 @click.argument("model", type=MODEL)
 @click.option("--cameras", type=FILE, help=f"{CAMERAS_HELP}, if there is one.")
 @click.option("--data", type=FILE, help="Scene folder whose cameras look; no image is needed.")
-@click.option("--orbit", "side", flag_value="orbit", help="Generate cameras all around it.")
-@click.option("--inside", "side", flag_value="inside", help="Generate cameras inside of it.")
+@click.option(
+    "--orbit/--inside", default=None, help="Generate cameras all around it, or inside of it."
+)
 @click.option(
     "--views",
     type=click.IntRange(1, 1000),

@@ -31,7 +31,7 @@ def audit(
     model: Path,
     cameras: Path | None,
     data: Path | None,
-    side: Side | None,
+    orbit: bool | None,
     views: int,
     out: Path | None,
     resolution: int | None,
@@ -44,10 +44,10 @@ def audit(
     loaded = load(model, truncation=not no_truncation, device=device)
     if out is not None:
         writable_folder(out)
-    if cameras is None and data is None and side is None:
+    if cameras is None and data is None and orbit is None:
         cameras = cameras_of(model)
     if cameras is None and data is None:
-        side = side or "auto"
+        side: Side = "auto" if orbit is None else "orbit" if orbit else "inside"
         placed = place(loaded, views, rasterizer, side=side, divide=resolution or 1)
     else:
         placed = _given(cameras, data, views, resolution, white_background)

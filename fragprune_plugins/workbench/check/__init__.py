@@ -11,11 +11,10 @@ from fragprune_plugins.workbench.commands.options import FILE
 
 
 @click.command("check", cls=Command)
-@click.argument("host", type=FILE)
+@click.argument("hosts", metavar="HOST...", type=FILE, nargs=-1, required=True)
 @click.option(
     "--adapter", help="Check only this adapter, and show where every seam is and what is wrong."
 )
-@click.option("--all", "every", is_flag=True, help="HOST is a folder of checkouts: a row for each.")
 def command(**options: Any) -> Report:
     """Read HOST, a training repository, and say what fragprune can do with it.
 
@@ -25,14 +24,14 @@ def command(**options: Any) -> Report:
 
     Nothing is imported or run, and no GPU is needed. The output lists packages that the host
     imports and that are not installed. --adapter shows for every seam the file and line where it
-    was found, changed or expected, and lists what does not work. --all prints a table of all
-    checkouts in a folder. The exit code is 0 if exactly one adapter fits.
+    was found, changed or expected, and lists what does not work. Several HOSTs give a table. The
+    exit code is 0 if exactly one adapter fits.
 
     \b
     Examples:
       fragprune check ~/code/gaussian-splatting
       fragprune check ~/code/my-fork --adapter vanilla-3dgs     (why does it not fit?)
       fragprune check gsplat                                    (an installed package)
-      fragprune check ~/forks --all                             (a table)
+      fragprune check ~/forks/*                                 (a table)
     """
     return work_of(__name__, **options)

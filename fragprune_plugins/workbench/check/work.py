@@ -20,16 +20,16 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
 
 
-def check(*, host: Path, adapter: str | None, every: bool) -> Report:
+def check(*, hosts: tuple[Path, ...], adapter: str | None) -> Report:
     """Do what ``fragprune check`` promises; its options are the arguments."""
-
-    if not host.is_dir() and HostRepo.installed(str(host)) is None:
-        raise UnknownHostError(
-            str(host),
-            "neither a folder nor an installed package",
-            "a host's checkout, or the import name of an installed host",
-            "Name the folder of train.py.",
-        )
+    for host in hosts:
+        if not host.is_dir() and HostRepo.installed(str(host)) is None:
+            raise UnknownHostError(
+                str(host),
+                "neither a folder nor an installed package",
+                "a host's checkout, or the import name of an installed host",
+                "Name the folder of train.py.",
+            )
     adapters = load_plugins().adapters
     if adapter is not None:
         adapters = [a for a in adapters if a.name == adapter.replace("_", "-")]
@@ -37,8 +37,11 @@ def check(*, host: Path, adapter: str | None, every: bool) -> Report:
             raise UnknownHostError(
                 "--adapter", repr(adapter), "an installed adapter", "Run fragprune adapters."
             )
-    if every:
-        return _table(host, adapters)
+    return _table(hosts, adapters) if len(hosts) > 1 else _single(hosts[0], adapters, adapter)
+
+
+def _single(host: Path, adapters: list[HostAdapter], adapter: str | None) -> Report:
+    """Everything about one checkout; the exit code is 0 if one adapter fits."""
     repo = _repository(host, adapters, adapter)
     tried = attempt(repo, adapters)
     closer = closest([each.adapter for each in tried if each.match.fits], adapters)
@@ -76,11 +79,10 @@ def check(*, host: Path, adapter: str | None, every: bool) -> Report:
     return Report(data, "\n".join(lines), exit_code=0 if verdict else 1)
 
 
-def _table(folder: Path, adapters: list[HostAdapter]) -> Report:
-    """A row for each checkout in a folder; the exit code is 0 if there are any."""
-
+def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter]) -> Report:
+    """A row for each checkout."""
     rows = []
-    for each in sorted(path for path in folder.iterdir() if path.is_dir()):
+    for each in hosts:
         repo = _repository(each, adapters, None)
         judged = judge(repo, attempt(repo, adapters), adapters)
         rows.append({"host": each.name, "commit": repo.commit, **judged.as_dict()})
@@ -93,7 +95,7 @@ def _table(folder: Path, adapters: list[HostAdapter]) -> Report:
         lines.append(f"| {' | '.join(cell.replace('|', '/') or '-' for cell in cells)} |")
     counts = {kind: sum(row["verdict"] == kind for row in rows) for kind in _KINDS}
     lines += ["", ", ".join(f"{kind}: {number}" for kind, number in counts.items())]
-    return Report({"hosts": rows, "counts": counts}, "\n".join(lines), exit_code=0 if rows else 1)
+    return Report({"hosts": rows, "counts": counts}, "\n".join(lines))
 
 
 _KINDS = ("fits", "several", "inside", "finetune", "never")

@@ -33,7 +33,7 @@ from fragprune_plugins.learning.schedule import (
     steps_of,
 )
 from fragprune_plugins.types import Rim
-from fragprune_plugins.workbench.commands.options import Number, together
+from fragprune_plugins.workbench.commands.options import Number
 from fragprune_plugins.workbench.commands.rules import Alone, apart
 
 
@@ -241,26 +241,6 @@ def _goal(
     if control:
         return Control()
     return Portable(pressure) if portable else Pressure(pressure)
-
-
-def resuming_options(kept: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The options of a stage 2 that goes on after a kill.
-
-    Args:
-        kept: the help of ``--checkpoint-every``: where an unfinished stage 2 is kept.
-    """
-    return together(
-        click.option(
-            "--checkpoint-every",
-            "every",
-            type=Number(min=0),
-            default=300.0,
-            show_default=True,
-            metavar="SECONDS",
-            help=kept,
-        ),
-        again_option("Begin stage 2 anew, though it is finished or there is a checkpoint."),
-    )
 
 
 def again_option(text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

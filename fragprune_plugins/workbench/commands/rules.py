@@ -71,12 +71,12 @@ def is_given(context: click.Context, name: str) -> bool:
     """Whether the user gave an option or argument, on the command line or in a file."""
     word, _, wanted = name.partition(" ")
     for param in context.command.params:
-        if word not in (*param.opts, param.human_readable_name):
+        if word not in (*param.opts, *param.secondary_opts, param.human_readable_name):
             continue
         value = context.params.get(str(param.name))
         if wanted:
             return fnmatchcase(str(value).lower(), wanted)
         if isinstance(param, click.Option) and param.is_flag:
-            return value is True or (value is not None and value == param.flag_value)
+            return value is (word not in param.secondary_opts)
         return context.get_parameter_source(str(param.name)) is not ParameterSource.DEFAULT
     return False

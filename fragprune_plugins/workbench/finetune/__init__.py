@@ -15,8 +15,8 @@ from fragprune_plugins.workbench.commands.command import (
 from fragprune_plugins.workbench.commands.config import config_option
 from fragprune_plugins.workbench.commands.learning import (
     LEARNING_APART,
+    again_option,
     learning_options,
-    resuming_options,
 )
 from fragprune_plugins.workbench.commands.logs import log_option
 from fragprune_plugins.workbench.commands.options import (
@@ -119,10 +119,7 @@ RULES = (
     is_flag=True,
     help="Leave out Gaussians that reach no pixel of any training or held-out view.",
 )
-@resuming_options(
-    "Keep the unfinished fine-tuning in OUT.fragprune-unfinished; 0 keeps it at Ctrl-C and "
-    "SIGTERM only.",
-)
+@again_option("Begin anew, though OUT is finished or there is a checkpoint.")
 @engine_options()
 @first_process_prints()
 def command(**options: Any) -> Report | None:

@@ -56,7 +56,6 @@ class Asked:
     shard: bool
     no_truncation: bool
     drop: bool
-    every: float
     again: bool
     engine: EngineOptions
 
@@ -131,7 +130,7 @@ def _open(asked: Asked) -> _Opened:
     else:
         assert photographs is not None
         dataset = load_photographs(photographs)
-    checkpoints = Checkpoints(resuming.path_beside(asked.out), asked.every or None, tell=_say)
+    checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
     configuration |= {"drop_invisible": asked.drop, "keep": asked.keep}
     configuration |= {"sharded": True} if asked.shard else {}

@@ -17,7 +17,6 @@ from fragprune_plugins.workbench.commands.options import (
     CAMERAS_HELP,
     FILE,
     MODEL,
-    Number,
     engine_options,
     scene_options,
     shard_option,
@@ -46,7 +45,7 @@ RULES = (
     CAMERAS_APART,
     Needs("--images", ("--data",), _PHOTOGRAPHS),
     Needs("--views", ("--data",), _PHOTOGRAPHS),
-    *apart("--out *.mp4", "--heatmap", "--shard-gaussians", expected="a folder for --out"),
+    *apart("--out *.mp4", "--shard-gaussians", expected="a folder for --out"),
 )
 
 
@@ -58,7 +57,7 @@ RULES = (
     type=FILE,
     required=True,
     help="Folder for the PNG files; or a film in .mp4, whose camera goes through the cameras in "
-    "their order.",
+    "their order, in 8 seconds or a frame for each.",
 )
 @click.option("--orbit", is_flag=True, help="Go around MODEL instead, once; it suits an object.")
 @click.option(
@@ -69,14 +68,6 @@ RULES = (
     callback=_direction,
     help="With --orbit: up direction of the scene.",
 )
-@click.option(
-    "--seconds",
-    type=Number(min=0.1, max=3600),
-    default=8.0,
-    show_default=True,
-    help="Length of a film or of --orbit, at 30 frames a second.",
-)
-@click.option("--heatmap", is_flag=True, help="Also draw fragments per pixel, on one shared scale.")
 @views_option
 @scene_options("Scene folder whose cameras draw, instead of --cameras.")
 @truncation_option
@@ -91,10 +82,10 @@ def command(**options: Any) -> Report | None:
 
     \b
     Examples:
-      fragprune render pruned.ply --data scene --out renders --heatmap
+      fragprune render pruned.ply --data scene --out renders
       fragprune render pruned.ply --cameras out/cameras.json --out renders
       fragprune render out --out renders                (the output folder of a training)
       fragprune render statue.ply --orbit --out statue.mp4
-      fragprune render pruned.ply --cameras camera_path.json --out flight.mp4 --seconds 20
+      fragprune render pruned.ply --cameras camera_path.json --out flight.mp4
     """
     return work_of(__name__, **options)

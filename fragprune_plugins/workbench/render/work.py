@@ -32,7 +32,7 @@ from fragprune_plugins.workbench.commands.options import (
 )
 from fragprune_plugins.workbench.distributed.processes import part_of
 from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
-from fragprune_plugins.workbench.figures.pictures import save_heatmap, save_image, stems
+from fragprune_plugins.workbench.figures.pictures import save_image, stems
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.ranks import Ranks, joined
@@ -44,6 +44,9 @@ from fragprune_plugins.workbench.scenes.generated import Named
 FPS = 30
 """Frames a second of a film."""
 
+FRAMES = 8 * FPS
+"""Frames of an orbit, and of a film at least."""
+
 _NO_FOLDER = (".gif", ".webm", ".mov", ".avi", ".mkv", ".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -54,8 +57,6 @@ def render(
     out: Path,
     orbit: bool,
     up: tuple[float, float, float],
-    seconds: float,
-    heatmap: bool,
     views: str,
     scene: SceneOptions,
     no_truncation: bool,
@@ -71,16 +72,15 @@ def render(
     rasterizer, device = open_engine(engine)
     writable_folder(out.parent if film else out)
     whole = load(model, truncation=not no_truncation, device="cpu" if shard else device)
-    frames = max(1, round(seconds * FPS))
     if scene.data is not None:
         dataset = load_photographs(photographs_for(model, scene))
         named = [(shot.name, shot.view) for shot in chosen(dataset, views)]
     else:
-        named = _views(whole, cameras, scene, frames, up)
+        named = _views(whole, cameras, scene, up)
     if film and not orbit:
-        named = filming.along(named, frames)
+        named = filming.along(named, max(FRAMES, len(named)))
     with joined(device) if shard else nullcontext(Ranks()) as ranks:
-        drawing = _Drawing(whole, named, rasterizer, device, ranks, shard, heatmap)
+        drawing = _Drawing(whole, named, rasterizer, device, ranks, shard)
         files = [out] if film else drawing.save(out)
         if film:
             filming.write_mp4(out, drawing.film(), FPS)
@@ -142,7 +142,6 @@ def _views(
     whole: Model,
     cameras: Path | None,
     scene: SceneOptions,
-    frames: int,
     up: tuple[float, float, float],
 ) -> Named:
     """The named views of a file, or without one those of an orbit."""
@@ -150,7 +149,7 @@ def _views(
         named = load_cameras(cameras, white_background=scene.white_background)
     else:
         background = torch.full((3,), float(scene.white_background))
-        orbit = filming.orbit(whole, frames, up)
+        orbit = filming.orbit(whole, FRAMES, up)
         named = [(name, replace(view, background=background)) for name, view in orbit]
     return divided(named, scene.resolution)
 
@@ -170,10 +169,9 @@ class _Drawing:
         device: torch.device,
         ranks: Ranks,
         shard: bool,
-        heatmap: bool,
     ) -> None:
         self.fragments: dict[int, float] = {}
-        self._named, self._device, self._ranks, self._heatmap = named, device, ranks, heatmap
+        self._named, self._device, self._ranks = named, device, ranks
         self._model = part_of(whole, ranks, device) if shard else whole
         self._splats = self._model.splats()
         self._engine = ShardedEngine(engine, ranks) if shard else engine
@@ -182,7 +180,7 @@ class _Drawing:
     def draw(self, index: int) -> RasterOutputs:
         view = self._named[index][1].to(self._device)
         rules = self._model.rules
-        inputs = RasterInputs(view, self._splats, counts=self._heatmap, planes=(), **rules)
+        inputs = RasterInputs(view, self._splats, counts=False, planes=(), **rules)
         thresholds = thresholds_for(inputs, self._model.thresholds)
         outputs = self._engine.rasterize(inputs, thresholds)
         self.fragments[index] = float(outputs.fragments_per_pixel)
@@ -193,24 +191,11 @@ class _Drawing:
         return (self.draw(index).image for index in bar)
 
     def save(self, out: Path) -> list[Path]:
-        """Write a picture of each view, and its map of fragments if asked for; all their paths."""
+        """Write a picture of each view; all their paths."""
         files = [out / f"{stem}.png" for stem in stems([name for name, _ in self._named])]
-        maps: dict[int, Tensor] = {}
         last, turns = len(files) - 1, -(-len(files) // self._ranks.size)
         for index in self._ranks.share(range(turns * self._ranks.size)):
             outputs = self.draw(min(index, last))  # shards draw together, as often as each other
-            if index > last:
-                continue
-            save_image(files[index], outputs.image)
-            if outputs.fragments is not None:
-                maps[index] = outputs.fragments.cpu()
-        most = max((float(counts.max()) for counts in maps.values()), default=0.0)
-        limit = max(self._ranks.gather(most))
-        for index, counts in maps.items():
-            save_heatmap(_map_of(files[index]), counts, limit)
-        return [*files, *map(_map_of, files)] if self._heatmap else files
-
-
-def _map_of(picture: Path) -> Path:
-    """Where a picture's map of fragments lies."""
-    return picture.with_name(picture.stem + "_fragments.png")
+            if index <= last:
+                save_image(files[index], outputs.image)
+        return files

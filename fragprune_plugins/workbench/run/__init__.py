@@ -52,12 +52,6 @@ RULES = (
     device="Device of the host; cpu runs a CUDA-only host without a GPU.",
 )
 @click.option(
-    "--evaluate/--no-evaluate",
-    default=True,
-    show_default=True,
-    help="Compare before and after on the views that the host holds out (--eval).",
-)
-@click.option(
     "--trust",
     is_flag=True,
     help="Go on where the host's own rasterizer draws otherwise than ours. What nobody proved is "

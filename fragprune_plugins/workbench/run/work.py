@@ -41,7 +41,6 @@ def run(
     from_iter: int | None,
     settings: Settings,
     engine: EngineOptions,
-    evaluate: bool,
     again: bool,
     trust: bool,
 ) -> Report:
@@ -66,7 +65,7 @@ def run(
             summary = launch.run(list(host_command), options)
         photographs = photographs_of(summary)
         not_compared: FragpruneError | None = summary.not_compared
-        if photographs and evaluate:
+        if photographs:
             try:
                 with current_gpu(engine.device):
                     *first, after = measure_models(photographs, engine)
