@@ -8,6 +8,7 @@ are made if their kernel was read; those that nobody reads raise if they are rea
 from __future__ import annotations
 
 import logging
+from argparse import ArgumentParser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -35,6 +36,7 @@ from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
     HostRepo,
+    NotComparedError,
     RasterInputs,
     RasterOutputs,
     Role,
@@ -126,6 +128,7 @@ class ForkDialect(GraphdecoDialect):
         blended: by package, the argument with further channels.
         off: settings and arguments that must be None, False or empty.
         scaled: settings that change the gradient on the screen, which ours ignores.
+        screens: arguments besides means2D that get a gradient on the screen, which ours do not.
         own_distances: its simple_knn returns more than that of 3DGS, and has no stand-in.
     """
 
@@ -134,6 +137,7 @@ class ForkDialect(GraphdecoDialect):
     blended: Mapping[str, str] = field(default_factory=dict)
     off: frozenset[str] = frozenset()
     scaled: frozenset[str] = frozenset()
+    screens: frozenset[str] = frozenset()
     own_distances: bool = False
 
     def unpack(self, call: HostCall) -> RasterInputs:
@@ -154,6 +158,11 @@ class ForkDialect(GraphdecoDialect):
             tell_once(
                 f"{', '.join(sorted(self.scaled))}: the gradient on the screen is not changed by "
                 "it here, so other Gaussians are densified than by the host's own rasterizer"
+            )
+        if not call.still and self.screens:
+            tell_once(
+                f"{', '.join(sorted(self.screens))}: gets no gradient here, and a densification "
+                "that reads it fails; only the host's own rasterizer computes it"
             )
         roles = [each.role for each in self._values(call)]
         planes = tuple(name for name in ("invdepth", "alpha") if name in roles)
@@ -274,7 +283,8 @@ class ForkAdapter(GraphdecoAdapter):
         states="any whose model is plain 3DGS",
         limits=(
             "What reading cannot prove is named by fragprune check.",
-            "Stage 2 starts from a checkpoint, not from a PLY.",
+            "Stage 2 starts from a checkpoint, not from a PLY. Where a script cannot resume its "
+            "own training, stage 2 follows in the same run.",
             "New Gaussians have neutral thresholds, not their parents'.",
         ),
     )
@@ -289,9 +299,9 @@ class ForkAdapter(GraphdecoAdapter):
         from fragprune_plugins.adapting import read_plain
 
         plain = read_plain(repo)
-        if not plain:
-            why, plainly = plain.reasons[0], "a plain 3DGS model"
-            return [Finding("error", "not-plain", MODEL, why, plainly)]
+        others = [each for each in plain.reasons if each not in plain.moved]
+        if others or not plain.model:
+            return [Finding("error", "not-plain", MODEL, others[0], "a plain 3DGS model")]
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
         return [
@@ -323,14 +333,13 @@ class ForkAdapter(GraphdecoAdapter):
         return (
             Seam(Role.SCENE, "scene", "Scene.__init__"),
             *(of(Role.ATTACH, name, optimizers) for name in setups),
-            of(Role.STEP, "update_learning_rate"),
+            *(of(Role.STEP, name) for name in ("update_learning_rate",) if fork.defines(name)),
             of(Role.KEEP, "_prune_optimizer"),
             of(Role.APPEND, "cat_tensors_to_optimizer"),
             *(of(Role.STILL, name) for name in fork.still),
             of(Role.SAVE, "save_ply"),
             of(Role.LOAD, "load_ply"),
-            of(Role.CAPTURE, "capture"),
-            of(Role.RESTORE, "restore"),
+            *(() if fork.one_run else (of(Role.CAPTURE, "capture"), of(Role.RESTORE, "restore"))),
             Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
             *(
                 Seam(Role.VIEW, draw.module, draw.function, (draw.camera, draw.model))
@@ -361,15 +370,29 @@ class ForkAdapter(GraphdecoAdapter):
             blended=fork.blended,
             off=fork.off,
             scaled=fork.scaled,
+            screens=fork.screens,
             own_distances=not plain_distances(repo),
         )
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """The flags of 3DGS, for the training scripts that were read, the served ones first."""
+        """The flags of 3DGS, for the training scripts that were read, the served ones first.
+
+        Where one of these cannot resume its own training, stage 2 follows in the same run.
+        """
         fork = read_fork(repo)
-        return replace(
-            super().command_line(repo), scripts=(*fork.scripts, *fork.unserved) or self.scripts
-        )
+        scripts = (*fork.scripts, *fork.unserved) or self.scripts
+        line = replace(super().command_line(repo), scripts=scripts)
+        if not fork.one_run:
+            return line
+        return replace(line, one_run=True, save_checkpoints="--save_iterations", resume=())
+
+    def lengthened(self, arguments: list[str], first: int, last: int) -> list[str]:
+        """The same for ``last`` iterations, with a model saved at ``first`` too."""
+        parser = ArgumentParser(add_help=False, allow_abbrev=False)
+        parser.add_argument("--save_iterations", type=int, nargs="+", default=[])
+        stated = parser.parse_known_args(arguments)[0].save_iterations
+        saved = map(str, sorted({first, last, *stated}))
+        return [*arguments, "--iterations", str(last), "--save_iterations", *saved]
 
     def _expect_served(self, repo: HostRepo, script: Path) -> None:
         fork = read_fork(repo)
@@ -422,6 +445,24 @@ class ForkAdapter(GraphdecoAdapter):
                 "a training without them",
                 "Leave it out, or prune its PLY: fragprune finetune.",
             )
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
+        """Vanilla's rules, where a PLY alone makes the picture.
+
+        Raises:
+            NotComparedError: a network moves the Gaussians, or colours them.
+        """
+        from fragprune_plugins.adapting import read_plain
+
+        by = [f"--{name}" for name in read_fork(repo).colours if f"--{name}" in arguments]
+        for why in (*by, *sorted(read_plain(repo).moved)):
+            raise NotComparedError(
+                "the host's command",
+                f"a PLY is not all that it draws: {why}",
+                "pictures of a PLY alone",
+                "Draw and measure with the host's render.py and metrics.py.",
+            )
+        return super().drawing(repo, arguments)
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """As 3DGS tells, if scripts change the model only until then; else unknown."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
@@ -25,17 +25,16 @@ PRIMITIVES = {"_prune_optimizer", "cat_tensors_to_optimizer", "replace_tensor_to
 """Methods that change rows or values of parameters inside the optimizer."""
 CHECKPOINT = r"(?:chkpnt|ckpt|checkpoint)[_-]?"
 """How names of checkpoints begin, before the iteration."""
-_NEVER = {
-    r"\brmtree\(\w+\.model_path": "it removes its output folder",
-    r"\bProcess\((.*\W)?target=|\bmp\.spawn\(": "it trains in processes of its own",
-}
-"""What a script must not do."""
+_PROCESSES = re.compile(r"\bProcess\((.*\W)?target=|\bmp\.spawn\(")
+_EMPTIES = re.compile(r"\brmtree\(\w+\.model_path")
+"""A script that removes its output folder, and with it the checkpoint to resume."""
 STATISTICS = {"oneupSHdegree", "add_densification_stats"}
 _MAKES = re.compile(r"__init__|capture\w*|(restore|create|load|init|set)_?\w*|\w*setup\w*")
 """Methods that make a model, before it is trained."""
 _OF_MODELS = re.compile(r"^scene\.\w*model\w*$")
 _MODELS = re.compile(r"\b(gaussians?|pc|model)$")
 """What scripts call a model."""
+_OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
 _CAMERA = re.compile(r"view|cam")
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
@@ -45,6 +44,8 @@ NEUTRAL = {"antialiasing", "confidence"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
 SERVED = {"dc"}
 """Further arguments that the engines know."""
+_SCREEN = re.compile(r"means2D_\w+")
+"""Further tensors that get a gradient on the screen, by which Gaussians are densified."""
 
 _PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|opac)")
 """Names of values that a proof can tell, if they are what they are called."""
@@ -86,6 +87,9 @@ class Fork:
         options: off by default, under which scripts draw by other functions.
         off: settings and arguments of the rasterizer that are None or False by default.
         scaled: settings that change the gradient on the screen alone, in its backward pass.
+        one_run: why a script cannot resume its own training; "" if all of them can.
+        screens: arguments besides means2D that get a gradient on the screen.
+        colours: options, off by default, under which a network makes the colours.
     """
 
     repo: HostRepo
@@ -100,11 +104,18 @@ class Fork:
     options: frozenset[str] = frozenset()
     off: frozenset[str] = frozenset()
     scaled: frozenset[str] = frozenset()
+    one_run: str = ""
+    screens: frozenset[str] = frozenset()
+    colours: frozenset[str] = frozenset()
 
     def warn(self, code: str, where: str, found: str) -> None:
         """Add a warning, once."""
         warning = Finding("warning", code, where, found)
         self.findings += [] if warning in self.findings else [warning]
+
+    def defines(self, method: str) -> bool:
+        """Whether the model has a method of this name."""
+        return method in _methods(self.repo)
 
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
@@ -141,20 +152,7 @@ class Fork:
     @cached_property
     def modules(self) -> tuple[str, ...]:
         """The scripts and the checkout's own modules that they import, without model and draws."""
-        waiting = [_module(script) for script in self.scripts]
-        seen: dict[str, None] = {}
-        while waiting:
-            module = waiting.pop(0)
-            tree = self.repo.tree(module)
-            if module in seen or tree is None or module.split(".")[0] == RENDERER:
-                continue
-            seen[module] = None
-            for node in graphdeco.nodes(tree):
-                if isinstance(node, ast.Import):
-                    waiting += [each.name for each in node.names]
-                elif isinstance(node, ast.ImportFrom):
-                    base = self.repo.absolute(module, node)
-                    waiting += [base, *(f"{base}.{each.name}" for each in node.names)]
+        seen = _imported(self.repo, map(_module, self.scripts))
         return tuple(each for each in seen if not _OF_MODELS.search(each))
 
     def trees(self) -> Iterator[tuple[str, ast.Module]]:
@@ -200,6 +198,24 @@ def _module(script: str) -> str:
     return script.removesuffix(".py").replace("/", ".")
 
 
+def _imported(repo: HostRepo, modules: Iterable[str]) -> dict[str, None]:
+    """Modules and those of the checkout that they import, without the renderer's."""
+    waiting, seen = [*modules], dict[str, None]()
+    while waiting:
+        module = waiting.pop(0)
+        tree = repo.tree(module)
+        if module in seen or tree is None or module.split(".")[0] == RENDERER:
+            continue
+        seen[module] = None
+        for node in graphdeco.nodes(tree):
+            if isinstance(node, ast.Import):
+                waiting += [each.name for each in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                base = repo.absolute(module, node)
+                waiting += [base, *(f"{base}.{each.name}" for each in node.names)]
+    return seen
+
+
 # -- scripts ---------------------------------------------------------------------------------------
 
 
@@ -223,11 +239,13 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
     for script in scripts:
         tree = repo.tree(_module(script))
         assert tree is not None  # it is a candidate
+        networks = _networks(repo, script)
         made = [
             name
             for node in graphdeco.nodes(tree)
             if isinstance(node, ast.Call)
             and (name := getattr(node.func, "id", "")).endswith("Model")
+            and name not in networks
         ]
         if made == [CLASS] and not _in_loop(tree, CLASS):
             fork.scripts += (script,)
@@ -242,30 +260,53 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         _check_script(fork, script)
 
 
+def _networks(repo: HostRepo, script: str) -> set[str]:
+    """Classes that a script imports and that save no PLY: they are no models of Gaussians."""
+    trees = map(repo.tree, _imported(repo, [_module(script)]))
+    return {
+        node.name
+        for tree in trees
+        for node in (tree.body if tree else ())
+        if isinstance(node, ast.ClassDef)
+        and node.name != CLASS
+        and not node.bases[1:]
+        and not any(getattr(each, "name", "") == "save_ply" for each in node.body)
+        and not any(ast.unparse(each).endswith(CLASS) for each in node.bases)
+    }
+
+
 def _check_script(fork: Fork, script: str) -> None:
-    """A script must restore what it captures, under the name that we look for."""
+    """A script trains in this process, and goes backward once in an iteration."""
     tree = fork.repo.tree(_module(script))
-    text = (
-        {n.value for n in graphdeco.nodes(tree) if isinstance(n, ast.Constant)} if tree else set()
-    )
-    source = ast.unparse(tree) if tree else ""
-    for pattern, found in _NEVER.items():
-        if re.search(pattern, source):
-            fork.refuse("script", script, found, "one process that keeps its files")
-    missing = [
-        name
-        for name in ("capture", "restore", "update_learning_rate")
-        if tree is None or name not in _mentioned(tree)
-    ]
-    if missing:
-        fork.refuse("script", script, f"no {', '.join(missing)}", "checkpoints, as 3DGS has them")
-    elif (backward := sum(name == "backward" for _, name in _method_calls(tree))) > 1:  # type: ignore[arg-type]
+    assert tree is not None  # it is a candidate
+    if _PROCESSES.search(ast.unparse(tree)):
+        found = "it trains in processes of its own"
+        fork.refuse("script", script, found, "one process that keeps its files")
+    if (backward := sum(name == "backward" for _, name in _method_calls(tree))) > 1:
         found = f"{backward} places that go backward, perhaps in one iteration"
         fork.refuse("script", script, found, "one, by which steps are counted")
-    elif not any(
-        isinstance(each, str) and re.search(rf"(^|/){CHECKPOINT}($|[{{%])", each) for each in text
-    ):
-        fork.refuse("script", script, "checkpoints of another name", "chkpnt and the iteration")
+    fork.one_run = fork.one_run or _not_resumed(fork.repo, script, tree)
+
+
+def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
+    """Why a script cannot resume its own training, or we not read its checkpoints; "" if it can."""
+    missing = [name for name in ("capture", "restore") if name not in _mentioned(tree)]
+    missing += [name for name in ("capture", "restore") if name not in _methods(repo)]
+    if missing:
+        return f"{script} has no {' and no '.join(dict.fromkeys(missing))}"
+    if _EMPTIES.search(ast.unparse(tree)):
+        return f"{script} removes its output folder"
+    names = (each.value for each in graphdeco.nodes(tree) if isinstance(each, ast.Constant))
+    texts = (each for each in names if isinstance(each, str))
+    if not any(re.search(rf"(^|/){CHECKPOINT}($|[{{%])", each) for each in texts):
+        return f"{script} has checkpoints of another name"
+    saved = [node.args[0] for node, name in _method_calls(tree) if name == "save" and node.args]
+    kept = [each for each in saved if "capture()" in ast.unparse(each)]
+    if not any(isinstance(each, ast.Tuple) and len(each.elts) == 2 for each in kept):
+        return f"{script} has checkpoints that are not its model and the iteration"
+    if not _returns_state(_methods(repo)["capture"]):
+        return "its checkpoints have no state of an optimizer"
+    return ""
 
 
 def rests_after_densification(fork: Fork) -> bool:
@@ -360,10 +401,6 @@ def _read_methods(fork: Fork) -> None:
         if body is not None and "[mask]" not in ast.unparse(body):
             place = fork.repo.place(MODEL, f"{CLASS}.{name}")
             fork.refuse("row-change", place, f"{name} keeps other rows than its mask's", "[mask]")
-    capture = methods.get("capture")
-    if capture is not None and not _returns_state(capture):
-        place = fork.repo.place(MODEL, f"{CLASS}.capture")
-        fork.refuse("checkpoint", place, "no optimizer's state among what it returns", "one")
 
 
 def plain_distances(repo: HostRepo) -> bool:
@@ -428,12 +465,16 @@ def _read_changes(fork: Fork) -> None:
     for script in fork.scripts:
         trained = fork.repo.tree(_module(script))
         for node in graphdeco.nodes(trained):
-            if isinstance(node, ast.Assign) and re.match(
-                r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(", ast.unparse(node.value)
-            ):
-                what = f"what {ast.unparse(node.targets[0])} of {script} trains"
-                at = fork.repo.at(_module(script), node.lineno)
-                fork.warn("optimizer", at, f"stage 2 does not freeze {what}")
+            if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
+                name = ast.unparse(node.targets[0])
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("optimizer.step"):
+                name = ast.unparse(node.func).removesuffix(".step")
+                if _MODELS.search(name.rpartition(".")[0]) or "." not in name:
+                    continue
+            else:
+                continue
+            at = fork.repo.at(_module(script), node.lineno)
+            fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
 
 
 def read_getters(fork: Fork) -> list[Finding]:
@@ -526,6 +567,15 @@ def _read_draws(fork: Fork) -> None:
             _check_call(fork, at, name, call)
         if body is not None and (selected := _selected(body)):
             fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
+        fork.colours |= {
+            node.test.attr
+            for node in graphdeco.nodes(body)
+            if isinstance(node, ast.If)
+            and isinstance(node.test, ast.Attribute)
+            and node.test.attr not in ("convert_SHs_python", "compute_cov3D_python")
+            and fork.is_off(node.test.attr)
+            and any(ast.unparse(each).startswith("colors_precomp = ") for each in node.body)
+        }
     if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
         at = f"{RENDERER} ({fork.repo.place(RENDERER, 'render')})"
         fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
@@ -553,7 +603,10 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
     """Settings and arguments besides the known ones: off, or without a part in the picture."""
     if blended := blended_argument(fork.repo, call):
         fork.blended[call.call.package] = blended
-    further = [*(call.call.besides - NEUTRAL), *(call.call.arguments - SERVED - {blended})]
+    screens = frozenset(filter(_SCREEN.fullmatch, call.call.arguments))
+    fork.screens |= screens
+    given = call.call.arguments - SERVED - screens - {blended}
+    further = [*(call.call.besides - NEUTRAL), *given]
     unknown = {each for each in further if not _stays_off(fork, function, call.given.get(each))}
     fork.off |= {*further} - unknown
     for name in sorted(unknown & call.call.besides):

@@ -45,10 +45,13 @@ class Plain:
     Attributes:
         reasons: what speaks against it, the weightiest first.
         model: "module:class" of the model; "" if there is none that saves a PLY.
+        moved: those of the reasons that only say that the drawing function gets how to move the
+            model's own Gaussians, of which it still draws each one.
     """
 
     reasons: tuple[str, ...]
     model: str = ""
+    moved: frozenset[str] = frozenset()
 
     def __bool__(self) -> bool:
         return bool(self.model) and not self.reasons
@@ -61,7 +64,8 @@ def read_plain(repo: HostRepo) -> Plain:
         return Plain(("no model of this family that saves a PLY was found",))
     module, name = found
     flat = list(_flat(repo, module, name))
-    drawn = list(_of_drawing(repo))
+    moving = dict(_of_drawing(repo))
+    drawn = list(moving)
     made = [each for each in drawn if "3D_filter" not in each]
     reasons = [
         *flat,
@@ -72,7 +76,8 @@ def read_plain(repo: HostRepo) -> Plain:
         *_of_saving(repo, module, name),
         *_of_others(repo, module),
     ]
-    return Plain(tuple(dict.fromkeys(reasons)), f"{module}:{name}")
+    moved = frozenset(each for each, moves in moving.items() if moves)
+    return Plain(tuple(dict.fromkeys(reasons)), f"{module}:{name}", moved)
 
 
 def find_model(repo: HostRepo) -> tuple[str, str] | None:
@@ -200,8 +205,8 @@ def _renderers(repo: HostRepo) -> list[str]:
     return [each for each in names if not each.endswith(".__init__")]
 
 
-def _of_drawing(repo: HostRepo) -> Iterator[str]:
-    """Inputs of the rasterizer that are not the model's own."""
+def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
+    """Inputs of the rasterizer that are not the model's own, and whether they only move it."""
     for module in _renderers(repo):
         functions = [
             node
@@ -310,10 +315,12 @@ class _Drawing:
                 if isinstance(part, ast.expr):
                     yield from self._roots(part, seen)
 
-    def reasons(self) -> Iterator[str]:
-        """Inputs of the first call that a plain drawing does not have."""
+    def reasons(self) -> Iterator[tuple[str, bool]]:
+        """Inputs of the first call that a plain drawing does not have, and whether arguments of
+        the function make them from the model's own.
+        """
         call = _call(self.function)
-        yield from self._cut()
+        yield from ((each, False) for each in self._cut())
         given = {each.arg: each.value for each in call.keywords if each.arg} if call else {}
         at = self.repo.at(self.module, self.function.lineno)
         for argument in ("means3D", "opacities", "scales", "rotations"):
@@ -322,15 +329,18 @@ class _Drawing:
             if others:
                 shown = ", ".join(others[:4])
                 what = f"makes {argument} from {shown}, not from its PLY alone"
-                yield f"{self.function.name} {what} ({at})"
+                moves = argument != "opacities" and set(others) <= self.parameters - {self.model}
+                own = any(each.startswith(f"{self.model}.get_") for each in roots)
+                yield f"{self.function.name} {what} ({at})", moves and own
         if "shs" in given and "dc" not in given:
             roots = [*self._roots(given["shs"])]
             if not roots and "colors_precomp" in given:
                 made = dict.fromkeys(self._roots(given["colors_precomp"]))
-                yield f"{self.function.name} makes colours from {', '.join(made)} ({at})"
+                yield f"{self.function.name} makes colours from {', '.join(made)} ({at})", False
             others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
             if others:
-                yield f"{self.function.name} makes colours from {', '.join(others[:4])} ({at})"
+                shown = ", ".join(others[:4])
+                yield f"{self.function.name} makes colours from {shown} ({at})", False
 
     def _cut(self) -> Iterator[str]:
         """A picture that is some channels of what the rasterizer returns."""

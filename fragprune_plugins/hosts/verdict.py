@@ -103,14 +103,12 @@ def _first(nearest: Tried, otherwise: str) -> str:
 def _unproved(repo: HostRepo, fitting: Tried) -> str:
     """What reading cannot show about a host that fits."""
     warned = [each.found for each in fitting.match.findings if each.level == "warning"]
-    if warned:
-        return "; ".join(warned)
     if repo.package or not hasattr(fitting.adapter, "package"):
-        return "the picture, until it is compared on the first run"
+        return "; ".join(warned) or "the picture, until it is compared on the first run"
     package: str = getattr(fitting.adapter.dialect(repo), "package", "")
-    if vendored(repo, package):
-        return "its picture; the rule in its vendored rasterizer is the known one"
-    return f"its picture; the sources of {package} are not in the checkout"
+    if not vendored(repo, package):
+        warned.append(f"its picture; the sources of {package} are not in the checkout")
+    return "; ".join(warned) or "its picture; the rule in its vendored rasterizer is the known one"
 
 
 def differences(repo: HostRepo, tried: Tried) -> tuple[str, ...]:

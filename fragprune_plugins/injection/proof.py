@@ -252,7 +252,8 @@ class _Trial:
         self.dialect = session.dialect
         self.engine = session.engine(drawn[self.dialect.means].device)
         self.where = f"{call.seam} in {place.name}"
-        self.unfelt = {"means2D"} if drawn.still else set()  # only densification reads it
+        screens = {name for name in drawn.arguments if name.startswith("means2D")}
+        self.unfelt = screens if drawn.still else set()  # only densification reads them
 
     def prove(self) -> Proof:
         """Compare every output and every gradient.

@@ -128,7 +128,7 @@ class Stages:
     def one_run(self) -> None:
         """Run a host that cannot resume once, longer; stage 2 begins where it would have ended."""
         settings, total = self.options.settings, self.host.iterations
-        last = total + settings.iterations
+        last = total + settings.iterations + self.host.line.skipped
         log.info("one run of %d iterations; stage 2 begins after %d", last, total)
         arguments = self.adapter.lengthened(self.host.arguments, total, last)
         if (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from miniatures import runs
 from miniatures.changed import ForkHost
@@ -31,4 +33,15 @@ def test_a_fork_is_trained_and_pruned(fork, photographs, tmp_path):
     words = runs.command(fork / "train_scene.py", photographs, tmp_path / "out", 12)
     summary = run(words, OPTIONS)
     check_stage_two(summary, "3dgs-fork")
+    assert [each["step"] for each in summary.curves] == list(range(1, 9))
+
+
+def test_a_fork_without_checkpoints_is_pruned_in_one_run(fork, photographs, tmp_path):
+    edit(fork / "train_scene.py", "chkpnt", "state")
+    words = runs.command(fork / "train_scene.py", photographs, tmp_path / "out", 12)
+    summary = run([*words, "--save_iterations", "13"], OPTIONS)
+    names = [each.parent.name for each in (summary.model_before, summary.model_after)]
+    assert names == ["iteration_12", "iteration_21"]
+    first = summary.model_before.parent.with_name("iteration_13") / "point_cloud.ply"
+    check_stage_two(replace(summary, model_before=first), "3dgs-fork")
     assert [each["step"] for each in summary.curves] == list(range(1, 9))

@@ -9,7 +9,13 @@ import pytest
 from miniatures.forks import fork
 
 from fragprune_3dgs_fork import ForkAdapter
-from fragprune_plugins.adapting import EngineError, HostCall, Role, UsageError
+from fragprune_plugins.adapting import (
+    EngineError,
+    HostCall,
+    NotComparedError,
+    Role,
+    UsageError,
+)
 from fragprune_plugins.hosts.choosing import attempt, choose
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.hosts.verdict import judge
@@ -278,6 +284,76 @@ def test_positions_may_be_others_where_no_script_sets_them(tmp_path, called):
     assert ("computed" in str(errors(repo))) == called
 
 
+NOT_RESUMED = {
+    "no restore": ("gaussians.restore(", "gaussians.load("),
+    "no capture": ("def capture(", "def other("),
+    "another name": ("chkpnt", "state"),
+    "a dict": ("((gaussians.capture(), iteration)", '({"model": gaussians.capture(), "at": 1}'),
+    "a removed folder": ("scene = Scene(", "shutil.rmtree(opt.model_path); scene = Scene("),
+    "a lost state": ("self.optimizer.state_dict()", "None"),
+}
+
+
+@pytest.mark.parametrize("what", NOT_RESUMED)
+def test_stage_two_follows_in_one_run_where_a_script_cannot_resume(tmp_path, what):
+    saves = ("--start_checkpoint", "--save_iterations")
+    repo, adapter = fork(tmp_path, NOT_RESUMED[what], saves), ForkAdapter()
+    assert errors(repo) == []
+    line = adapter.command_line(repo)
+    assert line.one_run
+    assert not line.resume
+    assert not {Role.CAPTURE, Role.RESTORE} & {each.role for each in adapter.seams_for(repo)}
+    longer = adapter.lengthened(["--save_iterations", "5", "7"], 7, 9)
+    assert longer[3:] == ["--iterations", "9", "--save_iterations", "5", "7", "9"]
+
+
+def test_a_script_that_can_resume_does(tmp_path):
+    assert not ForkAdapter().command_line(fork(tmp_path)).one_run
+
+
+MOVED = [
+    ("pc, pipe, bg_color", "pc, pipe, bg_color, d_xyz, d_scaling"),
+    ("means3D = pc.get_xyz", "means3D = pc.get_xyz + d_xyz"),
+    ("opacities=pc.get_opacity", "opacities=pc.get_opacity, scales=pc.get_scaling + d_scaling"),
+    ("gaussians = GaussianModel(3)", "gaussians = GaussianModel(3)\n    deform = DeformModel()"),
+    ("gaussians.optimizer.step()", "gaussians.optimizer.step()\n        deform.optimizer.step()"),
+    ("from scene import", "from scene.deform_model import DeformModel\nfrom scene import"),
+]
+
+
+def test_gaussians_that_a_network_beside_them_moves_keep_their_rows(tmp_path):
+    repo = fork(tmp_path, *MOVED, arguments=", means2D_densify=pc.points")
+    network = "class DeformModel:\n    def step(self, xyz, t): ...\n"
+    (tmp_path / "scene/deform_model.py").write_text(network)
+    assert errors(repo) == []
+    assert "deform.optimizer" in str(ForkAdapter().match(repo).findings)
+    with pytest.raises(NotComparedError, match="d_xyz"):
+        ForkAdapter().drawing(repo, [])
+
+
+def test_a_second_model_of_gaussians_is_no_network(tmp_path):
+    repo = fork(tmp_path, *MOVED)
+    (tmp_path / "scene/deform_model.py").write_text(
+        "class DeformModel:\n    def save_ply(self, path): ...\n"
+    )
+    assert "makes GaussianModel, DeformModel" in errors(repo)[0]
+
+
+COLOURED = """    if pipe.network:
+        colors_precomp = pipe.net(pc)
+    shs = pc.get_features
+"""
+
+
+def test_pictures_of_a_network_are_not_compared(tmp_path):
+    repo = fork(tmp_path, ("    shs = pc.get_features\n", COLOURED))
+    (tmp_path / "arguments/__init__.py").write_text(OPTIONS.replace("mult", "network"))
+    assert errors(repo) == []
+    assert ForkAdapter().drawing(repo, []) == {}
+    with pytest.raises(NotComparedError, match="--network"):
+        ForkAdapter().drawing(repo, ["--network"])
+
+
 STATEMENT = "gaussians.thin_out(mask)"
 REFUSED = {
     "a setting": ({"settings": ", mult=0.5"}, [], "mult, unknown"),
@@ -300,17 +376,15 @@ REFUSED = {
         "several at once",
     ),
     "another model": ({}, [("GaussianModel(3)", "DeformModel(3)")], "makes DeformModel"),
-    "no checkpoints": ({}, [("gaussians.restore(", "gaussians.load(")], "no restore"),
-    "other checkpoints": ({}, [("chkpnt", "state")], "checkpoints of another name"),
+    "neither checkpoints nor models on the way": (
+        {},
+        [("gaussians.restore(", "gaussians.load(")],
+        "no --save_iterations",
+    ),
     "two ways back": (
         {},
         [("        loss.backward()\n", "        loss.backward()\n        depth_loss.backward()\n")],
         "2 places that go backward",
-    ),
-    "a removed folder": (
-        {},
-        [("    scene = Scene(", "    shutil.rmtree(opt.model_path)\n    scene = Scene(")],
-        "removes its output folder",
     ),
     "processes": (
         {},
@@ -322,7 +396,6 @@ REFUSED = {
         ],
         "processes of its own",
     ),
-    "a lost state": ({}, [("self.optimizer.state_dict()", "None")], "no optimizer's state"),
     "values changed by the script": (
         {},
         [(STATEMENT, "gaussians._opacity.data.clamp_(0)")],

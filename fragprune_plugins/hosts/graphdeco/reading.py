@@ -110,11 +110,8 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
             found.append((script, by, "flags, read with argparse"))
             continue
         flags = {*_strings(tree), *_of_groups(repo)}
-        missing = [
-            line.spellings(field)[-1]
-            for field in wanted
-            if not flags.intersection(line.spellings(field))
-        ]
+        needed = filter(None, map(line.spellings, wanted))
+        missing = [each[-1] for each in needed if not flags.intersection(each)]
         if missing:
             found.append((script, f"no {', '.join(missing)}", "the flags that we set"))
     return [
@@ -132,7 +129,13 @@ def _strings(tree: ast.Module) -> Iterator[str]:
 
 
 def _of_groups(repo: HostRepo) -> Iterator[str]:
-    """Flags that the argument groups make of their attributes; ``_name`` also makes ``-n``."""
+    """Flags that the argument groups make of their attributes; ``_name`` also makes ``-n``.
+
+    Modules beside them may add others.
+    """
+    for path in sorted((repo.root / "arguments").glob("*.py")):
+        tree = repo.tree(f"arguments.{path.stem}") if path.stem != "__init__" else None
+        yield from _strings(tree) if tree else ()
     for node in nodes(repo.tree("arguments")):
         targets = node.targets if isinstance(node, ast.Assign) else []
         for each in targets:
