@@ -9,12 +9,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn
 
 from fragprune_plugins.errors import ModelFileError, NotComparedError, UsageError
 from fragprune_plugins.files.reading import MEBIBYTE, Door, parse_json
 from fragprune_plugins.hosts.findings import Finding, Match
-from fragprune_plugins.hosts.flags import Flags
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo, check_seams
@@ -250,6 +249,15 @@ def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
     )
     with door.reading(path):
         return config.read(path)
+
+
+class Flags(argparse.ArgumentParser):
+    """An argument parser that raises UsageError; argparse would end the process."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise it."""
+        expected, remedy = "flags the host understands", "Correct the command."
+        raise UsageError("the host's command", message, expected, remedy)
 
 
 @dataclass(frozen=True)
