@@ -19,14 +19,7 @@ from fragprune_plugins.constants import VERSION
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
     from fragprune_plugins.injection.api import activate, deactivate, paused
-    from fragprune_plugins.learning.goals import (
-        AtMost,
-        Control,
-        Faster,
-        Fewer,
-        Portable,
-        Pressure,
-    )
+    from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.plugins.hooks import engine_for, rasterize
@@ -43,6 +36,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.figures.viewing import overview, render_view
     from fragprune_plugins.workbench.finetune.api import finetune
     from fragprune_plugins.workbench.finetune.result import FinetuneResult
+    from fragprune_plugins.workbench.goals import AtMost, Faster
     from fragprune_plugins.workbench.models.model import load, save
     from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
     from fragprune_plugins.workbench.ranks import joined
@@ -55,7 +49,7 @@ __version__ = VERSION
 _NAMES = {
     "files.model": "Model",
     "injection.api": "activate deactivate paused",
-    "learning.goals": "AtMost Control Faster Fewer Portable Pressure",
+    "learning.goals": "Control Fewer Portable Pressure",
     "learning.schedule": "Schedule Settings StepPlan",
     "learning.thresholds": "ThresholdStore",
     "plugins.hooks": "engine_for rasterize",
@@ -66,6 +60,7 @@ _NAMES = {
     "workbench.figures.viewing": "overview render_view",
     "workbench.finetune.api": "finetune",
     "workbench.finetune.result": "FinetuneResult",
+    "workbench.goals": "AtMost Faster",
     "workbench.models.model": "load save",
     "workbench.pruning.scores": "keep_best keep_needed",
     "workbench.ranks": "joined",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
@@ -82,16 +81,13 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     """Create one of our own engines by name; "auto" is the fastest that runs on the device.
 
     On a GPU that is the cuda engine, once it has passed the check there
-    (``engines.cuda.self_check``). Until then the reference engine draws small scenes, with a
-    warning, and refuses large ones.
+    (``engines.cuda.self_check``).
 
     Raises:
         EngineError: the name is unknown, or the engine cannot run here.
     """
     if name == "auto":
-        name, why_not = _fastest(str(device))
-        if why_not is not None:
-            return _fallback(*why_not)
+        name = _fastest(str(device))
     if name not in ENGINES:
         raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
     module, _, kind = ENGINES[name].partition(":")
@@ -99,14 +95,20 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     return engine
 
 
-def _fastest(device: str) -> tuple[str, tuple[str, str] | None]:
-    """The fastest engine's name. If it replaces the cuda engine, also the reason and a remedy."""
+def _fastest(device: str) -> str:
+    """The fastest engine's name; raises EngineError on a GPU that the cuda engine cannot use."""
     if device.startswith("cuda"):
-        why_not = _why_not_cuda(device)
-        return ("reference" if why_not else "cuda"), why_not
+        if (why_not := _why_not_cuda(device)) is not None:
+            raise EngineError(
+                "engine 'auto'",
+                why_not[0],
+                "an engine that draws on a GPU in a reasonable time",
+                f"{why_not[1]} Or draw on the CPU: --device cpu. --engine reference is slow.",
+            )
+        return "cuda"
     from fragprune_plugins.engines.cpu import binding
 
-    return ("cpu" if device.startswith("cpu") and binding.available() else "reference"), None
+    return "cpu" if device.startswith("cpu") and binding.available() else "reference"
 
 
 def _why_not_cuda(device: str) -> tuple[str, str] | None:
@@ -120,11 +122,3 @@ def _why_not_cuda(device: str) -> tuple[str, str] | None:
 
     verdict = self_check.why_not(device)
     return (str(verdict), verdict.remedy) if verdict else None
-
-
-@cache
-def _fallback(why: str, remedy: str) -> Engine:
-    """The reference engine for small scenes; cached, so that each reason is logged once."""
-    from fragprune_plugins.engines.reference import Fallback
-
-    return Fallback(why, remedy)

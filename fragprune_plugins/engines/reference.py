@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterator
 from dataclasses import fields
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from fragprune_plugins.constants import TILE
-from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import (
     Footprints,
     RasterInputs,
@@ -30,8 +28,6 @@ from reference_renderer import Footprints as Projected
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-log = logging.getLogger("fragprune")
 
 
 class ReferenceEngine:
@@ -59,40 +55,6 @@ class ReferenceEngine:
             winners=drawn.winners if inputs.scores else None,
             surface=drawn.surface,
         )
-
-
-FALLBACK_LIMIT: Final = 10**9
-"""Gaussians x pixels of the largest frame that the oracle draws unasked, in a second or some."""
-
-
-class Fallback(ReferenceEngine):
-    """The oracle in place of an engine that cannot run; for small scenes only.
-
-    Args:
-        why: the reason why the intended engine cannot run.
-        remedy: what the user can do about it.
-    """
-
-    def __init__(self, why: str, remedy: str) -> None:
-        self._why, self._remedy = why, remedy
-        log.warning("drawing with the slow reference engine: %s. %s", why, remedy)
-
-    def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
-        """Draw the splats; see ``ReferenceEngine``.
-
-        Raises:
-            EngineError: there are too many Gaussians for this slow engine.
-        """
-        n, width, height = len(inputs.splats), inputs.view.width, inputs.view.height
-        if n * width * height > FALLBACK_LIMIT:
-            raise EngineError(
-                "engine 'auto'",
-                f"{n} Gaussians at {width}x{height}, and {self._why}",
-                f"at most {FALLBACK_LIMIT:.0e} Gaussians x pixels for the reference engine: a run "
-                "would take days",
-                f"{self._remedy} Or draw on the CPU: --device cpu. --engine reference insists.",
-            )
-        return super().rasterize(inputs, thresholds)
 
 
 def fragments(

@@ -16,7 +16,7 @@ from fragprune_plugins.hosts.choosing import choose, locate, usage
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process, ranks
 from fragprune_plugins.injection.command import HostCommand, split
-from fragprune_plugins.injection.options import RunOptions, RunSummary, Stage
+from fragprune_plugins.injection.options import RunOptions, RunSummary
 from fragprune_plugins.injection.stages import Stages
 from fragprune_plugins.plugins.hooks import engine_for, select_adapter
 from fragprune_plugins.plugins.loading import Plugins, installed
@@ -65,7 +65,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     device = process.host_device(options.device, options.engine)
     _expect_engine(trainer, options, device, plugins)
     started = time.perf_counter()
-    trains = _expect_trainable(host, repo, trainer, options.stage, device)
+    trains = _expect_trainable(host, repo, trainer, options, device)
     with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
         stages = Stages(host, repo, trainer, plugins, options, device, Path(scratch))
         if not trains or options.stage == "off":
@@ -114,7 +114,7 @@ def _expect_engine(
 
 
 def _expect_trainable(
-    host: HostCommand, repo: HostRepo, adapter: ScriptAdapter, stage: Stage, device: str
+    host: HostCommand, repo: HostRepo, adapter: ScriptAdapter, options: RunOptions, device: str
 ) -> bool:
     """Whether the command trains; refuse, before stage 1, what cannot run or be followed."""
     trains = host.script in (repo.root / name for name in host.line.scripts)
@@ -122,9 +122,10 @@ def _expect_trainable(
         trains = False  # it only evaluates
         if not sidecar.find(Path(host.flags.resume)):
             log.warning("%s has no thresholds beside it: drawn without", host.flags.resume)
-    if trains and stage != "off":
+    if trains and options.stage != "off":
         ranks.expect_one()
-        adapter.refuse(repo, host.arguments, stage=stage, device=device)
+        adapter.refuse(repo, host.arguments, stage=options.stage, device=device)
+        engine_for(options.engine, device)
     dialect = adapter.dialect(repo)
     answered = {*dialect.names(), *(dialect.spares() if device == "cpu" else ())}
     data = Path(host.flags.source) if trains and host.flags.source else None

@@ -6,6 +6,7 @@ As text, for files and flags, a goal is its name and its number: ``fewer=2``, ``
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass
 from typing import ClassVar
 
@@ -14,7 +15,6 @@ from fragprune_plugins.learning.pressure import (
     OWN_AREA_PRESSURE,
     OWN_PRESSURE,
     PORTABLE_ELASTICITY,
-    TIME_FOLLOWS,
     ElasticPressure,
     FixedPressure,
     PressureController,
@@ -97,7 +97,7 @@ class Fewer(Goal):
     ratio: float
 
     def __post_init__(self) -> None:
-        _expect("target speed-up", self.ratio, 1, 20, "1 < X <= 20, fragments before over after")
+        expect("target speed-up", self.ratio, 1, 20, "1 < X <= 20, fragments before over after")
 
     def pressure(self, elasticity: float, itself: bool) -> PressureRule:
         """Steered towards the ratio."""
@@ -106,66 +106,6 @@ class Fewer(Goal):
     def target(self) -> Target:
         """One shift of all thresholds meets the ratio late in the training."""
         return Target(self.ratio)
-
-
-@dataclass(frozen=True)
-class Faster(Goal):
-    """Draw frames so many times as fast.
-
-    Attributes:
-        ratio: frame time of the untruncated model as it came in over frame time now, on this
-            machine; above 1, up to 20.
-    """
-
-    name: ClassVar[str] = "faster"
-    ratio: float
-
-    def __post_init__(self) -> None:
-        _expect("target time", self.ratio, 1, 20, "1 < X <= 20, frame time before over after")
-
-    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
-        """Steered towards the ratio."""
-        return PressureController(self.ratio, follows=TIME_FOLLOWS)
-
-    def target(self) -> Target:
-        """Refuse: whoever trains has to time frames."""
-        raise UsageError(
-            "target time",
-            "a training that cannot time single frames",
-            "a target in fragments",
-            "Aim for fewer fragments here, or use fragprune finetune on the trained PLY.",
-        )
-
-
-@dataclass(frozen=True)
-class AtMost(Goal):
-    """Truncate as strongly as a bound on the loss of quality allows; takes several trainings.
-
-    Attributes:
-        decibels: of PSNR lost against the control, 0 to 10.
-    """
-
-    name: ClassVar[str] = "at-most"
-    decibels: float
-
-    def __post_init__(self) -> None:
-        if not 0 <= _number("largest loss", self.decibels) <= 10:
-            raise UsageError(
-                "largest loss", f"{self.decibels:g}", "0 to 10 dB", "Choose another bound."
-            )
-
-    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
-        """That of the first training with thresholds."""
-        return Pressure().pressure(elasticity, itself)
-
-    def target(self) -> Target:
-        """Refuse: the bound is one for several trainings."""
-        raise UsageError(
-            "largest loss",
-            "one training",
-            "several, of which the strongest truncation within the bound is chosen",
-            "Use fragprune finetune on the trained PLY.",
-        )
 
 
 @dataclass(frozen=True)
@@ -207,42 +147,45 @@ class Control(Goal):
         return FixedPressure(0.0)
 
 
-GOALS: dict[str, type[Goal]] = {
-    each.name: each for each in (Pressure, Fewer, Faster, AtMost, Portable, Control)
-}
-"""By name."""
+GOALS: dict[str, type[Goal]] = {each.name: each for each in (Pressure, Fewer, Portable, Control)}
+"""By name: those that one training can meet, a host's too."""
 
 
-def parse_goal(text: str) -> Goal:
+def parse_goal(text: str, goals: Mapping[str, type[Goal]] = GOALS) -> Goal:
     """The goal that ``str`` made a text of.
+
+    Args:
+        text: the goal's.
+        goals: by name.
 
     Raises:
         UsageError: the name is none of a goal, or the number is missing or out of range.
     """
     name, _, number = text.partition("=")
     try:
-        return GOALS[name](*([float(number)] if number else []))
+        return goals[name](*([float(number)] if number else []))
     except (KeyError, ValueError, TypeError) as error:
         raise UsageError(
             "goal",
             repr(text)[:80],
-            "pressure, pressure=X, fewer=X, faster=X, at-most=DB, portable, portable=X or control",
+            f"one of {', '.join(goals)}, with =X for its number",
             "Choose one.",
         ) from error
 
 
-def _number(what: str, value: object) -> float:
+def number(what: str, value: object) -> float:
     """A finite number; raises UsageError for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise UsageError(what, repr(value)[:80], "a number", "Correct it.")
     return value
 
 
-def _expect(what: str, value: float, above: float, most: float, expected: str) -> None:
-    if not above < _number(what, value) <= most:
+def expect(what: str, value: float, above: float, most: float, expected: str) -> None:
+    """Raise UsageError unless a number is above one and at most another."""
+    if not above < number(what, value) <= most:
         raise UsageError(what, f"{value:g}", expected, "Choose another.")
 
 
 def _expect_weight(weight: float | None) -> None:
-    if weight is not None and not 0 <= _number("pressure", weight) < 1:
+    if weight is not None and not 0 <= number("pressure", weight) < 1:
         raise UsageError("pressure", f"{weight:g}", "0 <= X < 1 (1e-4 is usual)", "Change it.")

@@ -35,9 +35,6 @@ Chosen on photographs that were not used: docs/how-to/without-photographs.md has
 ELASTICITY = 0.1
 """Per cent of the loss that one per cent of the fragments is worth by default."""
 
-TIME_FOLLOWS = 0.4
-"""d ln(frame time) / d ln(fragments), roughly: 0.3 in small pictures, 0.5 in large ones."""
-
 PORTABLE_ELASTICITY = 0.3
 """Per cent of the loss that one per cent of the ellipses' area is worth without thresholds."""
 

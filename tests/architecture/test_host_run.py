@@ -41,4 +41,4 @@ def test_the_command_run_loads_of_the_workbench_what_measures(python):
         "names = {m[len(start):].split('.')[0] for m in sys.modules if m.startswith(start)}\n"
         "print(json.dumps(sorted(names)))"
     )
-    assert set(ours) <= {"run", "commands", "figures", "models", "scenes", "ranks"}
+    assert set(ours) <= {"run", "commands", "figures", "goals", "models", "scenes", "ranks"}

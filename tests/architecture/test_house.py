@@ -25,9 +25,9 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (15_329, 12_000),
+    "core lines": (15_106, 12_000),
     "core imports of the workbench": (0, 0),
-    "imports inside functions": (57, 60),
+    "imports inside functions": (56, 60),
     "functions over 60 lines": (7, 10),
     "longest function": (77, 80),
     "members of an adapter": (24, 24),

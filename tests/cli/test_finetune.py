@@ -18,10 +18,10 @@ from finetune import tiny
 
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
-from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.workbench.finetune import faster, loop
 from fragprune_plugins.workbench.finetune.finished import describe_untruncated
+from fragprune_plugins.workbench.goals import parse_goal
 
 
 @pytest.fixture

@@ -7,15 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.goals import (
-    AtMost,
-    Control,
-    Faster,
-    Fewer,
-    Portable,
-    Pressure,
-    parse_goal,
-)
+from fragprune_plugins.learning import goals
+from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
 from fragprune_plugins.learning.pressure import (
     ELASTICITY,
     LEAST_PRESSURE,
@@ -26,6 +19,7 @@ from fragprune_plugins.learning.pressure import (
     PressureController,
 )
 from fragprune_plugins.learning.schedule import USUAL_STOP, JointSchedule, Schedule, Settings
+from fragprune_plugins.workbench.goals import AtMost, Faster, parse_goal
 
 
 @given(st.integers(2, 10_000), st.sampled_from(["opacity", "appearance", "all"]))
@@ -146,6 +140,11 @@ def test_a_goal_is_its_name_and_its_number(goal, text):
 def test_a_text_that_is_no_goal_is_a_usage_error(text):
     with pytest.raises(UsageError):
         parse_goal(text)
+
+
+def test_a_goal_that_one_training_cannot_meet_is_none_of_a_host():
+    with pytest.raises(UsageError, match="one of pressure, fewer, portable, control"):
+        goals.parse_goal("faster=1.4")
 
 
 @pytest.mark.parametrize("goal", [Faster(2), AtMost(0.1)])

@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from fragprune_plugins.errors import ResetError, UsageError
-from fragprune_plugins.learning.goals import Control, Faster, Fewer, Pressure
-from fragprune_plugins.learning.pressure import ELASTICITY, TIME_FOLLOWS
+from fragprune_plugins.learning.goals import Control, Fewer, Pressure
+from fragprune_plugins.learning.pressure import ELASTICITY
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2, evenly
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
+from fragprune_plugins.workbench.goals import TIME_FOLLOWS, Faster
 
 OPACITIES = torch.linspace(0.2, 0.9, 5)
 

@@ -17,13 +17,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.goals import Control, Faster, Fewer, Portable, Pressure
+from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench import ranks as module
 from fragprune_plugins.workbench.distributed import processes
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint, launched, speaks
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")

@@ -11,12 +11,13 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.errors import CheckpointError, OutputError
-from fragprune_plugins.learning.goals import Control, Faster, Fewer, Portable, Pressure
+from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import checkpoints as files
 from fragprune_plugins.workbench.finetune import faster, loop, resuming
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
+from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")

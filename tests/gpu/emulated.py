@@ -49,7 +49,6 @@ class EmulatedDevice:
         self.opened: dict[tuple[str, tuple[tuple[str, int], ...]], ctypes.CDLL] = {}
 
     kind = "cpu"
-    recording = False
 
     def launch(
         self,
@@ -67,9 +66,6 @@ class EmulatedDevice:
         )
         if status:
             raise RuntimeError(library.emulated_message().decode())
-
-    def capturing(self, where: torch.device) -> bool:
-        return self.recording
 
     def _open(self, source: str, macros: dict[str, int]) -> ctypes.CDLL:
         key = (source, tuple(sorted(macros.items())))

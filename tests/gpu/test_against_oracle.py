@@ -7,7 +7,6 @@ place); threads run in another order each time a seed says so.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -22,7 +21,7 @@ from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.types import RasterInputs
 
 KINDS = {
     "plain": {},
@@ -191,57 +190,6 @@ def test_packed_pictures_are_off_by_no_more_than_half_precision(
 
 
 SCENE = scenes.random_scene(0)
-
-
-@pytest.fixture
-def captured(engine: CudaEngine, device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch):
-    """Draws into a graph, where there was room for so many entries."""
-
-    def draw(capacity: int, inputs: RasterInputs = SCENE) -> RasterOutputs:
-        engine._capacity = capacity
-        monkeypatch.setattr(device, "recording", True)
-        return engine.rasterize(inputs, None)
-
-    return draw
-
-
-def test_captured_frames_read_nothing_back_until_they_are_checked(
-    engine: CudaEngine, captured
-) -> None:
-    expected = engine.rasterize(SCENE, None)
-    found = captured(512)
-    assert torch.equal(found.image, expected.image)
-    assert math.isnan(found.evaluated_per_pixel)
-    engine.check()
-
-
-def test_a_captured_frame_that_found_no_room_is_reported_once(engine: CudaEngine, captured) -> None:
-    engine.rasterize(SCENE, None)
-    captured(512)
-    captured(7)
-    captured(512)  # its replay comes later, and does not hide the other's
-    with pytest.raises(EngineError, match="Capture the graph again"):
-        engine.check()
-    assert engine._capacity > 60
-    engine.check()
-
-
-def test_captured_offsets_beyond_all_bounds_are_reported_once(engine: CudaEngine, captured) -> None:
-    offsets = torch.zeros(28, 40, 2)
-    inputs = replace(SCENE, sample_offsets=offsets)
-    engine.rasterize(inputs, None)
-    offsets[3, 4, 1] = torch.nan
-    captured(512, inputs)
-    offsets.zero_()
-    captured(512, inputs)
-    with pytest.raises(EngineError, match="sample_offsets"):
-        engine.check()
-    engine.check()
-
-
-def test_capturing_comes_after_a_first_frame(engine: CudaEngine, captured) -> None:
-    with pytest.raises(EngineError, match="Draw the scene once"):
-        captured(512)
 
 
 def test_more_entries_than_can_be_counted_are_refused(

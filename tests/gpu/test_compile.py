@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -96,14 +95,6 @@ def test_a_gpu_that_the_toolkit_does_not_know_gets_ptx(nvrtc: kernels.Nvrtc) -> 
     with pytest.raises(kernels.Unavailable, match="older"):
         kernels.target_of(70, (75, 90))
     assert b".target sm_75" in nvrtc.compile("blend", MACROS, "compute_75").code
-
-
-def test_nvcc_compiles_the_same_sources() -> None:
-    if shutil.which("nvcc") is None:
-        pytest.skip("no nvcc here")
-    nvcc = kernels.Nvcc()
-    assert nvcc.version.count(".") == 1
-    check(nvcc.compile("unblend", MACROS, f"sm_{nvcc.architectures[0]}"))
 
 
 def test_what_is_built_beforehand_is_what_training_asks_for() -> None:

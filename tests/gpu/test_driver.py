@@ -54,7 +54,6 @@ torch.cuda.init = lambda: None
 torch.cuda.current_device = lambda: 0
 torch.cuda.current_stream = lambda index: SimpleNamespace(cuda_stream=0)
 torch.cuda.get_device_capability = lambda index: (9, 0)
-torch.cuda.is_current_stream_capturing = lambda: False
 Driver.kind = "cpu"
 
 expected = torch.load(sys.argv[1])
@@ -87,9 +86,6 @@ assert_identical(expected, everything(CudaEngine(Second(), deterministic=True), 
 assert current() == int(torchs) != int(cu.cuDevicePrimaryCtxRetain(1)[1])
 assert cu.cuCtxPopCurrent()[0] == 0
 assert int(cu.cuCtxPopCurrent()[0]) != 0  # and nothing else was left on the stack
-asked.clear()
-Driver().capturing(torch.device("cuda", 1))
-assert asked == [torch.device("cuda", 1)]
 """
 
 
@@ -114,7 +110,6 @@ def script(
         "PYTHONPATH": str(here.parent),
         "LD_LIBRARY_PATH": str(folder),
         "FAKE_KERNELS": str(builds),
-        kernels.ENVIRONMENT: "nvrtc",
         kernels.CACHE: str(folder / "kept"),
     }
     # Compiled here, found there: NVRTC itself looks for a driver, and must not meet this one.

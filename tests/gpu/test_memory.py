@@ -70,13 +70,3 @@ def test_ten_steps_hold_no_more_than_one(device: EmulatedDevice, deterministic: 
         for _ in range(9):
             step(engine)
         assert memory.held == after_one
-
-
-def test_frames_captured_into_graphs_are_the_graphs_to_hold(
-    engine: CudaEngine, device: EmulatedDevice, drawings: list[weakref.ref], monkeypatch
-) -> None:
-    step(engine)
-    monkeypatch.setattr(device, "recording", True)
-    with no_collector():
-        step(engine)
-        assert [each() for each in drawings] == [None] * 2

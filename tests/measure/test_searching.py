@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.goals import AtMost, Control
+from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.finetune import searching
@@ -21,6 +21,7 @@ from fragprune_plugins.workbench.finetune.searching import (
     next_pressure,
     strongest,
 )
+from fragprune_plugins.workbench.goals import AtMost
 
 
 def search(loss_of, bound: float, start: float) -> list[Trial]:

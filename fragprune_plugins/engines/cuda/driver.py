@@ -68,7 +68,7 @@ class Driver:
             raise EngineError(
                 "engine 'cuda'",
                 why,
-                "a CUDA device, and NVRTC (through cuda-bindings) or nvcc",
+                "a CUDA device, and NVRTC, through cuda-bindings",
                 f"{remedy()} Or use the engine 'reference'.",
             )
         from cuda.bindings import driver
@@ -107,11 +107,6 @@ class Driver:
             )
         finally:
             self._call("cuCtxPopCurrent")
-
-    def capturing(self, where: torch.device) -> bool:
-        """Whether the device's current stream records a graph."""
-        with torch.cuda.device(where):
-            return bool(torch.cuda.is_current_stream_capturing())
 
     def _context(self, index: int) -> Any:
         """Make torch's context current in this thread, which may not have used it before."""

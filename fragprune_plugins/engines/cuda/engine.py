@@ -14,7 +14,6 @@ from fragprune_plugins.engines.cuda.frame import (
     Drawn,
     Wanted,
     learnable,
-    refuse,
 )
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterOutputs, Splats
@@ -90,7 +89,6 @@ class CudaEngine:
         self.device = device
         self._deterministic, self._packed = deterministic, packed
         self._capacity = _FIRST_CAPACITY
-        self._shortages: dict[torch.device, Tensor] = {}
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
@@ -142,53 +140,14 @@ class CudaEngine:
             )
 
     def draw(self, drawing: Drawing, wanted: Wanted) -> Drawn:
-        """Run the forward pass; repeat it with more room if the lists did not fit.
-
-        A frame captured into a graph also records how much room its replays lack. The graph owns
-        the frame's memory, so nothing of a replaced graph remains here.
-        """
+        """Run the forward pass; repeat it with more room if the lists did not fit."""
         deterministic = self._deterministic
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
         how = {"deterministic": deterministic, "packed": self._packed}
-        worst = self._shortages.get(drawing.where)
-        if self.device.capturing(drawing.where):
-            if worst is None:
-                raise EngineError(
-                    "engine 'cuda'",
-                    "a graph that is captured before any frame",
-                    "kernels that have been loaded",
-                    "Draw the scene once before capturing.",
-                )
-            drawn = drawing.draw(self._capacity, wanted, **how)
-            torch.maximum(worst, drawing.shortage(self._capacity), out=worst)
-            return drawn
-        if worst is None:
-            nothing = torch.zeros(2, dtype=torch.float64, device=drawing.where)
-            self._shortages[drawing.where] = nothing
         drawn = drawing.draw(self._capacity, wanted, **how)
         if (entries := drawing.read()) > self._capacity:
             self._capacity = entries + entries // 4
             drawn = drawing.draw(self._capacity, wanted, **how)
             drawing.read()
         return drawn
-
-    def check(self) -> None:
-        """Check the frames captured into graphs, after a replay; waits for the GPU.
-
-        Raises:
-            EngineError: since the last check a replay lacked room for its lists, or its sample
-                offsets were too large. Its picture is invalid.
-        """
-        for worst in self._shortages.values():
-            entries, spread = worst.tolist()
-            worst.zero_()
-            refuse(int(entries), spread)
-            if entries:
-                self._capacity = max(self._capacity, int(entries * 1.25))
-                raise EngineError(
-                    "engine 'cuda'",
-                    f"{int(entries)} entries in a captured frame's lists",
-                    "at most the allocated room",
-                    "Capture the graph again: there is more room now.",
-                )

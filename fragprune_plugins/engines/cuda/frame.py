@@ -173,9 +173,6 @@ class Device(Hashable, Protocol):
         Asynchronous, on the current stream; ``arguments`` is copied before this returns.
         """
 
-    def capturing(self, where: torch.device) -> bool:
-        """Whether a device's current stream records a graph, so that nothing can be read back."""
-
 
 class Arena:
     """Named arrays in one tensor, each at a multiple of 256 bytes.
@@ -503,12 +500,6 @@ class Drawing:
         self.entries = entries
         refuse(entries, 0.0 if self._spread is None else float(self._spread))
         return entries
-
-    def shortage(self, capacity: int) -> Tensor:
-        """(2,) float64 on the device: entries if they did not fit, else 0; spread of offsets."""
-        entries = self._found[1]
-        spread = torch.zeros_like(entries) if self._spread is None else self._spread
-        return torch.stack([entries.where(entries > capacity, 0).double(), spread.double()])
 
     def _new_outputs(self) -> dict[str, Any]:
         """The tensors that the kernels fill, by their names in ``Drawn``; None if unwanted."""

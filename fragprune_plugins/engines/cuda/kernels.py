@@ -1,30 +1,27 @@
 """Compiles the GPU's kernels at first use, and keeps the compiled code.
 
-The compiler is NVRTC, from torch's own wheels, through ``cuda.bindings``, or nvcc if it is on the
-path. Python's and torch's headers are not needed.
+The compiler is NVRTC, from torch's own wheels, through ``cuda.bindings``. Python's and torch's
+headers are not needed.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import re
-import shutil
-import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from filelock import FileLock, Timeout
 
 from fragprune_plugins import native
 
 ENVIRONMENT: Final = "FRAGPRUNE_CUDA"
-"""Set to off, nvrtc or nvcc to override the choice of compiler."""
+"""Set to off, it switches the cuda engine off."""
 
 CACHE: Final = "FRAGPRUNE_CACHE"
 """Names a folder for compiled kernels, instead of the platform's cache folder."""
@@ -62,25 +59,17 @@ class Image:
     log: str
 
 
-class Compiler(Protocol):
-    """A way from source to image.
+class Nvrtc:
+    """The run-time compiler, a shared library.
 
     Attributes:
-        name: nvrtc or nvcc.
+        name: nvrtc.
         version: of the toolkit.
         architectures: compute capabilities for which it makes machine code, ascending.
+
+    Raises:
+        Unavailable: it is not here.
     """
-
-    name: str
-    version: str
-    architectures: tuple[int, ...]
-
-    def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
-        """Compile native/cuda/``source``.cu for a target like sm_90 or compute_90."""
-
-
-class Nvrtc:
-    """The run-time compiler, a shared library."""
 
     name = "nvrtc"
 
@@ -101,7 +90,7 @@ class Nvrtc:
         self.architectures = tuple(sorted(int(a) for a in found if a >= OLDEST))
 
     def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
-        """Compile a source; see ``Compiler``.
+        """Compile native/cuda/``source``.cu for a target like sm_90 or compute_90.
 
         Raises:
             Unavailable: the source does not compile; the message has the log.
@@ -146,78 +135,23 @@ class Nvrtc:
         return tuple(results)
 
 
-class Nvcc:
-    """The toolkit's compiler, a program."""
-
-    name = "nvcc"
-
-    def __init__(self) -> None:
-        path = shutil.which("nvcc")
-        if path is None:
-            raise Unavailable("no nvcc on the path")
-        self._path = path
-        found = re.search(r"release (\d+\.\d+)", self._run("--version").stdout)
-        if found is None:
-            raise Unavailable(f"{path} does not say its version")
-        self.version = found.group(1)
-        listed = self._run("--list-gpu-arch").stdout
-        codes = {int(code) for code in re.findall(r"compute_(\d+)\b", listed)}
-        self.architectures = tuple(sorted(code for code in codes if code >= OLDEST))
-
-    def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
-        """Compile a source; see ``Compiler``.
-
-        Raises:
-            Unavailable: the source does not compile; the message has the log.
-        """
-        with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / "image"
-            done = self._run(
-                *_OPTIONS,
-                *(f"-D{name}={value}" for name, value in macros.items()),
-                "-cubin" if target.startswith("sm_") else "-ptx",
-                f"-arch={target}",
-                "-Xptxas=-v",
-                *("-o", str(out), str(SOURCES / f"{source}.cu")),
-            )
-            if done.returncode or not out.is_file():
-                raise Unavailable(f"{source}.cu for {target}: {done.stderr}")
-            return Image(out.read_bytes(), done.stderr)
-
-    def _run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [self._path, *arguments]
-        try:
-            return subprocess.run(command, capture_output=True, text=True, check=False)
-        except OSError as error:
-            raise Unavailable(f"{self._path} cannot be run: {error}") from error
-
-
-_COMPILERS: Final[dict[str, Callable[[], Compiler]]] = {"nvrtc": Nvrtc, "nvcc": Nvcc}
-
-
 @cache
-def _choose(wanted: str) -> Compiler | str:
+def _opened() -> Nvrtc | str:
     """The compiler, or the reason why there is none."""
-    if wanted in ("off", "0"):
-        return f"switched off by {ENVIRONMENT}={wanted}"
-    if wanted and wanted not in _COMPILERS:
-        return f"{ENVIRONMENT}={wanted} is none of {', '.join(['off', *_COMPILERS])}"
-    reasons = []
-    for name in [wanted] if wanted else _COMPILERS:
-        try:
-            return _COMPILERS[name]()
-        except Unavailable as why:
-            reasons.append(str(why))
-    return "; ".join(reasons)
+    try:
+        return Nvrtc()
+    except Unavailable as why:
+        return str(why)
 
 
-def compiler() -> Compiler:
-    """The compiler to use, decided once for each value of the environment.
+def compiler() -> Nvrtc:
+    """The compiler, opened once.
 
     Raises:
-        Unavailable: there is none; the message says why.
+        Unavailable: there is none, or the environment switches it off; the message says why.
     """
-    answer = _choose(os.environ.get(ENVIRONMENT, "").strip().lower())
+    off = os.environ.get(ENVIRONMENT, "").strip().lower() in ("off", "0")
+    answer = f"switched off by {ENVIRONMENT}" if off else _opened()
     if isinstance(answer, str):
         raise Unavailable(answer)
     return answer
@@ -254,7 +188,7 @@ def cache_folder() -> Path:
         return Path(named)
     try:
         from platformdirs import user_cache_path
-    except ImportError:  # without the extra: nvcc alone needs none of it
+    except ImportError:  # without the extra
         return Path.home() / ".cache" / "fragprune" / "kernels"
     return user_cache_path("fragprune") / "kernels"
 
@@ -271,14 +205,14 @@ def digest_of_sources() -> bytes:
     return digest.digest()
 
 
-def _name_of(by: Compiler, source: str, macros: dict[str, int], target: str) -> str:
+def _name_of(by: Nvrtc, source: str, macros: dict[str, int], target: str) -> str:
     what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
     digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]
     return f"{source}-{target}-{digest}"
 
 
 def image_of(
-    source: str, macros: dict[str, int], target: str, by: Compiler | None = None
+    source: str, macros: dict[str, int], target: str, by: Nvrtc | None = None
 ) -> tuple[Image, bool]:
     """A compiled source, and whether it was in the cache.
 

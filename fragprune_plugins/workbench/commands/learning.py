@@ -10,15 +10,7 @@ from typing import Any, get_args
 import click
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.goals import (
-    AtMost,
-    Control,
-    Faster,
-    Fewer,
-    Goal,
-    Portable,
-    Pressure,
-)
+from fragprune_plugins.learning.goals import Control, Fewer, Goal, Portable, Pressure
 from fragprune_plugins.learning.pressure import (
     ELASTICITY,
     LEAST_PRESSURE,
@@ -35,6 +27,7 @@ from fragprune_plugins.learning.schedule import (
 from fragprune_plugins.types import Rim
 from fragprune_plugins.workbench.commands.options import Number
 from fragprune_plugins.workbench.commands.rules import Alone, apart
+from fragprune_plugins.workbench.goals import AtMost, Faster
 
 
 class _Stop(click.ParamType[float | str | None]):

@@ -18,12 +18,12 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.goals import Faster
 from fragprune_plugins.learning.interruption import Waiting
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
 from fragprune_plugins.workbench.finetune.loop import Alone, Training
+from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint
 from fragprune_plugins.workbench.scenes.dataset import Shot
 

@@ -90,7 +90,7 @@ def build(architectures: str) -> Report:
         raise EngineError(
             "--build-cuda",
             str(why),
-            "NVRTC (through cuda-bindings) or nvcc",
+            "NVRTC, through cuda-bindings",
             "Install fragprune-plugins[cuda12] or [cuda13], and torch or nvidia-cuda-nvrtc.",
         ) from why
     folder = str(kernels.cache_folder())

@@ -76,17 +76,6 @@ def picture(image: Tensor) -> PIL.Image.Image:
     return PIL.Image.fromarray(_bytes(image))
 
 
-def save_heatmap(path: Path, fragments: Tensor, limit: float) -> None:
-    """Write fragments per pixel (H, W) as colours with their scale.
-
-    Args:
-        path: the PNG.
-        fragments: (H, W) counts.
-        limit: the count at the top of the scale; use one value for pictures to compare.
-    """
-    save_panel(path, [("", fragments)], limit)
-
-
 def save_map(path: Path, values: Tensor, limit: float) -> None:
     """Write values (H, W) as colours, one pixel for each, without a scale: ``colour_stops`` has it.
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fragprune_plugins.files.records import CONTROL
-from fragprune_plugins.learning.goals import Faster, Fewer, parse_goal
+from fragprune_plugins.learning.goals import Fewer
+from fragprune_plugins.workbench.goals import Faster, parse_goal
 
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00
 

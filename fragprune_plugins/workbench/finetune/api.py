@@ -9,7 +9,6 @@ from pathlib import Path
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.goals import AtMost, Faster
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.targets import Target
@@ -20,6 +19,7 @@ from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, Keeper
 from fragprune_plugins.workbench.finetune.searching import strongest
+from fragprune_plugins.workbench.goals import AtMost, Faster
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset

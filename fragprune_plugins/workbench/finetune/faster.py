@@ -15,12 +15,12 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.pressure import TIME_FOLLOWS
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.learning.targets import FEWEST, Target, calibrate
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.clock import timed
+from fragprune_plugins.workbench.goals import TIME_FOLLOWS
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
 CLOCKED_AT = (0.25, 0.45, 0.65)

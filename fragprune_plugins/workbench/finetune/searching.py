@@ -16,13 +16,14 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.goals import AtMost, Control, Pressure
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.targets import FEWEST
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
+from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
 TOLERANCE = 0.02

@@ -14,7 +14,6 @@ from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.learning.goals import AtMost
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
@@ -33,6 +32,7 @@ from fragprune_plugins.workbench.finetune.finished import Finetuned
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
+from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.written import dropping, require_place
 from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed

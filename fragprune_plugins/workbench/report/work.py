@@ -26,7 +26,6 @@ from fragprune_plugins.files.records import (
     located,
     portable,
 )
-from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import open_engine, own_cameras
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -41,6 +40,7 @@ from fragprune_plugins.workbench.figures.wording import (
     missed,
     outcome,
 )
+from fragprune_plugins.workbench.goals import parse_goal
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page
 from fragprune_plugins.workbench.report.page import Drawn
