@@ -25,14 +25,14 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (15_106, 12_000),
+    "core lines": (15_100, 12_000),
     "core imports of the workbench": (0, 0),
     "imports inside functions": (56, 60),
     "functions over 60 lines": (7, 10),
     "longest function": (77, 80),
     "members of an adapter": (24, 24),
     "members of a dialect": (7, 7),
-    "members with one user": (4, 5),
+    "members with one user": (3, 5),
     "options": (45, 45),
 }
 
