@@ -169,7 +169,7 @@ class Session(SessionState):
         if model is None or self.output is None or not isinstance(self.adapter, ScriptAdapter):
             return None
         state = self.models[model]
-        learned = state.store.cuts or (self.settings.goal.on_area and state.steps > 0)
+        learned = not state.store.neutral or (self.settings.goal.on_area and state.steps > 0)
         if not learned:
             return None
         return self.adapter.save_model(model, self.output, self.start + state.steps)

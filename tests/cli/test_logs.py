@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import logging
 import os
 import subprocess
@@ -19,6 +20,7 @@ from fragprune_plugins.plugins.hookspecs import fragprune_step
 from fragprune_plugins.plugins.loading import Plugins, installed
 from fragprune_plugins.workbench.commands.logs import (
     COLUMNS,
+    Bar,
     CsvLog,
     TensorBoardLog,
     WandbLog,
@@ -40,6 +42,20 @@ def rows(path):
 def tell(plugins, steps):
     for step in steps:
         plugins.tell(fragprune_step, stats=stats(step))
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(("step", "name"), [(2, "warm-up"), (3, "fine-tuning")])
+def test_the_bar_of_a_run_says_when_it_warms_up(monkeypatch, step, name):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    bar = Bar(4, warmup=2)
+    bar.write(stats(step))
+    bar.close()
+    assert f"fragprune, {name}: " in sys.stderr.getvalue()
 
 
 def test_finetune_writes_a_row_a_step(tmp_path):

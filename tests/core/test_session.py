@@ -156,6 +156,7 @@ def test_a_model_is_saved_only_if_something_was_learned(
         model = host.model()
         state = host.session.models[model]
         state.steps = steps
+        state.store.stop = 0.01  # which is given and not learned
         if not neutral:
             state.store.open(torch.full((30,), 0.5))
         monkeypatch.setattr(host.session.adapter, "save_model", lambda *_: Path("there"))

@@ -1,6 +1,7 @@
 """docs/how-to/write-an-adapter.md, followed to the letter: its files written, its commands run.
 
-Only ``pip install`` is done by hand: it would change the environment of every other test.
+Of ``pip install`` only the package's metadata is made, by setuptools: more would change the
+environment of every other test.
 """
 
 from __future__ import annotations
@@ -36,18 +37,13 @@ def commands(text: str) -> list[tuple[str, list[str]]]:
 
 
 def install(folder: Path) -> None:
-    """What pip would do with the page's pyproject.toml: metadata beside the modules."""
-    project = (folder / "pyproject.toml").read_text()
-    _, _, entries = project.partition("[project.entry-points.fragprune]\n")
-    name, version = (
-        re.search(rf'^{key} = "(.*)"', project, re.M)[1] for key in ("name", "version")
-    )
+    """What pip asks of the page's pyproject.toml: metadata, which then lies beside the modules."""
     for earlier in folder.glob("*.dist-info"):
         shutil.rmtree(earlier)
-    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    (info / "entry_points.txt").write_text(f"[fragprune]\n{entries.replace(chr(34), '')}")
+    made = "prepare_metadata_for_build_editable"
+    build = f"from setuptools.build_meta import {made}; {made}('.')"
+    printed = run(folder, shlex.join([sys.executable, "-c", build]))
+    assert any(folder.glob("*.dist-info")), printed
 
 
 def test_the_page_has_every_file_and_command():

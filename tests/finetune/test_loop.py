@@ -12,7 +12,7 @@ from finetune import tiny
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
 from fragprune_plugins.learning.goals import Control, Fewer, Pressure
-from fragprune_plugins.learning.schedule import USUAL_STOP, Settings
+from fragprune_plugins.learning.schedule import USUAL_STOP, Schedule, Settings
 from fragprune_plugins.learning.targets import calibrate
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
@@ -146,6 +146,13 @@ def test_target_is_met_on_training_views(model, dataset, target):
     assert before / after == pytest.approx(target, rel=0.02)
     assert result.progress.target_reached
     assert result.progress.speedup == pytest.approx(target, rel=0.02)
+
+
+def test_the_bar_says_when_it_warms_up(model, dataset, capsys):
+    settings = Settings(iterations=4)
+    finetune(model, dataset, settings, schedule=Schedule(settings, warmup=2), progress=True)
+    names = [line.split(":")[0] for line in capsys.readouterr().err.split("\r") if "px" in line]
+    assert list(dict.fromkeys(names)) == ["warm-up", "fine-tuning"]
 
 
 def test_interrupted(model, dataset, monkeypatch):

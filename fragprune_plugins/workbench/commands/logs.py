@@ -153,18 +153,19 @@ class Bar:
 
     Args:
         total: number of steps.
+        warmup: so many of them come before thresholds open.
     """
 
-    def __init__(self, total: int) -> None:
-        self._total = total
+    def __init__(self, total: int, warmup: int) -> None:
+        self._total, self._warmup = total, warmup
         self._bar: Any = None
 
     def write(self, stats: StepStats) -> None:
         """Go on by a step."""
         if self._bar is None:
-            self._bar = tqdm(
-                total=self._total, disable=None, desc="fragprune", unit="it", position=1
-            )
+            self._bar = tqdm(total=self._total, disable=None, unit="it", position=1)
+        name = "warm-up" if stats.step <= self._warmup else "fine-tuning"
+        self._bar.set_description(f"fragprune, {name}", refresh=False)
         self._bar.set_postfix(
             fragments=f"{stats.fragments_per_pixel:.1f}/px", loss=f"{stats.loss:.4f}", refresh=False
         )

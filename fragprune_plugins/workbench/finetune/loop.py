@@ -229,6 +229,8 @@ class Training:
                     keeper.keep(self)
                 bar.update()
                 if self.curves and self.done % max(1, total // _POSTFIXES) == 0:
+                    warming = self.stage.warming_up
+                    bar.set_description("warm-up" if warming else "fine-tuning", refresh=False)
                     bar.set_postfix(**self._how_it_goes())
         self.stage.close()
         self.processes.finished(self)

@@ -61,7 +61,8 @@ def run(
     # A host prints to stdout; with --json, stdout gets only our object.
     as_json = click.get_current_context().meta[JSON]
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
-        with logging_steps([Bar(settings.iterations)]):
+        warmup = 0 if stage == "joint" else settings.warmup
+        with logging_steps([Bar(settings.iterations, warmup)]):
             summary = launch.run(list(host_command), options)
         photographs = photographs_of(summary)
         not_compared: FragpruneError | None = summary.not_compared
