@@ -62,12 +62,7 @@ class Tried:
 
     def brief(self) -> str:
         """The verdict and the first error, if any, in one short line."""
-        line = self.verdict()
-        if self.errors:
-            first = self.errors[0]
-            module, _, name = first.where.partition(" (")[0].partition(":")
-            missing = first.code == "seam-missing"
-            line += f"; no {name} in {module}" if missing else f"; {first.found}"
+        line = self.verdict() + (f"; {self.errors[0].found}" if self.errors else "")
         return line if len(line) <= _SHORT else f"{line[: _SHORT - 3].rstrip()}..."
 
 

@@ -259,7 +259,7 @@ def _look_up(repo: HostRepo, seam: Seam) -> SeamState:
     where = f"{seam} ({at})"
     if have is None:
         broken = repo.path(seam.module) is not None and repo.tree(seam.module) is None
-        found = "source that is no Python" if broken else "no such function"
+        found = "source that is no Python" if broken else f"no {seam.attribute}"
         gone = Finding("error", "seam-missing", where, found, "one")
         return SeamState(seam, "missing", at, gone)
     missing = [name for name in seam.needs if name not in have]

@@ -85,7 +85,7 @@ def test_one_that_fits_none_has_a_short_line_an_adapter_the_nearest_first(host):
     lines = [line for line in run("check", host).stdout.splitlines() if "does not fit" in line]
     assert lines[0].startswith("3dgs-fork does not fit: ")
     assert lines[1].startswith(
-        "vanilla-3dgs does not fit: 14 of 15 seams hold; no GaussianModel.densify_and_clone in "
+        "vanilla-3dgs does not fit: 14 of 15 seams hold; no GaussianModel.densify_and_clone"
     )
     assert len(lines) == len({line.split(" does not")[0] for line in lines}) > 1
     assert max(map(len, lines)) <= 100

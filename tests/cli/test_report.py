@@ -13,7 +13,9 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 from fragprune_plugins.files import records
+from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page
+from fragprune_plugins.workbench.scenes.generated import around, bounds
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,11 @@ def test_a_fine_tuning_without_photographs_shows_the_original_s_own_views(tmp_pa
     words = ("--iters", 2, "--train", "opacity", "--resolution", 16)
     run_json("finetune", model, "--self", "--out", out, *words)
     report = run_json("report", tmp_path)
-    assert len(report["views"]) == 3
+    splat = load(model)
+    cameras, (centre, _) = dict(around(splat)), bounds(splat)
+    below = [float(cameras[name].campos[1] - centre[1]) for name in report["views"]]
+    assert len(below) == 3
+    assert 0 > below[0] > below[1] > below[2]  # y is down: from above, the lowest first
     page = (tmp_path / "report.html").read_text()
     assert "The original&#39;s own picture" in page
     assert "PSNR of the picture against the original" in page

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fragprune_plugins.workbench.figures.wording import describe, fewer, gain, outcome
+from fragprune_plugins.workbench.figures.wording import describe, fewer, gain, headlines, outcome
 
 
 def measured(fragments, ms, psnr, error=0.01):
@@ -42,8 +42,12 @@ def test_fragments_come_with_frame_times_and_psnr():
     ],
 )
 def test_frames_are_called_faster_only_beyond_two_standard_errors(ms, error, claim):
-    line = gain(measured(20, 3.0, 30, error), measured(10, ms, 30, error))
-    assert f"frames 3.00 -> {ms:.2f} ms ({claim})" in line
+    before, after = measured(20, 3.0, 30, error), measured(10, ms, 30, error)
+    assert f"frames 3.00 -> {ms:.2f} ms ({claim})" in gain(before, after)
+    _, (figure, said), _ = headlines({"before": before, "after": after}, None)
+    assert figure == f"{1 if 'noise' in claim else 3.0 / ms:.2f}x"
+    assert said.startswith(f"as fast: frames in 3.00 → {ms:.2f} ms")
+    assert said.endswith("noise") == ("noise" in claim)
 
 
 def test_more_fragments_are_not_called_fewer():

@@ -177,14 +177,13 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
     """
     before, after = data["before"], data["after"]
     larger = data.get("larger", data)
-    (was, now), (slow, fast) = (
-        (first[key], second[key])
-        for first, second, key in (
-            (before, after, "fragments_per_pixel"),
-            (larger["before"], larger["after"], "frame_ms"),
-        )
-    )
     of = f" of {larger['size']}" if "size" in larger else ""
+    was, now = (each["fragments_per_pixel"] for each in (before, after))
+    slow, fast = (larger[key]["frame_ms"] for key in ("before", "after"))
+    faster, error = _faster(larger["before"], larger["after"])
+    took = f"as fast: frames{of} in {slow:.2f} → {fast:.2f} ms"
+    if abs(faster - 1) <= CLAIMED * error:
+        faster, took = 1, f"{took}, no difference beyond the noise"
     if after.get("target") == ITSELF:
         picture = f"{after['psnr']:.1f} dB", "PSNR of the picture against the original's own"
     elif control is not None:
@@ -197,7 +196,7 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
         )
     return [
         (f"{was / max(now, 1e-9):.1f}x", f"fewer fragments to draw: {was:.1f} → {now:.1f} a pixel"),
-        (f"{slow / max(fast, 1e-9):.2f}x", f"as fast: frames{of} in {slow:.2f} → {fast:.2f} ms"),
+        (f"{faster:.2f}x", took),
         picture,
     ]
 
@@ -266,13 +265,17 @@ def fewer(before: float, after: float) -> str:
 
 def frames(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for frame times, with their ratio only if it exceeds the standard errors."""
-    was, now = before["frame_ms"], after["frame_ms"]
-    ratio = was / max(now, 1e-9)
-    errors = (report["frame_ms_se"] / max(report["frame_ms"], 1e-9) for report in (before, after))
-    error = ratio * math.hypot(*errors)
+    ratio, error = _faster(before, after)
     faster = (
         f"{ratio:.2f} ± {error:.2f}x as fast"
         if abs(ratio - 1) > CLAIMED * error
         else "no difference beyond the noise"
     )
-    return f"frames {was:.2f} -> {now:.2f} ms ({faster})"
+    return f"frames {before['frame_ms']:.2f} -> {after['frame_ms']:.2f} ms ({faster})"
+
+
+def _faster(before: dict[str, Any], after: dict[str, Any]) -> tuple[float, float]:
+    """How many times as fast frames are, and its standard error."""
+    ratio = before["frame_ms"] / max(after["frame_ms"], 1e-9)
+    errors = (report["frame_ms_se"] / max(report["frame_ms"], 1e-9) for report in (before, after))
+    return ratio, ratio * math.hypot(*errors)

@@ -27,7 +27,7 @@ from fragprune_plugins.files.records import (
     portable,
 )
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import open_engine, own_cameras
+from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, own_cameras
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.page import Table, embedded
@@ -241,7 +241,8 @@ def _source(record: Record, data: Path | None) -> _Source | None:
         with DOOR.stated(record.path):
             models = [located(record.data[name], record.path.parent) for name in ("model", "out")]
         needs = list(filter(None, [own.scene.data, own.cameras]))
-        return _Source(models, False, {}, needs, own.pictures)
+        pictures = own.pictures if needs else partial(_from_above, own)
+        return _Source(models, False, {}, needs, pictures)
     read = recorded(record)
     if read is None:
         return None
@@ -249,6 +250,12 @@ def _source(record: Record, data: Path | None) -> _Source | None:
     return _Source(
         read.models, read.filtered, read.drawing, [scene.folder], lambda *_: load_photographs(scene)
     )
+
+
+def _from_above(own: OwnCameras, model: Model, engine: Engine) -> Dataset:
+    """Pictures of a model from all around, shown from above: such cameras begin below it."""
+    made = own.pictures(model, engine)
+    return replace(made, test=made.test[len(made.test) // 2 :])
 
 
 def _draw(
