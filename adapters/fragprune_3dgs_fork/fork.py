@@ -13,7 +13,6 @@ from fragprune_3dgs_fork.rasterizer import (
     Output,
     blended_argument,
     changed_gradients,
-    is_off,
     meaning,
     off_by_default,
 )
@@ -33,7 +32,7 @@ _MAKES = re.compile(r"__init__|capture\w*|(restore|create|load|init|set)_?\w*|\w
 """Methods that make a model, before it is trained."""
 _OF_MODELS = re.compile(r"^scene\.\w*model\w*$")
 _MODELS = re.compile(r"\b(gaussians?|pc|model)$")
-"""What scripts call a model."""
+"""What functions and scripts call a model that they are given."""
 _OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
 _CAMERA = re.compile(r"view|cam")
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
@@ -247,15 +246,15 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
             and (name := getattr(node.func, "id", "")).endswith("Model")
             and name not in networks
         ]
-        if made == [CLASS] and not _in_loop(tree, CLASS):
+        if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
+            if len(made) > 1 or _in_loop(tree, CLASS):
+                fork.one_run = f"{script} makes several models"
         elif made:
             others.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
-        if made.count(CLASS) > 1 or _in_loop(tree, CLASS):
-            others[-1] += ", several at once"
     if not fork.scripts:
         found = "; ".join(others) or "no script that trains a GaussianModel"
-        fork.refuse("other-host", str(repo.root), found, "one *train*.py that makes one model")
+        fork.refuse("other-host", str(repo.root), found, "a *train*.py that makes GaussianModels")
     for script in fork.scripts:
         _check_script(fork, script)
 
@@ -386,13 +385,16 @@ def _read_methods(fork: Fork) -> None:
     )
     called: dict[str, None] = {}
     for module, tree in fork.trees():
+        owners = _owners(tree)
         statements = {
             id(each.value) for each in graphdeco.nodes(tree) if isinstance(each, ast.Expr)
         }
         for node, name in _method_calls(tree):
-            if name in changing and _MODELS.search(ast.unparse(node.func.value)):  # type: ignore[attr-defined]
+            if name in changing:
                 called[name] = None
-                if id(node) not in statements:
+                owner = ast.unparse(node.func.value)  # type: ignore[attr-defined]
+                own = _MODELS.search(owner) or owner.split("[")[0] in owners
+                if own and id(node) not in statements:
                     at = fork.repo.at(module, node.lineno)
                     fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in called)
@@ -401,6 +403,15 @@ def _read_methods(fork: Fork) -> None:
         if body is not None and "[mask]" not in ast.unparse(body):
             place = fork.repo.place(MODEL, f"{CLASS}.{name}")
             fork.refuse("row-change", place, f"{name} keeps other rows than its mask's", "[mask]")
+
+
+def _owners(tree: ast.AST) -> set[str]:
+    """Variables, and lists and dicts, that hold models which a script makes."""
+    owners: set[str] = set()
+    for node in graphdeco.nodes(tree):  # in order of depth, so not of the source
+        if isinstance(node, ast.Assign) and f"{CLASS}(" in ast.unparse(node.value):
+            owners |= {ast.unparse(each).split("[")[0] for each in node.targets}
+    return owners
 
 
 def plain_distances(repo: HostRepo) -> bool:
@@ -464,12 +475,14 @@ def _read_changes(fork: Fork) -> None:
             fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
         trained = fork.repo.tree(_module(script))
+        owners = _owners(trained) if trained else set()
         for node in graphdeco.nodes(trained):
             if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
                 name = ast.unparse(node.targets[0])
             elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("optimizer.step"):
                 name = ast.unparse(node.func).removesuffix(".step")
-                if _MODELS.search(name.rpartition(".")[0]) or "." not in name:
+                owner = name.rpartition(".")[0]
+                if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:
                     continue
             else:
                 continue
@@ -494,7 +507,7 @@ def read_getters(fork: Fork) -> list[Finding]:
         _target(node)
         for name in (reached & methods.keys()) - {"__init__"}
         for node in graphdeco.nodes(methods[name])
-        if isinstance(node, ast.Assign) and not is_off(node.value)
+        if isinstance(node, ast.Assign) and not graphdeco.is_off(node.value)
     }
     unset = {each for each in _guards(methods) if fork.is_off(each)} - made
     found = graphdeco.read_getters(fork.repo, MODEL)
@@ -630,9 +643,9 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
     if isinstance(value, ast.Attribute):
         return fork.is_off(value.attr)
     if not isinstance(value, ast.Name) or body is None:
-        return is_off(value)
+        return graphdeco.is_off(value)
     names = fork.repo.parameters(RENDERER, function) or ()
-    if value.id not in _off(body):
+    if value.id not in graphdeco.off_by_default(body):
         return False
     number = names.index(value.id) if value.id in names else len(names)
     for _, tree in fork.trees():
@@ -648,7 +661,7 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
 
 def _selected(body: Function) -> str:
     """The code that picks rows of what is drawn, such as ``means3D[mask]``; "" if none does."""
-    off = _off(body)
+    off = graphdeco.off_by_default(body)
     for statement in _statements(body.body, off):
         for node in ast.walk(statement):
             if isinstance(node, ast.Assign) and any(
@@ -663,19 +676,6 @@ def _selected(body: Function) -> str:
 def _picks(index: ast.expr) -> bool:
     first = index.elts[0] if isinstance(index, ast.Tuple) and index.elts else index
     return not isinstance(first, ast.Slice | ast.Constant)
-
-
-def _off(body: Function) -> set[str]:
-    """Parameters that are None or False by default."""
-    arguments = body.args
-    plain = [*arguments.posonlyargs, *arguments.args]
-    pairs = [*zip(reversed(plain), reversed(arguments.defaults), strict=False)]
-    pairs += [(a, d) for a, d in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True) if d]
-    return {
-        each.arg
-        for each, value in pairs
-        if isinstance(value, ast.Constant) and value.value in (None, False)
-    }
 
 
 def _statements(body: list[ast.stmt], off: set[str]) -> Iterator[ast.stmt]:

@@ -123,15 +123,10 @@ def _sum_for_gaussians(text: str, name: str) -> Literal["count", "weight"] | Non
 # -- settings --------------------------------------------------------------------------------------
 
 
-def is_off(value: ast.expr | None) -> bool:
-    """Whether an expression is None or False."""
-    return isinstance(value, ast.Constant) and value.value in (None, False)
-
-
 def off_by_default(repo: HostRepo, modules: Iterable[str], name: str) -> bool:
     """Whether all that modules assign to ``self.name`` first, or an option's default, is off."""
     values = [each for module in modules for each in graphdeco.defaults(repo, module, name)]
-    return bool(values) and all(map(is_off, values))
+    return bool(values) and all(map(graphdeco.is_off, values))
 
 
 def changed_gradients(repo: HostRepo, package: str, setting: str) -> frozenset[str] | None:
@@ -192,5 +187,5 @@ def _changed(forward: ast.FunctionDef, backward: ast.FunctionDef) -> frozenset[s
     return frozenset(
         name
         for name, each in zip(names, returned.elts, strict=False)
-        if not is_off(each) and getattr(each, "id", "") not in given
+        if not graphdeco.is_off(each) and getattr(each, "id", "") not in given
     )

@@ -337,15 +337,21 @@ class CommandLine:
         for name, options_of in options.items():
             if flags := self.spellings(name):
                 parser.add_argument(*flags, dest=name, **options_of)
+        values, written = self._parsed(parser, arguments, dict.fromkeys(options))
+        for name in options:
+            key = ("", *self.spellings(name))[-1].lstrip("-")
+            setattr(values, name, written.get(key, getattr(values, name)))
+        return values
+
+    def _parsed(
+        self, parser: Flags, arguments: list[str], values: dict[str, Any]
+    ) -> tuple[argparse.Namespace, dict[str, Any]]:
+        """Values of flags that a parser knows, and those of the configuration file."""
         if self.config:
             parser.add_argument(self.config.flag, dest="config", type=Path)
-        values, _ = parser.parse_known_args(arguments, argparse.Namespace(**dict.fromkeys(options)))
-        if self.config and values.config:
-            written = read_config(self.config, values.config)
-            for name in options:
-                key = ("", *self.spellings(name))[-1].lstrip("-")
-                setattr(values, name, written.get(key, getattr(values, name)))
-        return values
+        given, _ = parser.parse_known_args(arguments, argparse.Namespace(**values))
+        file = self.config and given.config
+        return given, read_config(self.config, file) if self.config and file else {}
 
     def numbers(self, arguments: list[str], **defaults: Sequence[int]) -> dict[str, list[int]]:
         """Numbers of other flags, by name, as the host will read them.
@@ -360,11 +366,7 @@ class CommandLine:
         parser = Flags(add_help=False, allow_abbrev=False)
         for name, default in defaults.items():
             parser.add_argument(f"--{name}", type=int, nargs="+", default=[*default])
-        if self.config:
-            parser.add_argument(self.config.flag, dest="config", type=Path)
-        values, _ = parser.parse_known_args(arguments)
-        file = self.config and values.config
-        written = read_config(self.config, file) if self.config and file else {}
+        values, written = self._parsed(parser, arguments, {})
         found = {name: written.get(name, getattr(values, name)) for name in defaults}
         return {name: each if isinstance(each, list) else [each] for name, each in found.items()}
 
@@ -424,7 +426,7 @@ class HostAdapter(ABC):
                 )
             ]
         fits = not any(finding.level == "error" for finding in findings)
-        return Match(self.name, "known" if fits else "none", tuple(findings))
+        return Match(self.name, fits, tuple(findings))
 
     @abstractmethod
     def dialect(self, repo: HostRepo) -> Dialect:

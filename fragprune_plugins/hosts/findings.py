@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 
@@ -33,11 +33,5 @@ class Match:
     """Whether one adapter fits one folder, with the findings."""
 
     adapter: str
-    confidence: Literal["known", "none"]
+    fits: bool
     findings: tuple[Finding, ...] = ()
-    details: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def fits(self) -> bool:
-        """True when every seam holds and nothing speaks against it."""
-        return self.confidence != "none"

@@ -7,7 +7,6 @@ before activation, and if ``render`` draws from the model's getters alone.
 from __future__ import annotations
 
 import ast
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 from fragprune_plugins.files.columns import change_of
 from fragprune_plugins.hosts.graphdeco.call import RASTERIZER
 from fragprune_plugins.hosts.kernels import SPLAT, read_kernels
-from fragprune_plugins.hosts.source import Function, HostRepo, nodes
+from fragprune_plugins.hosts.source import Function, HostRepo, nodes, off_by_default
 
 _COLUMNS = ("f_dc", "f_rest", "opacity", "scale", "rot")
 _PLAIN = {"x", "y", "z", "nx", "ny", "nz", "l", *_COLUMNS}
@@ -87,10 +86,7 @@ def find_model(repo: HostRepo) -> tuple[str, str] | None:
 
 def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
     """Module and class of each model in ``scene`` that saves a PLY."""
-    try:
-        files = sorted(each.stem for each in (repo.root / "scene").glob("*.py"))
-    except OSError:
-        files = []
+    files = sorted(each.stem for each in (repo.root / "scene").glob("*.py"))
     files.sort(key=lambda stem: (stem != "gaussian_model", "gaussian" not in stem, len(stem)))
     for stem in files:
         tree = repo.tree(f"scene.{stem}") if stem.isidentifier() else None
@@ -196,13 +192,9 @@ def _of_kernel(repo: HostRepo) -> Iterator[str]:
 
 def _renderers(repo: HostRepo) -> list[str]:
     """Modules of the drawing functions."""
-    names = ["gaussian_renderer"]
-    try:
-        files = sorted(os.listdir(repo.root / "gaussian_renderer"))
-    except OSError:
-        files = []
-    names += [f"gaussian_renderer.{each[:-3]}" for each in files if each.endswith(".py")]
-    return [each for each in names if not each.endswith(".__init__")]
+    files = sorted((repo.root / "gaussian_renderer").glob("*.py"))
+    others = (f"gaussian_renderer.{each.stem}" for each in files if each.stem != "__init__")
+    return ["gaussian_renderer", *others]
 
 
 def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
@@ -236,20 +228,7 @@ class _Drawing:
         self.repo, self.module, self.function = repo, module, function
         arguments = function.args
         every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
-        self.parameters = {each.arg for each in every}
-        plain = [*arguments.posonlyargs, *arguments.args]
-        defaults = dict(
-            zip(reversed([each.arg for each in plain]), reversed(arguments.defaults), strict=False)
-        ) | {
-            each.arg: value
-            for each, value in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
-            if value
-        }
-        self.off = {
-            name
-            for name, value in defaults.items()
-            if isinstance(value, ast.Constant) and value.value in (None, False)
-        }
+        self.parameters, self.off = {each.arg for each in every}, off_by_default(function)
         self.values: dict[str, list[ast.expr]] = {}
         self._collect(function.body)
         models = [

@@ -69,6 +69,19 @@ def imported(tree: ast.Module | None) -> list[str]:
     return list(names)
 
 
+def off_by_default(function: Function) -> set[str]:
+    """Parameters that are None or False by default."""
+    a = function.args
+    named = [*a.posonlyargs, *a.args][-len(a.defaults) :] if a.defaults else []
+    pairs = zip([*named, *a.kwonlyargs], [*a.defaults, *a.kw_defaults], strict=True)
+    return {each.arg for each, value in pairs if is_off(value)}
+
+
+def is_off(value: ast.expr | None) -> bool:
+    """Whether an expression is None or False."""
+    return isinstance(value, ast.Constant) and value.value in (None, False)
+
+
 @lru_cache(maxsize=256)
 def _identifiers(tree: ast.Module) -> dict[str, int]:
     """Every name, attribute, definition and parameter in a tree, with its first line."""

@@ -91,13 +91,10 @@ def judge(repo: HostRepo, tried: Sequence[Tried], adapters: Sequence[HostAdapter
         return Verdict("finetune", sentence, "", name, differs, inside)
     if inside:
         return Verdict("inside", fitting_inside, plain.reasons[0], name, differs, inside)
-    reason = plain.reasons[0] if plain.model or not nearest else _first(nearest, plain.reasons[0])
+    reason = plain.reasons[0]
+    if nearest and not plain.model:  # what the nearest adapter misses tells more
+        reason += f"; {nearest.verdict()}"
     return Verdict("never", f"Not possible: {reason}.", reason, name, differs)
-
-
-def _first(nearest: Tried, otherwise: str) -> str:
-    """What the nearest adapter misses, where no model tells more."""
-    return f"{otherwise}; {nearest.verdict()}" if nearest.held else otherwise
 
 
 def _unproved(repo: HostRepo, fitting: Tried) -> str:

@@ -278,9 +278,10 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
     """Keep the host's own loss, a scalar, for the curves."""
     state = session.last_state
     if state is not None and call.instance.numel() == 1:
-        state.begun = False
-        if state.stage is not None:
+        if state.stage is not None and (state.begun or len(session.models) == 1):
             state.stage.lost(call.instance)
+        for each in session.models.values():
+            each.begun = False
     return call.run()
 
 

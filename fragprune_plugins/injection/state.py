@@ -146,6 +146,7 @@ class SessionState:
         )
         self.rates: weakref.WeakKeyDictionary[Any, dict[str, float]] = weakref.WeakKeyDictionary()
         self.warned = False
+        self.main: weakref.ReferenceType[Any] | None = None  # the scene's model, of several
         self.last: weakref.ReferenceType[Any] | None = None
         self.last_state: ModelState | None = None  # stays when the host drops its model
         self.rendering: ContextVar[tuple[Any, int] | None] = ContextVar("rendering", default=None)
@@ -191,8 +192,10 @@ class SessionState:
         return [(self.adapter.group_name(model, group), group) for group in groups]
 
     def follow(self, model: Any, state: ModelState) -> None:
-        """Make this the model of reports and summaries."""
-        self.last, self.last_state = weakref.ref(model), state
+        """Make this the model of reports and summaries, unless the scene's own is among several."""
+        main = self.main() if self.main else None
+        if main is None or main is model or main not in self.models:
+            self.last, self.last_state = weakref.ref(model), state
 
     def changed(self, store: ThresholdStore, operation: str, before: int) -> None:
         """Tell observers that rows changed.

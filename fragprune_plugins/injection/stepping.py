@@ -25,8 +25,10 @@ from fragprune_plugins.plugins.hooks import thresholds_for
 
 
 def on_scene(session: SessionState, call: SeamCall) -> Any:
-    """Note the host's output folder."""
+    """Note the host's output folder, and its model."""
     result = call.run()
+    model = getattr(call.instance, "gaussians", None)
+    session.main = weakref.ref(model) if model is not None else None
     if getattr(call.instance, "model_path", None):
         session.output = Path(call.instance.model_path)
     return result
@@ -83,13 +85,15 @@ def stage2(session: SessionState, model: Any, state: ModelState) -> Stage2:
         session.schedule,
         truncate=partial(thresholds_for, plugins=session.plugins),
         views=state.views,
-        watch=partial(report, session),
+        watch=partial(report, session, state),
         parameters=parameters,
     )
 
 
-def report(session: SessionState, stats: StepStats) -> None:
-    """Keep a finished step for the curves, and tell observers."""
+def report(session: SessionState, state: ModelState, stats: StepStats) -> None:
+    """Keep a finished step of the followed model for the curves, and tell observers."""
+    if state is not session.last_state:
+        return
     session.curves.append(asdict(stats))
     session.plugins.tell(hookspecs.fragprune_step, stats=stats)
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import torch
 from miniatures import runs
 from miniatures.changed import ForkHost
-from miniatures.runs import OPTIONS, check_stage_two, edit
+from miniatures.runs import OPTIONS, check_stage_two, edit, frozen_differences
 
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import run
 
 RATES = "        gaussians.update_learning_rate(iteration)\n"
@@ -45,3 +48,38 @@ def test_a_fork_without_checkpoints_is_pruned_in_one_run(fork, photographs, tmp_
     first = summary.model_before.parent.with_name("iteration_13") / "point_cloud.ply"
     check_stage_two(replace(summary, model_before=first), "3dgs-fork")
     assert [each["step"] for each in summary.curves] == list(range(1, 9))
+
+
+SCENE = "    scene = Scene(dataset, gaussians)\n    gaussians.training_setup(opt)\n"
+PAIR = """    pair = {"second": GaussianModel(dataset.sh_degree)}
+    Scene(dataset, pair["second"])
+"""
+BACKWARD = "        loss.backward()\n"
+BOTH = """        second = l1_loss(render(camera, pair["second"], pipe, bg)["render"], truth)
+        for each in (loss, second):
+            each.backward()
+"""
+SAVED = "                scene.save(iteration)\n"
+FILE = 'f"{scene.model_path}/second/iteration_{iteration}/point_cloud.ply"'
+
+
+def test_two_models_of_one_script_learn_each_its_own_thresholds(fork, photographs, tmp_path):
+    train = fork / "train_scene.py"
+    edit(train, SCENE, f'{PAIR}{SCENE}    pair["second"].training_setup(opt)\n')
+    edit(train, BACKWARD, BOTH)
+    edit(train, SAVED, f'{SAVED}                pair["second"].save_ply({FILE})\n')
+    edit(train, STEP, f'{STEP}                pair["second"].optimizer.step()\n')
+    words = runs.command(train, photographs, tmp_path / "out", 12)
+    summary = run([*words, "--save_iterations", "13"], OPTIONS)
+    assert [each["step"] for each in summary.curves] == list(range(1, 9))
+    stores = []
+    for name in ("point_cloud", "second"):
+        first, last = (
+            tmp_path / f"out/{name}/iteration_{each}/point_cloud.ply" for each in (13, 21)
+        )
+        stores.append(sidecar.load(last)[0])
+        assert frozen_differences(first, last, read_ply) == []
+        assert not stores[-1].neutral
+    assert not torch.equal(stores[0].logits, stores[1].logits)
+    assert summary.gaussians == len(stores[0])
+    assert summary.model_after.parent.parent.name == "point_cloud"

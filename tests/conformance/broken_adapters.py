@@ -91,7 +91,7 @@ class FitsEverything(Vanilla3DGS):
     """Takes any folder for its host."""
 
     def match(self, repo: Any) -> Match:
-        return Match(self.name, "known")
+        return Match(self.name, True)
 
 
 @dataclass(frozen=True)

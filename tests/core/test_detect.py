@@ -296,7 +296,7 @@ class Installed(Vanilla3DGS):
     installed = ("toyhost_of_tests",)
 
     def match(self, repo):
-        return Match(self.name, "known" if repo.package in self.installed else "none")
+        return Match(self.name, repo.package in self.installed)
 
 
 @pytest.fixture

@@ -291,6 +291,14 @@ NOT_RESUMED = {
     "a dict": ("((gaussians.capture(), iteration)", '({"model": gaussians.capture(), "at": 1}'),
     "a removed folder": ("scene = Scene(", "shutil.rmtree(opt.model_path); scene = Scene("),
     "a lost state": ("self.optimizer.state_dict()", "None"),
+    "several models": (
+        "gaussians = GaussianModel(3)",
+        "gaussians, b = GaussianModel(3), GaussianModel(3)",
+    ),
+    "as many as asked for": (
+        "    gaussians = GaussianModel(3)\n",
+        "    for k in range(opt.models):\n        models[k] = GaussianModel(3)\n",
+    ),
 }
 
 
@@ -369,11 +377,6 @@ REFUSED = {
         {},
         [("    if chosen is not None:\n        means3D", "    means3D")],
         "draws a selection",
-    ),
-    "several models": (
-        {},
-        [("    gaussians = GaussianModel(3)", "    for _ in range(2):\n        GaussianModel(3)")],
-        "several at once",
     ),
     "another model": ({}, [("GaussianModel(3)", "DeformModel(3)")], "makes DeformModel"),
     "neither checkpoints nor models on the way": (

@@ -25,7 +25,7 @@ from fragprune_vanilla_3dgs import Vanilla3DGS
 pytestmark = pytest.mark.usefixtures("single_thread")
 
 COUNT = 60
-MATCHES = [Match(name, "known", ()) for name in ("a-host", "b-host")]
+MATCHES = [Match(name, True) for name in ("a-host", "b-host")]
 
 
 def learned() -> ThresholdStore:

@@ -25,7 +25,7 @@ from fragprune_plugins.hosts.graphdeco.call import (
 from fragprune_plugins.hosts.graphdeco.densifying import clones, needy, reaches, splits
 from fragprune_plugins.hosts.graphdeco.reading import defaults, read_flags, read_getters
 from fragprune_plugins.hosts.kernels import SURFEL, normal_sources, vendored
-from fragprune_plugins.hosts.source import nodes
+from fragprune_plugins.hosts.source import is_off, nodes, off_by_default
 
 __all__ = [
     "CLONE",
@@ -41,9 +41,11 @@ __all__ = [
     "defaults",
     "drawing_functions",
     "group_names",
+    "is_off",
     "needy",
     "nodes",
     "normal_sources",
+    "off_by_default",
     "reaches",
     "read_calls",
     "read_flags",

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from fragprune_plugins.files.model import Model
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
+    from fragprune_plugins.types import RasterOutputs
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 CAMERAS = "utils.camera_utils"

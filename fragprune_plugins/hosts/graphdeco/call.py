@@ -47,15 +47,10 @@ class RasterizerCall:
         return found.arguments <= self.arguments and passed == self
 
     def __str__(self) -> str:
-        passed = f"{', '.join(sorted(self.besides))} besides the shared settings"
-        given = f"{', '.join(sorted(self.arguments))} besides the shared arguments"
-        parts = [
-            passed if self.besides else "the shared settings alone",
-            *([given] if self.arguments else []),
-            "the result kept whole" if self.outputs is None else f"{self.outputs} values back",
-            *([f"from {self.package}"] if self.package else []),
-        ]
-        return ", ".join(parts)
+        more = ", ".join(sorted(self.besides | self.arguments)) or "nothing"
+        back = "the result kept whole" if self.outputs is None else f"{self.outputs} values back"
+        package = f", from {self.package}" if self.package else ""
+        return f"{more} besides the shared settings and arguments, {back}{package}"
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from inspect import Parameter, Signature
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -17,7 +18,17 @@ from torch import Tensor, nn
 
 from fragprune_plugins.constants import NEAR
 from fragprune_plugins.hosts.adapter import HostCall
+from fragprune_plugins.hosts.graphdeco.call import ARGUMENTS
 from fragprune_plugins.learning.losses import WINDOW, ssim_map
+
+_TAKEN = (*ARGUMENTS, "dc")
+_SIGNATURE = Signature(
+    [
+        *(Parameter(each, Parameter.POSITIONAL_OR_KEYWORD) for each in ("self", *_TAKEN[:3])),
+        *(Parameter(each, Parameter.POSITIONAL_OR_KEYWORD, default=None) for each in _TAKEN[3:]),
+        Parameter("more", Parameter.VAR_KEYWORD),
+    ]
+)
 
 
 def rasterizer(
@@ -54,35 +65,14 @@ def rasterizer(
             return visible
 
     def entry(name: str) -> Callable[..., Any]:
-        def call(
-            self: GaussianRasterizer,
-            means3D: Tensor,
-            means2D: Tensor,
-            opacities: Tensor,
-            shs: Tensor | None = None,
-            colors_precomp: Tensor | None = None,
-            scales: Tensor | None = None,
-            rotations: Tensor | None = None,
-            cov3D_precomp: Tensor | None = None,
-            dc: Tensor | None = None,
-            **more: Any,
-        ) -> Any:
+        where = f"{package}:GaussianRasterizer.{name}"
+
+        def call(self: GaussianRasterizer, *given: Any, **named: Any) -> Any:
             """Draw; see the adapter's dialect for what comes back."""
-            arguments = {
-                "means3D": means3D,
-                "means2D": means2D,
-                "opacities": opacities,
-                "shs": shs,
-                "colors_precomp": colors_precomp,
-                "scales": scales,
-                "rotations": rotations,
-                "cov3D_precomp": cov3D_precomp,
-                "dc": dc,
-                **more,
-            }
-            where = f"{package}:GaussianRasterizer.{name}"
+            arguments = dict.fromkeys(_TAKEN) | dict(zip(_TAKEN, given, strict=False)) | named
             return draw(HostCall(self.raster_settings, arguments, where))
 
+        vars(call)["__signature__"] = _SIGNATURE
         return call
 
     for name in ("forward", *also):

@@ -149,7 +149,7 @@ def _as_dict(tried: Tried) -> dict[str, Any]:
     """All findings and seams of one adapter, for --json."""
     return {
         "adapter": tried.adapter.name,
-        "confidence": tried.match.confidence,
+        "fits": tried.match.fits,
         "seams_held": tried.held,
         "seams_looked_up": tried.looked_up,
         "findings": [finding.as_dict() for finding in tried.match.findings],
