@@ -45,12 +45,8 @@ def optimizer_state(capture: Any, where: str) -> dict[str, Any]:
     ]
     if parts:
         return parts[0]
-    raise ModelFileError(
-        where,
-        "no optimizer's state in it",
-        "one, as the host captures it",
-        "Name another, or a PLY.",
-    )
+    found, expected = "no optimizer's state in it", "one, as the host captures it"
+    raise ModelFileError(where, found, expected, "Name another, or a PLY.")
 
 
 @dataclass(frozen=True)
@@ -238,15 +234,8 @@ def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
     Raises:
         UsageError: the file cannot be read.
     """
-    remedy = f"Correct {config.flag} {path}."
-    door = Door(
-        UsageError,
-        "unreadable",
-        "a file the host can read",
-        remedy,
-        limit=MEBIBYTE,
-        missing=remedy,
-    )
+    remedy, expected = f"Correct {config.flag} {path}.", "a file the host can read"
+    door = Door(UsageError, "unreadable", expected, remedy, limit=MEBIBYTE, missing=remedy)
     with door.reading(path):
         return config.read(path)
 

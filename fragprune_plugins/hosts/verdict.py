@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -164,11 +163,6 @@ def _within(folder: Path) -> Plain | None:
 
 def _hosts(root: Path) -> list[Path]:
     """Folders in a checkout that have a renderer of this family."""
-    found = []
-    for path, inside, _ in os.walk(root):
-        folder = Path(path)
-        if "gaussian_renderer" in inside and folder != root:
-            found.append(folder)
-        deep = len(folder.relative_to(root).parts) >= _DEEPEST
-        inside[:] = [] if deep else sorted(each for each in inside if not each.startswith("."))
-    return sorted(found)
+    patterns = ("*/" * deep + "gaussian_renderer" for deep in range(1, _DEEPEST + 1))
+    found = (path.parent for each in patterns for path in root.glob(each) if path.is_dir())
+    return sorted(each for each in found if "/." not in f"/{each.relative_to(root).as_posix()}")

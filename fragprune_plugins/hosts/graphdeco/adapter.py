@@ -268,17 +268,8 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def other_host(self, repo: HostRepo, found: list[str]) -> list[Finding]:
         """One error with all differences from this host, if there are any."""
-        if not found:
-            return []
-        return [
-            Finding(
-                "error",
-                "other-host",
-                str(repo.root),
-                ", ".join(found),
-                f"a {self.info.title} checkout",
-            )
-        ]
+        at, expected = str(repo.root), f"a {self.info.title} checkout"
+        return [Finding("error", "other-host", at, ", ".join(found), expected)] if found else []
 
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
         """The dialect for the arguments and outputs of the first of ``calls`` in the source."""
