@@ -38,6 +38,16 @@ def _frozen():
     gc.freeze()
 
 
+@pytest.fixture(scope="session")
+def photographs(tmp_path_factory):
+    """The demo's room, very small."""
+    from fragprune_plugins.workbench.demo.scene import make_scene
+
+    folder = tmp_path_factory.mktemp("scene")
+    make_scene(folder, views=6, width=40, points=150)
+    return folder
+
+
 @pytest.fixture
 def single_thread():
     """Torch on one thread: the same sums in the same order."""

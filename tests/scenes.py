@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
+from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.types import Compensation, Footprints, RasterInputs, Rim, Splats, View
 
 AnySplats = Splats | Footprints
@@ -388,3 +389,18 @@ def _tensors(value: View | AnySplats | RasterInputs) -> dict[str, Any]:
     """The dataclass's fields that are tensors, by name."""
     pairs = ((f.name, getattr(value, f.name)) for f in fields(value))
     return {name: tensor for name, tensor in pairs if isinstance(tensor, Tensor)}
+
+
+def blended(view: View, splats: Splats, values: Tensor) -> Tensor:
+    """(1, H, W): a number of each Gaussian (N,) blended as a colour, by the oracle in float64."""
+
+    def double(thing: Any, **changes: Any) -> Any:
+        held = {
+            k: each.detach().double() for k, each in vars(thing).items() if torch.is_tensor(each)
+        }
+        return replace(thing, **held | changes)
+
+    camera = double(view, background=torch.zeros(3, dtype=torch.float64))
+    colors = values.double()[:, None].repeat(1, 3)
+    drawn = double(splats, colors=colors, sh=None, features=None)
+    return ReferenceEngine().rasterize(RasterInputs(camera, drawn), None).image[:1].float()

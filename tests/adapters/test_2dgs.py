@@ -7,7 +7,7 @@ import pytest
 import torch
 from cli.commands import run as command_line
 from cli.commands import run_json
-from miniatures.runs import OPTIONS, check_stage_two, command, written
+from miniatures.runs import OPTIONS, check_stage_two, command, miniature
 from miniatures.surfels import SurfelHost
 from miniatures.vanilla_3dgs import Notes, joint
 from PIL import Image
@@ -30,13 +30,7 @@ from fragprune_plugins.workbench.scenes.dataset import load_dataset
 COUNT = 16
 
 
-@pytest.fixture(scope="module")
-def mini(tmp_path_factory):
-    return written(SurfelHost, tmp_path_factory.mktemp("surfels"))
-
-
-def of(mini, **options):
-    return {"path": mini, "adapter": SurfelSplatting(), "driver": SurfelHost()} | options
+mini, of = miniature(SurfelHost, SurfelSplatting, driver=SurfelHost)
 
 
 # -- the call ------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from miniatures import runs
 from miniatures.moving import MovingHost
 from miniatures.vanilla_3dgs import Notes
 from PIL import Image
+from scenes import blended
 
 from fragprune_4dgaussians import MovingGaussians
 from fragprune_4dgaussians.config import PythonFile
@@ -26,16 +27,13 @@ from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import joint, running
 from fragprune_plugins.workbench.models import model as models
-from reference_renderer import Camera, Gaussians, render
 
 LAST = 20
 OPTIONS = runs.OPTIONS
 EVERYTHING = replace(OPTIONS, settings=Settings(iterations=8, threshold_lr=0.3))
 
 
-@pytest.fixture(scope="module")
-def mini(tmp_path_factory):
-    return runs.written(MovingHost, tmp_path_factory.mktemp("moving"))
+mini, of = runs.miniature(MovingHost, MovingGaussians, driver=MovingHost)
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +53,6 @@ def output(trained, tmp_path):
 
 def command(mini, photographs, out, *more, iterations=LAST):
     return runs.command(mini / "train.py", photographs, out, iterations, *more)
-
-
-def of(mini, **options):
-    return {"path": mini, "adapter": MovingGaussians(), "driver": MovingHost()} | options
 
 
 def load(path):
@@ -368,27 +362,8 @@ def test_depth_is_the_sum_of_blended_depths_and_has_no_gradient(mini):
         view, splats = notes.inputs.view, notes.inputs.splats
         depths = splats.means @ view.viewmatrix[:3, 2] + view.viewmatrix[3, 2]
         assert not torch.equal(splats.means, model.get_xyz)
-        drawn = render(
-            Camera(
-                width=view.width,
-                height=view.height,
-                tan_fov_x=view.tan_fov_x,
-                tan_fov_y=view.tan_fov_y,
-                viewmatrix=view.viewmatrix.double(),
-                projmatrix=view.projmatrix.double(),
-                campos=view.campos.double(),
-                background=torch.zeros(3, dtype=torch.float64),
-            ),
-            Gaussians(
-                means=splats.means.detach().double(),
-                opacities=splats.opacities.detach().double(),
-                scales=splats.scales.detach().double(),
-                rotations=splats.rotations.detach().double(),
-                colors=depths.detach().double()[:, None].repeat(1, 3),
-            ),
-        )
-        depth = package["depth"]
-        torch.testing.assert_close(depth, drawn.image[:1].float(), rtol=1e-4, atol=1e-4)
+        expected, depth = blended(view, splats, depths.detach()), package["depth"]
+        torch.testing.assert_close(depth, expected, rtol=1e-4, atol=1e-4)
         assert not depth.requires_grad
         assert depth.any()
 

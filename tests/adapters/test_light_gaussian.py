@@ -14,7 +14,7 @@ import pytest
 import torch
 from miniatures import light_gaussian, runs
 from miniatures.light_gaussian import LightGaussianHost
-from miniatures.runs import OPTIONS, check_stage_two, frozen_differences, written
+from miniatures.runs import OPTIONS, check_stage_two, frozen_differences, miniature
 from miniatures.vanilla_3dgs import Notes, expect_ancestors, joint, label, running
 from oracle import naive
 
@@ -30,13 +30,7 @@ from fragprune_plugins.plugins.hookspecs import hookimpl
 COUNT = 16
 
 
-@pytest.fixture(scope="module")
-def mini(tmp_path_factory):
-    return written(LightGaussianHost, tmp_path_factory.mktemp("light"))
-
-
-def of(mini, **options):
-    return {"path": mini, "adapter": LightGaussian()} | options
+mini, of = miniature(LightGaussianHost, LightGaussian)
 
 
 # -- the counting call ---------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.mcmc import MCMCHost
-from miniatures.runs import OPTIONS, check_stage_two, written
+from miniatures.runs import OPTIONS, check_stage_two, miniature
 from miniatures.vanilla_3dgs import (
     joint,
 )
@@ -21,13 +21,7 @@ from fragprune_plugins.injection.launch import run
 COUNT = 24
 
 
-@pytest.fixture(scope="module")
-def mini(tmp_path_factory):
-    return written(MCMCHost, tmp_path_factory.mktemp("mcmc"))
-
-
-def of(mini, **options):
-    return {"path": mini, "adapter": MCMC()} | options
+mini, of = miniature(MCMCHost, MCMC)
 
 
 # -- rows ----------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from importlib import import_module
 import pytest
 import torch
 from miniatures.mini_splatting import MiniSplattingHost
-from miniatures.runs import check_stage_two, frozen_differences, written
+from miniatures.runs import check_stage_two, frozen_differences, miniature
 from miniatures.vanilla_3dgs import HOST, InterruptAt, joint, label
 
 from fragprune_mini_splatting import MiniSplatting
@@ -26,14 +26,7 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import load_plugins
 
-
-@pytest.fixture(scope="module")
-def mini(tmp_path_factory):
-    return written(MiniSplattingHost, tmp_path_factory.mktemp("mini"))
-
-
-def of(mini, **options):
-    return {"path": mini, "adapter": MiniSplatting()} | options
+mini, of = miniature(MiniSplattingHost, MiniSplatting)
 
 
 # -- which host ----------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from miniatures.mip_splatting import MipHost
-from miniatures.runs import OPTIONS, check_stage_two, command, frozen_differences, written
+from miniatures.runs import OPTIONS, check_stage_two, command, frozen_differences, miniature
 from miniatures.vanilla_3dgs import Notes, joint, label, running
 from PIL import Image
 
@@ -28,13 +28,7 @@ from fragprune_plugins.workbench.scenes.dataset import load_dataset
 COUNT = 16
 
 
-@pytest.fixture(scope="module")
-def mini(tmp_path_factory):
-    return written(MipHost, tmp_path_factory.mktemp("mip"))
-
-
-def of(mini, **options):
-    return {"path": mini, "adapter": MipSplatting(), "driver": MipHost()} | options
+mini, of = miniature(MipHost, MipSplatting, driver=MipHost)
 
 
 # -- which host ----------------------------------------------------------------------------------

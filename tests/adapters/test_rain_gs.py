@@ -12,7 +12,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.rain_gs import RainHost
-from miniatures.runs import OPTIONS, check_stage_two, written
+from miniatures.runs import OPTIONS, check_stage_two, miniature
 from miniatures.vanilla_3dgs import Notes, expect_ancestors, identity, joint, label, running
 
 from fragprune_plugins import rasterize
@@ -29,13 +29,7 @@ from fragprune_rain_gs import PACKAGE, RainGS
 COUNT = 16
 
 
-@pytest.fixture(scope="module")
-def mini(tmp_path_factory):
-    return written(RainHost, tmp_path_factory.mktemp("rain"))
-
-
-def of(mini, **options):
-    return {"path": mini, "adapter": RainGS(), "driver": RainHost()} | options
+mini, of = miniature(RainHost, RainGS, driver=RainHost)
 
 
 # -- which host, and its rasterizer ----------------------------------------------------------------

@@ -8,6 +8,7 @@ from importlib import import_module
 import pytest
 import torch
 from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
+from scenes import blended
 
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
@@ -22,7 +23,6 @@ from fragprune_plugins.testing.host import joint, running
 from fragprune_rt_4dgs import RT4DGS, neighbours
 from fragprune_rt_4dgs.config import YAMLFile
 from fragprune_rt_4dgs.dialect import RT4DGSDialect
-from reference_renderer import Camera, Gaussians, render
 
 COUNT = 16
 ENGINE = ReferenceEngine()
@@ -83,27 +83,9 @@ def test_the_six_outputs_against_their_definitions(mini, driver):
             splats.means @ camera.world_view_transform[:3, 2] + camera.world_view_transform[3, 2]
         )
         assert not flow.any()
-        channels = {"depth": depth[:, None].repeat(1, 3), "alpha": torch.ones(len(depth), 3)}
-        for name, values in channels.items():
-            drawn = render(
-                Camera(
-                    width=view.width,
-                    height=view.height,
-                    tan_fov_x=view.tan_fov_x,
-                    tan_fov_y=view.tan_fov_y,
-                    viewmatrix=view.viewmatrix.double(),
-                    projmatrix=view.projmatrix.double(),
-                    campos=view.campos.double(),
-                    background=torch.zeros(3, dtype=torch.float64),
-                ),
-                Gaussians(
-                    means=splats.means.double(),
-                    opacities=splats.opacities.double(),
-                    cov3d=splats.cov3d.double(),
-                    colors=values.double(),
-                ),
-            )
-            torch.testing.assert_close(package[name], drawn.image[:1].float(), rtol=1e-4, atol=1e-4)
+        for name, values in {"depth": depth, "alpha": torch.ones(len(depth))}.items():
+            expected = blended(view, splats, values)
+            torch.testing.assert_close(package[name], expected, rtol=1e-4, atol=1e-4)
         assert tuple(package["flow"].shape) == (2, view.height, view.width)
         there = (model.get_marginal_t(camera.timestamp) > 0.05)[:, 0]
         assert 0 < int(there.sum()) < COUNT

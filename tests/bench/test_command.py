@@ -68,19 +68,8 @@ def test_the_text_says_what_was_saved_and_how_busy_the_machine_was() -> None:
 
 
 def cameras_file(folder: Path) -> Path:
-    camera = tiny.cameras()[0]
-    entry = {
-        "id": 0,
-        "img_name": "first",
-        "width": camera.width,
-        "height": camera.height,
-        "position": (-camera.rotation.T @ camera.translation).tolist(),
-        "rotation": camera.rotation.T.tolist(),
-        "fx": camera.fx,
-        "fy": camera.fy,
-    }
     file = folder / "cameras.json"
-    file.write_text(json.dumps([entry]))
+    file.write_text(json.dumps(tiny.host_cameras(tiny.cameras()[:1])))
     return file
 
 

@@ -25,21 +25,8 @@ def scene(tmp_path):
 @pytest.fixture
 def cameras(tmp_path):
     """The cameras.json that a host writes."""
-    entries = [
-        {
-            "id": i,
-            "img_name": f"view{i:02d}",
-            "width": tiny.SIDE,
-            "height": tiny.SIDE,
-            "position": (-camera.rotation.T @ camera.translation).tolist(),
-            "rotation": camera.rotation.T.tolist(),
-            "fx": tiny.FOCAL,
-            "fy": tiny.FOCAL,
-        }
-        for i, camera in enumerate(tiny.cameras(17))
-    ]
     path = tmp_path / "cameras.json"
-    path.write_text(json.dumps(entries))
+    path.write_text(json.dumps(tiny.host_cameras(tiny.cameras(17))))
     return path
 
 

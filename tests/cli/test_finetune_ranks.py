@@ -114,22 +114,30 @@ def test_a_process_that_raises_takes_all_down_with_its_own_words(scene, tmp_path
     assert names(tmp_path) == files
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_signal_to_one_ends_all_after_the_same_step_and_one_goes_on(
-    scene, tmp_path, number, code
-):
+@pytest.mark.parametrize(
+    ("number", "more"),
+    [(signal.SIGTERM, ()), (signal.SIGINT, ()), (signal.SIGTERM, ("--shard-gaussians",))],
+)
+def test_a_signal_to_one_ends_all_after_the_same_step(scene, tmp_path, number, more):
+    """Then one process goes on; shards go on as shards."""
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
-    run_json(*words(scene, whole, "--views-per-step", 2))
+
+    def again(place):
+        if not more:
+            return run_json(*words(scene, place, "--views-per-step", 2))
+        return json.loads(command(2, *words(scene, place, *more, "--json"))[0].left[1])
+
+    again(whole)
     ended = command(
         2,
-        *words(scene, out),
+        *words(scene, out, *more),
         prepare=lambda rank: at_step(6, lambda: signal.raise_signal(number)) if rank == 1 else None,
     )
     (first, text, _), second = (each.left for each in ended)
-    assert (first, second) == (code, (0, "", ""))
+    assert (first, second) == (128 + number, (0, "", ""))
     assert "7 of 20 iterations" in text
-    report = run_json(*words(scene, out, "--views-per-step", 2))
-    assert report["resumed_at"] == 7
+    assert len(read_ply(out)) == len(read_ply(whole))
+    assert again(out)["resumed_at"] == 7
     assert out.read_bytes() == whole.read_bytes()
 
 
@@ -185,25 +193,6 @@ def test_shards_report_and_write_what_one_process_does(scene, tmp_path):
     assert other.left == (0, "", "")
     text = command(2, *words(scene, two, *more[:3], "--again"))[0].left[1]
     assert "2 processes held a part of the Gaussians each" in text
-
-
-def test_shards_save_what_they_learned_when_a_signal_comes_to_one(scene, tmp_path):
-    number = signal.SIGTERM
-    whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
-    shards = ("--shard-gaussians",)
-    command(2, *words(scene, whole, *shards))
-    ended = command(
-        2,
-        *words(scene, out, *shards),
-        prepare=lambda rank: at_step(6, lambda: signal.raise_signal(number)) if rank == 1 else None,
-    )
-    (first, text, _), second = (each.left for each in ended)
-    assert (first, second) == (128 + number, (0, "", ""))
-    assert "7 of 20 iterations" in text
-    assert len(read_ply(out)) == len(read_ply(whole))
-    first, second = command(2, *words(scene, out, *shards, "--json"))
-    assert json.loads(first.left[1])["resumed_at"] == 7
-    assert out.read_bytes() == whole.read_bytes()
 
 
 @pytest.mark.parametrize(

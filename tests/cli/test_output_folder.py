@@ -26,18 +26,7 @@ def write_output(folder, data, model, **arguments):
     known = {"sh_degree": 1, "source_path": str(data), "images": "images", "resolution": -1}
     known |= {"white_background": False, "eval": True, "data_device": "cuda"} | arguments
     (folder / "cfg_args").write_text(str(Namespace(**known)))
-    camera = tiny.cameras()[0]
-    entry = {
-        "id": 0,
-        "img_name": "one",
-        "width": camera.width,
-        "height": camera.height,
-        "position": (-camera.rotation.T @ camera.translation).tolist(),
-        "rotation": camera.rotation.T.tolist(),
-        "fx": camera.fx,
-        "fy": camera.fy,
-    }
-    (folder / "cameras.json").write_text(json.dumps([entry]))
+    (folder / "cameras.json").write_text(json.dumps(tiny.host_cameras(tiny.cameras()[:1])))
     return folder
 
 

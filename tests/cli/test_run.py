@@ -32,10 +32,8 @@ def _one_thread(single_thread):
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, views=6, width=40, points=150)
-    return folder
+def scene(photographs):
+    return photographs
 
 
 def ran(*words):

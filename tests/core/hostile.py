@@ -55,17 +55,7 @@ GEOMETRY: dict[str, dict[str, Any]] = {
 
 def camera_entry() -> dict[str, Any]:
     """A good entry of a cameras.json."""
-    camera = tiny.cameras(1)[0]
-    return {
-        "id": 0,
-        "img_name": "a",
-        "width": 32,
-        "height": 32,
-        "position": (-camera.rotation.T @ camera.translation).tolist(),
-        "rotation": camera.rotation.T.tolist(),
-        "fx": 36.0,
-        "fy": 36.0,
-    }
+    return tiny.host_cameras(tiny.cameras(1))[0]
 
 
 def image_record(

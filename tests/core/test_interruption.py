@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -50,21 +51,29 @@ def test_who_has_it_ignored_is_left_alone():
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
 
 
-def test_another_thread_than_the_main_one_changes_nothing():
+@pytest.mark.parametrize("guarded", [sigterm_interrupts, between_steps])
+def test_another_thread_than_the_main_one_changes_nothing(guarded):
     seen = []
 
-    def inside():
-        with sigterm_interrupts():
-            seen.append(signal.getsignal(signal.SIGTERM))
+    def handlers():
+        return signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
 
+    def inside():
+        with guarded() as now:
+            seen.append(handlers())
+            if now is not None:
+                now()
+
+    before = handlers()
     thread = threading.Thread(target=inside)
     thread.start()
     thread.join()
-    assert seen == [signal.SIG_DFL]
+    assert seen == [before]
 
 
-def test_a_forked_worker_just_ends():
-    with sigterm_interrupts():
+@pytest.mark.parametrize("further", [contextlib.nullcontext, between_steps])
+def test_a_forked_worker_just_ends(further):
+    with sigterm_interrupts(), further():
         child = os.fork()
         if child == 0:
             signal.raise_signal(signal.SIGTERM)
@@ -91,30 +100,6 @@ def test_between_steps_a_signal_waits_and_a_second_one_does_not():
 def test_a_signal_in_the_last_step_is_not_lost():
     with pytest.raises(KeyboardInterrupt), between_steps():
         signal.raise_signal(signal.SIGINT)
-
-
-def test_between_steps_a_forked_worker_just_ends():
-    with sigterm_interrupts(), between_steps():
-        child = os.fork()
-        if child == 0:
-            signal.raise_signal(signal.SIGTERM)
-            os._exit(0)
-        _, status = os.waitpid(child, 0)
-    assert os.waitstatus_to_exitcode(status) == 143
-
-
-def test_between_steps_in_another_thread_than_the_main_one_changes_nothing():
-    seen = []
-
-    def inside():
-        with between_steps() as now:
-            seen.append(signal.getsignal(signal.SIGINT))
-            now()
-
-    thread = threading.Thread(target=inside)
-    thread.start()
-    thread.join()
-    assert seen == [signal.default_int_handler]
 
 
 def test_sigterm_inside_a_finalizer_is_not_lost():

@@ -7,6 +7,7 @@ import math
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,6 +59,23 @@ def cameras(count: int = 9) -> list[Camera]:
         half = SIDE / 2
         result.append(Camera(rotation, translation, SIDE, SIDE, FOCAL, FOCAL, half, half))
     return result
+
+
+def host_cameras(chosen: list[Camera]) -> list[dict[str, Any]]:
+    """The content of the cameras.json that a host writes."""
+    return [
+        {
+            "id": i,
+            "img_name": f"view{i:02d}",
+            "width": camera.width,
+            "height": camera.height,
+            "position": (-camera.rotation.T @ camera.translation).tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "fx": camera.fx,
+            "fy": camera.fy,
+        }
+        for i, camera in enumerate(chosen)
+    ]
 
 
 def photographs(model: Model) -> list[torch.Tensor]:

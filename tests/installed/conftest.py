@@ -9,7 +9,6 @@ from installed.gsplat_host import GsplatHost
 
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.testing.host import running
-from fragprune_plugins.workbench.demo.scene import make_scene
 
 DRIVERS = {"gaussian-splatting": GaussianSplattingHost, "gsplat": GsplatHost}
 
@@ -17,14 +16,6 @@ DRIVERS = {"gaussian-splatting": GaussianSplattingHost, "gsplat": GsplatHost}
 @pytest.fixture(autouse=True)
 def _one_thread(single_thread):
     """Bit-identical runs need sums in one order."""
-
-
-@pytest.fixture(scope="session")
-def photographs(tmp_path_factory):
-    """The demo's room, very small."""
-    folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, views=6, width=40, points=150)
-    return folder
 
 
 @pytest.fixture

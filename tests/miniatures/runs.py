@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 from fragprune_plugins.files import sidecar
@@ -32,6 +33,26 @@ def written(host: type[Host], root: Path) -> Path:
     """The folder, a miniature now."""
     host().write(root)
     return root
+
+
+def miniature(host: type[Host], adapter: type, **defaults: type) -> tuple[Any, Any]:
+    """A fixture with the folder of a miniature, and a function for the words of a session there.
+
+    Args:
+        host: writes it.
+        adapter: of the session.
+        defaults: further words, and the classes of their values.
+    """
+
+    @pytest.fixture(scope="module")
+    def mini(tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return written(host, tmp_path_factory.mktemp("mini"))
+
+    def of(mini: Path, **options: Any) -> dict[str, Any]:
+        made = {name: kind() for name, kind in defaults.items()}
+        return {"path": mini, "adapter": adapter()} | made | options
+
+    return mini, of
 
 
 def command(script: Path, scene: object, out: object, iterations: int, *more: object) -> list[str]:

@@ -196,20 +196,7 @@ def _progress(folder: Path) -> bytes:
 
 
 def _cameras() -> bytes:
-    cameras = [
-        {
-            "id": i,
-            "img_name": f"view{i}",
-            "width": camera.width,
-            "height": camera.height,
-            "position": (-camera.rotation.T @ camera.translation).tolist(),
-            "rotation": camera.rotation.T.tolist(),
-            "fx": camera.fx,
-            "fy": camera.fy,
-        }
-        for i, camera in enumerate(tiny.cameras(VIEWS))
-    ]
-    return json.dumps(cameras).encode()
+    return json.dumps(tiny.host_cameras(tiny.cameras(VIEWS))).encode()
 
 
 def _transforms() -> bytes:
