@@ -1,19 +1,19 @@
-"""Pictures: renders, fragment-density maps, side-by-side panels, learning curves."""
+"""Pictures: renders, fragment-density maps, side-by-side panels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain, count
+from itertools import accumulate, chain, count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import PIL.Image
+import PIL.ImageDraw
+import PIL.ImageFont
+import torch
 from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
-from mpl_toolkits.axes_grid1 import ImageGrid  # type: ignore[import-untyped]
 from torch import Tensor
 
 from fragprune_plugins.files.atomic import replacing
@@ -34,6 +34,7 @@ BESIDE = tuple(
 )
 """What commands add to a view's name for further pictures of it."""
 
+_TALL, _TEXT = 240, 14  # pixels of a panel: of its pictures, at least, and of its letters
 _STEM = 150  # bytes of a picture's name, of 255 that file systems allow
 
 
@@ -85,11 +86,15 @@ def save_map(path: Path, values: Tensor, limit: float) -> None:
         limit: the value at the top of the scale; what is larger looks like it.
     """
 
+    with replacing(path) as temporary:
+        _map(values, limit).save(temporary, format="PNG")
+
+
+def _map(values: Tensor, limit: float) -> PIL.Image.Image:
     levels = (255 * values.detach().float().cpu() / max(limit, 1e-9)).clamp(0, 255).round()
     shown = PIL.Image.fromarray(levels.byte().numpy(), mode="P")
     shown.putpalette(colormaps[COLOURS](range(256), bytes=True)[:, :3].tobytes())
-    with replacing(path) as temporary:
-        shown.save(temporary, format="PNG")
+    return shown
 
 
 def colour_stops(count: int = 9) -> list[str]:
@@ -102,50 +107,31 @@ def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float)
     """Write pictures side by side under their titles; counts (H, W) become colours.
 
     Args:
-        path: the PNG or JPG.
+        path: the PNG.
         pictures: (title, picture), where a picture is (3, H, W) RGB or (H, W) counts, of one size.
         limit: the count at the top of the colour scale, which all (H, W) share.
     """
-
     height, width = pictures[0][1].shape[-2:]
-    tall = min(4.5, max(2.2, 3.6 * height / width))
-    wide = tall * width / height
-    maps = any(picture.ndim == 2 for _, picture in pictures)
-    figure = Figure(figsize=((wide + 0.08) * len(pictures) + 0.9 * maps + 0.3, tall + 0.55))
-    grid: Any = ImageGrid(
-        figure,
-        111,
-        nrows_ncols=(1, len(pictures)),
-        axes_pad=0.08,
-        cbar_mode="single" if maps else None,
-        cbar_size=0.12,
-        cbar_pad=0.1,
-    )
-    for axes, (title, picture) in zip(grid, pictures, strict=True):
-        axes.set_axis_off()
-        axes.set_title(title, fontsize=9)
-        if picture.ndim == 3:
-            axes.imshow(_bytes(picture), interpolation="nearest")
-        else:
-            shown = axes.imshow(
-                picture.detach().cpu().numpy(),
-                vmin=0,
-                vmax=max(limit, 1.0),
-                cmap=COLOURS,
-                interpolation="nearest",
-            )
-            grid.cbar_axes[0].colorbar(shown, label=LABEL)
-    _save(path, figure)
+    times = -(-_TALL // height)  # small pictures grow by whole pixels
+    font = PIL.ImageFont.load_default(_TEXT)
+    shown = [
+        (title, picture(each) if each.ndim == 3 else _map(each, limit).convert("RGB"))
+        for title, each in pictures
+    ]
+    if any(each.ndim == 2 for _, each in pictures):
+        scale = torch.linspace(limit, 0, height)[:, None].expand(-1, max(1, width // 12))
+        shown.append((f"{LABEL}, 0 to {limit:g}", _map(scale, limit).convert("RGB")))
+    wide = [max(times * each.width, int(font.getlength(title))) + _TEXT for title, each in shown]
+    panel = PIL.Image.new("RGB", (sum(wide), times * height + 2 * _TEXT), "white")
+    pen = PIL.ImageDraw.Draw(panel)
+    for at, (title, each) in zip(accumulate([0, *wide]), shown, strict=False):
+        pen.text((at, _TEXT // 4), title, "black", font)
+        large = each.resize((times * each.width, times * height), PIL.Image.Resampling.NEAREST)
+        panel.paste(large, (at, 2 * _TEXT))
+    with replacing(path) as temporary:
+        panel.save(temporary, format="PNG")
 
 
 def _bytes(image: Tensor) -> np.ndarray[Any, Any]:
     values: np.ndarray[Any, Any] = image.detach().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
     return np.round(255 * values).astype(np.uint8)
-
-
-def _save(path: Path, figure: Figure) -> None:
-
-    FigureCanvasAgg(figure)
-    with replacing(path) as temporary:
-        kind = path.suffix[1:] or "png"
-        figure.savefig(temporary, format=kind, dpi=130, bbox_inches="tight")
