@@ -1,6 +1,9 @@
-"""Makes the pictures of docs/gallery.md: ``python docs/gallery.py``, some minutes, no download.
+"""Makes the pictures of docs/gallery.md and README: ``python docs/gallery.py DEMO``.
 
-It runs ``fragprune demo`` and ``fragprune audit``, and puts what they wrote side by side.
+    fragprune demo --out DEMO
+    python docs/gallery.py DEMO
+
+It audits the demo's original, and puts what both commands wrote side by side.
 """
 
 from __future__ import annotations
@@ -17,11 +20,10 @@ GALLERY = Path(__file__).parent / "gallery"
 TILE = (320, 240)
 
 
-def main() -> None:
+def main(demo: Path) -> None:
     """All pictures."""
     with tempfile.TemporaryDirectory() as folder:
-        demo, audit = Path(folder, "demo"), Path(folder, "audit")
-        fragprune("demo", "--out", demo)
+        audit = Path(folder)
         trained = next((demo / "model").rglob("iteration_1000/point_cloud.ply"))
         fragprune("audit", trained, "--data", demo / "scene", "--out", audit)
         for view in ("view_032", "view_024"):
@@ -56,4 +58,4 @@ def side_by_side(name: str, rows: list[list[Path]]) -> None:
 
 if __name__ == "__main__":
     GALLERY.mkdir(exist_ok=True)
-    main()
+    main(Path(sys.argv[1]))

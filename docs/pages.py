@@ -38,7 +38,7 @@ def main(demo: Path) -> None:
     """The pages of the demo, of its report, of an audit, and of the viewer."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        trained = max((demo / "model").rglob("point_cloud.ply"), key=lambda path: path.parent.name)
+        trained = min((demo / "model").rglob("point_cloud.ply"), key=lambda path: path.parent.name)
         fragprune("audit", trained, "--data", demo / "scene", "--out", folder / "audit")
         report = folder / "report.html"
         fragprune("report", demo / "model", "--data", demo / "scene", "--out", report)
@@ -68,7 +68,7 @@ def photograph(browser: Any, address: str, screen: dict[str, Any]) -> Image.Imag
     page = browser.new_context(**screen).new_page()
     page.goto(address)
     page.wait_for_timeout(4000)
-    image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    image = Image.open(io.BytesIO(page.screenshot(timeout=200_000))).convert("RGB")
     page.context.close()
     return image
 

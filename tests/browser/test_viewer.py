@@ -146,6 +146,18 @@ def test_full_pixels_are_left_alone_and_look_the_same(browser, tmp_path):
         assert np.abs(stopped.image - through.image).max() <= 1.01 / 255
 
 
+def test_pixels_stop_as_the_models_do_a_few_fragments_later(browser, tmp_path):
+    view, stop = a_view(), 0.05
+    stopped = a_model(count=6000).with_stop(stop)
+    write_page(tmp_path, [a_model(count=6000), stopped], view)
+    with viewing(browser, tmp_path) as tab:
+        hold(tab, view)
+        through, soon = (frame(tab, view, layer) for layer in (0, 1))
+    assert soon.fragments.sum() < 0.9 * through.fragments.sum()
+    exact = engine_frame(stopped, view)
+    assert decibels(soon.image, exact) > decibels(through.image, exact) + 1
+
+
 def test_usual_quads_reach_as_far_for_every_gaussian(browser, tmp_path):
     model, view = a_model(), a_view()
     model.opacity.fill_(-3.0)  # faint ones end long before the square root of 8

@@ -76,9 +76,9 @@ def frame(tab: Tab, view: View, layer: int = 0, *, stop: bool = True) -> Frame:
 
 def engine_frame(model: Model, view: View, *, truncated: bool = True) -> np.ndarray:
     """Our cpu engine's picture, (H, W, 3) RGB in [0, 1]."""
-    store = model.thresholds if truncated else None
+    store, rules = (model.thresholds, model.rules) if truncated else (None, {})
     with torch.no_grad():
-        inputs = RasterInputs(view, model.splats(), planes=())
+        inputs = RasterInputs(view, model.splats(), planes=(), **rules)
         image = rasterize(inputs, store, engine="cpu").image
     return image.clamp(0, 1).permute(1, 2, 0).numpy()
 

@@ -32,6 +32,8 @@ def test_a_folder_with_cameras_and_photographs(scene, tmp_path):
     assert held["start"]["position"] == held["cameras"][0]["position"]
     assert sorted(report["files"]) == sorted(str(p) for p in out.rglob("*.*"))
     assert report["truncated"] == [True]
+    assert "positions" in report["rounded"]
+    assert all("bits" in each for each in held["models"])
 
 
 @pytest.mark.parametrize("name", [".", "index.html"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zlib
 from dataclasses import replace
 
@@ -10,13 +11,14 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.values import morton_order
 from fragprune_plugins.workbench.view.compact import compact
 from fragprune_plugins.workbench.view.packing import pack
+from fragprune_plugins.workbench.view.site import Layer, compacted, make_site
 
 
 def a_model(degree: int = 1, count: int = 400) -> Model:
@@ -148,8 +150,12 @@ def test_a_small_unit_does_not_make_a_scene_coarse():
     assert off < model.xyz.abs().max() / 1000
 
 
-def test_a_mean_that_no_step_reaches_is_refused():
-    model = a_model()
-    model.xyz[3, 1] = 1e9
-    with pytest.raises(OutputError, match="Name a folder"):
-        compact(*pack(model))
+def test_a_model_with_a_mean_that_no_step_reaches_keeps_its_tables():
+    far, near = a_model(), a_model()
+    far.xyz[3, 1] = 1e9
+    layers = [Layer("far", 0, True), Layer("near", 1, True)]
+    site = make_site("two", [far, near], layers, (), overview(near))
+    small, _ = compacted(site)
+    kept = [small[name] == site[name] for name in ("model-0.splats", "model-1.splats")]
+    assert kept == [True, False]
+    assert ["bits" in facts for facts in json.loads(small["scene.json"])["models"]] == [False, True]

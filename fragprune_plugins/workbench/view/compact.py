@@ -1,4 +1,4 @@
-"""The tables of ``packing`` in few bytes, for a page that holds its model itself.
+"""The tables of ``packing`` in few bytes, for pages that are written.
 
 Gaussians are sorted along a Z-order curve, their numbers become codes, and bytes of equal meaning
 lie one after the other, deflated. Numbers are rounded as in a .spz file where there are more than
@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fragprune_plugins.errors import OutputError
 from fragprune_plugins.workbench.models.formats.values import z_order
 
 Bytes = NDArray[np.uint8]
@@ -49,7 +48,7 @@ def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int]
         The bytes; ``bits`` and ``rows`` for the facts; what was rounded, as words for the user.
 
     Raises:
-        OutputError: a mean is too far from all others.
+        OverflowError: a mean is too far from all others.
     """
     count, coefficients = facts["gaussians"], 3 * (facts["degree"] + 1) ** 2
     geometry = np.frombuffer(tables, "<u4", count * 8).reshape(count, 8)
@@ -98,12 +97,7 @@ def _bits(means: NDArray[np.float64]) -> int:
     while bits > _BITS and most * 2.0**bits >= _FARTHEST:
         bits -= 1
     if most * 2.0**bits >= _FARTHEST:
-        raise OutputError(
-            "--out",
-            f"a Gaussian at {most:.6g}",
-            f"means within {_FARTHEST >> _BITS} units in one page",
-            "Name a folder.",
-        )
+        raise OverflowError(f"a mean at {most:.6g}")
     return bits
 
 

@@ -46,8 +46,8 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
         model: N Gaussians.
 
     Returns:
-        The bytes, and: ``gaussians``, ``degree``, ``truncated`` (has thresholds), ``stop`` (which
-        quads cannot draw with; None for none), ``rim`` (which is always hard there), ``scales``
+        The bytes, and: ``gaussians``, ``degree``, ``truncated`` (has thresholds), ``stop`` (after
+        which pixels soon end; None for none), ``rim`` (which is always hard there), ``scales``
         (least and largest logarithm of a scale).
     """
     drawn, falloff = model.splats(), model.falloff

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import re
@@ -158,15 +159,15 @@ def save_site(folder: Path, site: Site) -> None:
 def compacted(site: Site) -> tuple[Site, list[str]]:
     """The same viewer with models that take few bytes, and what was rounded for that.
 
-    Raises:
-        OutputError: a model has a Gaussian too far from all others.
+    A model with a Gaussian that is too far from all others keeps its tables.
     """
     scene, small = json.loads(site["scene.json"]), dict(site)
     rounded: dict[str, None] = {}
     for facts in scene["models"]:
-        small[facts["file"]], more, names = compact(site[facts["file"]], facts)
-        facts |= more
-        rounded |= dict.fromkeys(names)
+        with contextlib.suppress(OverflowError):
+            small[facts["file"]], more, names = compact(site[facts["file"]], facts)
+            facts |= more
+            rounded |= dict.fromkeys(names)
     small["scene.json"] = json.dumps(scene, allow_nan=False).encode()
     return small, list(rounded)
 

@@ -72,23 +72,21 @@ def view(
     if out is None:
         facts["address"] = _serve(site, port, browse=not no_browser)
         return Report(facts, "The viewer is closed.")
+    site, rounded = compacted(site)
     if single:
-        site, rounded = compacted(site)
         page = single_page(site)
         with replacing(out) as temporary:
             temporary.write_bytes(page)
-        facts |= {"bytes": len(page), "files": [str(out)], "rounded": rounded}
-        wrote = f"Wrote {out} ({_mebibytes(len(page))}): open it in a browser."
-        if rounded:
-            wrote += f" As a .spz file would, it rounds {', '.join(rounded)}."
-        return Report(facts, wrote)
-    save_site(out, site)
-    facts["files"] = [str(out / name) for name in sorted(site)]
-    return Report(
-        facts,
-        f"Wrote {len(site)} files to {out} ({_mebibytes(facts['bytes'])}). A web server has to "
-        f"serve them; here: python -m http.server -d {out}",
-    )
+        site, files, what = {out.name: page}, [str(out)], str(out)
+        then = "Open it in a browser."
+    else:
+        save_site(out, site)
+        files, what = [str(out / name) for name in sorted(site)], f"{len(site)} files to {out}"
+        then = f"A web server has to serve them; here: python -m http.server -d {out}"
+    size = sum(map(len, site.values()))
+    facts |= {"bytes": size, "files": files, "rounded": rounded}
+    how = f", with {', '.join(rounded)} rounded as in a .spz file" if rounded else ""
+    return Report(facts, f"Wrote {what} ({size / 2**20:.1f} MiB){how}. {then}")
 
 
 def _layers(paths: list[Path], truncated: list[bool]) -> list[Layer]:
@@ -107,10 +105,6 @@ def _told_apart(left: Path, right: Path) -> tuple[str, str]:
         if one != other:
             return one, other
     return str(left), str(right)
-
-
-def _mebibytes(count: int) -> str:
-    return f"{count / 2**20:.1f} MiB"
 
 
 def _cameras(data: Path | None, cameras: Path | None, white_background: bool) -> list[Shown]:

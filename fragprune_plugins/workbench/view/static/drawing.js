@@ -55,7 +55,7 @@ export class Drawing {
             this.#project(camera, layer);
             gl.enable(gl.SCISSOR_TEST);
             gl.scissor(from, 0, to - from, this.height);
-            this.#blend(layer.splats.count, counted);
+            this.#blend(layer, counted);
         }
         gl.disable(gl.SCISSOR_TEST);
     }
@@ -168,8 +168,9 @@ export class Drawing {
         gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
 
-    #blend(count, counted) {
-        const { gl } = this;
+    #blend({ splats: { count, facts }, truncated }, counted) {
+        const { gl } = this, applies = truncated || !facts.truncated;
+        const least = Math.max(1 / 512, applies ? facts.stop ?? 0 : 0); // light of a pixel that goes on
         gl.viewport(0, 0, this.width, this.height);
         gl.bindFramebuffer(gl.FRAMEBUFFER, counted ? this.countTarget : this.target);
         gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 1]);
@@ -186,7 +187,7 @@ export class Drawing {
         gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
         const portion = stop ? Math.min(PORTION, Math.max(1024, Math.ceil(count / marks))) : PORTION;
         for (let first = 0; first < count; first += portion) {
-            if (stop && first) this.#mark();
+            if (stop && first) this.#mark(least);
             gl.bindFramebuffer(gl.FRAMEBUFFER, counted ? this.countTarget : this.target);
             const use = this.#use(counted ? "counted" : "quads", QUADS, FRAGMENT(counted));
             gl.depthFunc(gl.LEQUAL);
@@ -203,7 +204,7 @@ export class Drawing {
         gl.disable(gl.BLEND);
     }
 
-    #mark() {
+    #mark(least) {
         const { gl } = this;
         const use = this.#use("mark", WHOLE, MARK);
         gl.bindFramebuffer(gl.FRAMEBUFFER, this.marks);
@@ -211,6 +212,7 @@ export class Drawing {
         gl.depthMask(true);
         gl.depthRange(0, 0);
         this.#bind(0, this.color, use("u_color"));
+        gl.uniform1f(use("u_least"), least);
         gl.drawArrays(gl.TRIANGLES, 0, 3);
         gl.depthRange(0, 1);
     }

@@ -519,9 +519,9 @@ async function start() {
     const counts = scene.models.map(({ gaussians }) => gaussians.toLocaleString("en"));
     $("#about").textContent = `${counts.join(" and ")} Gaussians`;
     const stop = Math.max(...scene.models.map(({ stop }) => stop ?? 0));
-    if (stop > 0)  // quads go on where a pixel of the model's would end
-        $("#about").textContent += `. Its pixels stop at ${+(100 * stop).toPrecision(3)} % of their light; `
-            + "here they go on, which shows as little more and costs more fragments";
+    if (stop > 0)  // they are looked at between portions
+        $("#about").textContent += `. Its pixels stop at ${+(100 * stop).toPrecision(3)} % of their light, `
+            + "here a few fragments later";
     if (scene.models.some(({ rim }) => rim === "soft"))
         $("#about").textContent += ". Its rims are soft, across a pixel; here they are hard";
 }

@@ -167,11 +167,12 @@ void main() {
     color = vec4(v_color.rgb * alpha, alpha);
 }`;
 
-// Marks, in the depth buffer, pixels with too little light left to see.
+// Marks, in the depth buffer, pixels with too little light left to see, or to go on by the model's stop.
 export const MARK = `${HEAD}
 uniform sampler2D u_color;
+uniform float u_least;
 void main() {
-    if (texelFetch(u_color, ivec2(gl_FragCoord.xy), 0).a >= ${1 / 512}) discard;
+    if (texelFetch(u_color, ivec2(gl_FragCoord.xy), 0).a >= u_least) discard;
 }`;
 
 export const SUM = side => `${HEAD}
