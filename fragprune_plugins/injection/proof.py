@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -87,7 +87,7 @@ def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bo
 def _read_or_prove(
     session: SessionState, call: SeamCall, drawn: HostCall, place: _Place, shape: tuple[Any, ...]
 ) -> Proof:
-    """A kept proof of a call of this shape, else a new one, which is kept."""
+    """A kept proof of a call of this shape, else a new one, which is kept if it fails, too."""
     means = drawn[session.dialect.means]
     engine = session.engine(means.device)
     where = torch.cuda.get_device_name(means.device) if means.is_cuda else "cpu"
@@ -97,9 +97,22 @@ def _read_or_prove(
     kept = proofs.file_of(proofs.digest_of(Path(file)), key) if file else None
     proof = proofs.read(kept) if kept else None
     if proof is None:
-        proof = _Trial(session, call, drawn, place).prove()
+        trial = _Trial(session, call, drawn, place)
+        try:
+            proof = trial.prove()
+        except _OtherwiseError as error:
+            proof = Proof(trial.where, (), failed=str(error))
         if kept:
             proofs.keep(proof, kept)
+    if proof.failed:
+        raise ProofError(
+            proof.call,
+            proof.failed,
+            f"what {session.adapter.name} draws, forward and backward",
+            "Thresholds would learn from other pictures than its own. fragprune check says whether "
+            "its PLY is plain 3DGS, which fragprune finetune prunes; --stage off trains without "
+            "thresholds, and --trust with them all the same.",
+        )
     log.info("proved: %s", proof)
     return proof
 
@@ -220,6 +233,10 @@ def _read_place(file: Path, line: int, at: str) -> _Place:
     return _Place(at, names, frozenset(unread))
 
 
+class _OtherwiseError(Exception):
+    """The two rasterizers differ; says how."""
+
+
 # ---- the proof ---------------------------------------------------------------------------------
 
 
@@ -259,7 +276,7 @@ class _Trial:
         """Compare every output and every gradient.
 
         Raises:
-            ProofError: names the first difference that matters.
+            _OtherwiseError: names the first difference that matters.
         """
         count, settings = len(self.drawn[self.dialect.means]), self.drawn.settings
         own = {
@@ -322,12 +339,14 @@ class _Trial:
         name, new = likeness.meaning(ours[1], chart.seen) or "as the adapter answers", False
         if told := _first(both, map(likeness.difference, theirs, ours)):
             if is_picture:
-                self._refuse(f"another picture: {told}")
+                raise _OtherwiseError(f"another picture: {told}")
             name, new = likeness.meaning(theirs[1], chart.seen), True
             if not name or likeness.difference(theirs[0], _made(name, own.seen)):
                 if unread:
                     return "something unknown that is not read", False
-                self._refuse(f"{self._called(number)}, which the host uses, is unknown: {told}")
+                raise _OtherwiseError(
+                    f"{self._called(number)}, which the host uses, is unknown: {told}"
+                )
             ours = [_made(name, each.seen) for each in both]
         if unread and not is_picture:
             return name, new
@@ -338,7 +357,7 @@ class _Trial:
             ours = [_made(name, each.seen) for each in both]
             wrong = _first(both, map(differ, both, theirs, ours)) and wrong
         if wrong:
-            self._refuse(f"another backward pass from {self._called(number)}: {wrong}")
+            raise _OtherwiseError(f"another backward pass from {self._called(number)}: {wrong}")
         differ = partial(_gradient_difference, self.unfelt)
         if is_picture and _first(both, map(differ, both, theirs, ours)):
             name += ", with another gradient on the screen, which stage 2 does not read"
@@ -347,16 +366,6 @@ class _Trial:
     def _called(self, number: int) -> str:
         known = number < len(self.place.values)
         return f"output {number + 1}{f' ({self.place.values[number]})' if known else ''}"
-
-    def _refuse(self, found: str) -> NoReturn:
-        raise ProofError(
-            self.where,
-            found,
-            f"what {self.session.adapter.name} draws, forward and backward",
-            "Thresholds would learn from other pictures than its own. fragprune check says whether "
-            "its PLY is plain 3DGS, which fragprune finetune prunes; --stage off trains without "
-            "thresholds, and --trust with them all the same.",
-        )
 
 
 def _first(both: list[_Both], told: Iterable[str]) -> str:

@@ -18,21 +18,24 @@ _ENDINGS = (".py", ".so", ".pyd", ".cu", ".cuh", ".cpp", ".h")
 
 @dataclass(frozen=True)
 class Proof:
-    """A call of a host's rasterizer that our engine draws the same way.
+    """A call of a host's rasterizer that was drawn by both, the same way or not.
 
     Attributes:
         call: the rasterizer, and the place of the call in the host's source.
         outputs: what each returned value is, in order.
         made: by the number of an output, its meaning (``likeness.MEANINGS``), where the proof found
             another than the adapter answers.
+        failed: how it draws otherwise; "" if it does not.
     """
 
     call: str
     outputs: tuple[str, ...]
     made: dict[int, str] = field(default_factory=dict)
+    failed: str = ""
 
     def __str__(self) -> str:
-        return f"{self.call} returns {', '.join(self.outputs)}"
+        told = f": {self.failed}" if self.failed else f" returns {', '.join(self.outputs)}"
+        return self.call + told
 
 
 def digest_of(file: Path) -> str:
@@ -68,5 +71,5 @@ def read(file: Path) -> Proof | None:
     with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
         told: dict[str, Any] = json.loads(file.read_text())
         made = {int(number): name for number, name in told["made"].items()}
-        return Proof(told["call"], tuple(told["outputs"]), made)
+        return Proof(told["call"], tuple(told["outputs"]), made, told["failed"])
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 from dataclasses import replace
@@ -9,6 +10,7 @@ from importlib import import_module
 
 import pytest
 import torch
+from cli import commands
 from cli.commands import run_json
 from miniatures import compiled, vanilla_3dgs
 from miniatures.compiled import DIFFERENCES
@@ -213,6 +215,24 @@ def test_a_proof_is_kept_until_the_rasterizer_changes(host, monkeypatch):
     assert run_json("check", folder)["proved"] == []
     draw(folder)
     assert len(made) == 2
+
+
+def test_a_failed_proof_is_kept_and_not_repeated(host, monkeypatch):
+    folder, made = host("dilation"), []
+    prove = proof._Trial.prove
+    monkeypatch.setattr(proof._Trial, "prove", lambda trial: made.append(1) or prove(trial))
+    said = set()
+    for _ in range(2):
+        with pytest.raises(ProofError) as refused:
+            draw(folder, learn=True)
+        said.add(str(refused.value))
+    assert len(said) == len(made) == 1
+    checked = commands.run("check", folder, "--json")
+    told = json.loads(checked.stdout)
+    assert (checked.exit_code, told["proved"]) == (1, [])
+    assert "another picture" in told["failed"][0]
+    assert "draws otherwise" in told["sentence"]
+    assert draw(folder, learn=True, trust=True) == [None]
 
 
 def test_a_stand_in_proves_nothing_and_says_so(caplog):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.errors import UnknownHostError
-from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
+from fragprune_plugins.hosts.adapter import Dialect, HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import Tried, attempt, closest, locate, usage
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
 from fragprune_plugins.hosts.source import HostRepo
@@ -48,14 +48,19 @@ def _single(host: Path, adapters: list[HostAdapter], adapter: str | None) -> Rep
     fitting = [each for each in tried if each.adapter in closer]
     verdict = fitting[0] if len(fitting) == 1 else None
     judged = judge(repo, tried, adapters)
-    proved = _proved(repo, verdict.adapter.dialect(repo).names()) if verdict else []
-    if proved:
+    kept = _kept(repo, verdict.adapter.dialect(repo)) if verdict else []
+    proved = [str(proof) for proof in kept if not proof.failed]
+    failed = [str(proof) for proof in kept if proof.failed]
+    if failed:
+        sentence = f"It fits {judged.adapter} by its source, but its rasterizer draws otherwise."
+        judged = replace(judged, sentence=sentence, reason="; ".join(failed))
+    elif proved:
         sentence = f"It fits {judged.adapter}, and its rasterizer was proved on this machine."
         judged = replace(judged, sentence=sentence, reason="")
     missing = _missing(repo, verdict.adapter) if verdict else []
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
     lines += ["", judged.sentence]
-    lines += [f"  {proof}" for proof in proved]
+    lines += [f"  {proof}" for proof in failed or proved]
     if judged.differs:
         lines += ["", f"It differs from {judged.adapter}:", *(f"  {d}" for d in judged.differs)]
     lines += [""]
@@ -69,14 +74,15 @@ def _single(host: Path, adapters: list[HostAdapter], adapter: str | None) -> Rep
         "commit": repo.commit,
         **judged.as_dict(),
         "fits": verdict.adapter.name if verdict else None,
-        "proved": [str(proof) for proof in proved],
+        "proved": proved,
+        "failed": failed,
         "missing": [
             {"module": each.module, "distribution": each.distribution, "at": each.at}
             for each in missing
         ],
         "adapters": [_as_dict(each) for each in tried],
     }
-    return Report(data, "\n".join(lines), exit_code=0 if verdict else 1)
+    return Report(data, "\n".join(lines), exit_code=0 if verdict and not failed else 1)
 
 
 def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter]) -> Report:
@@ -176,17 +182,21 @@ def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
     return missing_imports(repo, [repo.root / name for name in scripts], answered)
 
 
-def _proved(repo: HostRepo, packages: frozenset[str]) -> list[Proof]:
-    """The kept proofs of a host's compiled packages as they are installed or vendored now."""
+def _kept(repo: HostRepo, dialect: Dialect) -> list[Proof]:
+    """The kept proofs of a host's compiled packages as they are installed or vendored now.
+
+    None that failed for a host that is known to draw otherwise.
+    """
     found: dict[str, Proof] = {}
-    for name in sorted(packages):
+    for name in sorted(dialect.names()):
         file = repo.path(name)
         if file is None and "." not in name and name not in sys.modules:
             spec = find_spec(name)
             file = Path(spec.origin) if spec and spec.origin else None
         pattern = proofs.file_of(proofs.digest_of(file), "*") if file else None
         for path in sorted(pattern.parent.glob(pattern.name)) if pattern else ():
-            if (proof := proofs.read(path)) is not None:
+            proof = proofs.read(path)
+            if proof is not None and not (proof.failed and getattr(dialect, "otherwise", "")):
                 found[str(proof)] = proof
     return list(found.values())
 
