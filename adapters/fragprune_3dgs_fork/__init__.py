@@ -41,7 +41,6 @@ from fragprune_plugins.adapting import (
     RasterOutputs,
     Role,
     Seam,
-    SeamCall,
     Splats,
     UsageError,
     graphdeco,
@@ -64,15 +63,6 @@ log = logging.getLogger("fragprune")
 def tell_once(what: str) -> None:
     """Warn of something once."""
     log.warning("%s", what)
-
-
-def optimizers(call: SeamCall) -> list[Any]:
-    """All of the model's, the main one first."""
-    import torch
-
-    main = call.model.optimizer
-    others = [each for each in vars(call.model).values() if isinstance(each, torch.optim.Optimizer)]
-    return [main, *(each for each in others if each is not main)]
 
 
 class Unread:
@@ -332,7 +322,7 @@ class ForkAdapter(GraphdecoAdapter):
         setups = dict.fromkeys(["training_setup", *fork.setups])
         return (
             Seam(Role.SCENE, "scene", "Scene.__init__"),
-            *(of(Role.ATTACH, name, optimizers) for name in setups),
+            *(of(Role.ATTACH, name, graphdeco.optimizers) for name in setups),
             *(of(Role.STEP, name) for name in ("update_learning_rate",) if fork.defines(name)),
             of(Role.KEEP, "_prune_optimizer"),
             of(Role.APPEND, "cat_tensors_to_optimizer"),

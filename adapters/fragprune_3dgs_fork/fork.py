@@ -168,7 +168,7 @@ _known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
 def read_fork(repo: HostRepo) -> Fork:
     """Read a checkout, once; of several scripts only those that can be served, if one can."""
     if repo not in _known:
-        fork = _read(repo, _candidates(repo))
+        fork = _read(repo, graphdeco.training_scripts(repo, "*train*.py", "*/*train*.py"))
         if fork.errors and len(fork.scripts) > 1:
             alone = {script: _read(repo, (script,)) for script in fork.scripts}
             if served := tuple(script for script, each in alone.items() if not each.errors):
@@ -216,20 +216,6 @@ def _imported(repo: HostRepo, modules: Iterable[str]) -> dict[str, None]:
 
 
 # -- scripts ---------------------------------------------------------------------------------------
-
-
-def _candidates(repo: HostRepo) -> tuple[str, ...]:
-    """Scripts that train: right in the checkout, the usual one first, or in folders of it."""
-    for pattern in ("*train*.py", "*/*train*.py"):
-        files = sorted(repo.root.glob(pattern), key=lambda each: (each.stem != "train", each))
-        names = [
-            each.relative_to(repo.root).as_posix() for each in files if each.stem.isidentifier()
-        ]
-        trees = ((name, repo.tree(_module(name))) for name in names)
-        trains = {"backward", "training_setup"}
-        if found := tuple(name for name, tree in trees if tree and trains <= _mentioned(tree)):
-            return found
-    return ()
 
 
 def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:

@@ -48,11 +48,6 @@ def most_compressed(call: SeamCall) -> Path:
     return next((file for file in files if file.is_file()), files[-1])
 
 
-def optimizers(call: SeamCall) -> list[Any]:
-    """The optimizer of the Gaussians, then that of the hash grid and the colour network."""
-    return [call.model.optimizer, call.model.optimizer_net]
-
-
 @contextmanager
 def tracing(call: SeamCall) -> Iterator[RowTrace]:
     """Store row numbers as a second column of the opacities, which sorting only moves.
@@ -102,13 +97,7 @@ class Compact3DGS(GraphdecoAdapter):
     densifies_until = ()  # it prunes by its mask to the end
     own_names = tuple(f"{MODEL}:{name}" for name in ("vq_scale", "recolor", "mlp_head"))
     seams = (
-        *revised(
-            GraphdecoAdapter.seams,
-            {
-                "GaussianModel.training_setup": {"how": optimizers},
-                "GaussianModel.load_ply": None,
-            },
-        ),
+        *revised(GraphdecoAdapter.seams, {"GaussianModel.load_ply": None}),
         Seam(Role.LOAD, MODEL, "GaussianModel.load_model", ("path",), how=most_compressed),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_npz", ("path",), how=partial(ended, by=".npz")),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_npz_pp", ("path",), how=partial(ended, by=PP)),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import torch
 from torch import Tensor
 
+from fragprune_plugins.constants import TRANSMITTANCE_MIN
 from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats, View
 
 SHARE: Final = 200
@@ -89,32 +90,124 @@ def _told(off: Tensor, away: Tensor) -> str:
 # ---- what an output is -------------------------------------------------------------------------
 
 
-def _depth(drawn: RasterOutputs) -> Tensor | None:
-    return None if drawn.features is None else drawn.features[-1:]
+@dataclass(frozen=True)
+class Seen:
+    """What our engine draws for a host's call.
+
+    Attributes:
+        drawn: its outputs for ``widened`` inputs.
+        inputs: as the dialect made them.
+        draw: draws others, without thresholds for rows behind these.
+    """
+
+    drawn: RasterOutputs
+    inputs: RasterInputs
+    draw: Callable[[RasterInputs], RasterOutputs]
+
+    @property
+    def splats(self) -> Splats | None:
+        """The Gaussians, if they are ellipsoids in the world."""
+        splats = self.inputs.splats
+        return splats if isinstance(splats, Splats) and not splats.flat else None
 
 
-def _over_alpha(drawn: RasterOutputs) -> Tensor | None:
-    depth = _depth(drawn)
-    if depth is None:
+def _depths(splats: Splats, view: View) -> Tensor:
+    """(N, 1) z of the means in view space."""
+    return splats.means @ view.viewmatrix[:3, 2:3] + view.viewmatrix[3, 2]
+
+
+def _depth(seen: Seen) -> Tensor | None:
+    return None if seen.drawn.features is None else seen.drawn.features[-1:]
+
+
+def _over_alpha(seen: Seen) -> Tensor | None:
+    depth, alpha = _depth(seen), seen.drawn.alpha
+    return None if depth is None else torch.where(alpha > 0, depth / alpha.clamp(min=1e-12), 0.0)
+
+
+def _heaviest_depth(seen: Seen) -> Tensor | None:
+    """z of the Gaussian of largest weight; 0 where nothing is drawn."""
+    rows, splats = seen.drawn.winners, seen.splats
+    if rows is None or splats is None:
         return None
-    return torch.where(drawn.alpha > 0, depth / drawn.alpha.clamp(min=1e-12), 0.0)
+    depths = _depths(splats, seen.inputs.view)[rows.clamp(min=0).long(), 0]
+    return torch.where(rows >= 0, depths, 0.0)[None]
 
 
-MEANINGS: Final[Mapping[str, Callable[[RasterOutputs], Tensor | None]]] = {
-    "the picture": lambda drawn: drawn.image,
-    "alpha": lambda drawn: drawn.alpha,
-    "transmittance": lambda drawn: 1 - drawn.alpha,
+def _median_depth(seen: Seen) -> Tensor | None:
+    """z of the fragment behind which less than half of the light is left; 0 where more is.
+
+    It is what a pixel that stops behind that fragment adds to one that stops before it. The hosts'
+    own rule stops there, if two veils in front leave as little light as that.
+    """
+    splats, view = seen.splats, seen.inputs.view
+    if splats is None or splats.scales is None:
+        return None
+    depths = _depths(splats, view)
+    plain = replace(splats, features=torch.cat([torch.ones_like(depths), depths], 1))
+    near, opaque = (1 + 1e-5) * max(seen.inputs.near, 1e-3), 1 - (2 * TRANSMITTANCE_MIN) ** 0.5
+    ahead = torch.tensor([[0.0, 0.0, near, 1.0]]).double() @ torch.linalg.inv(
+        view.viewmatrix.double().cpu()
+    )
+    veil = {
+        "means": ahead[:, :3],
+        "scales": torch.full((1, 3), 2e5 * near * max(view.tan_fov_x, view.tan_fov_y)),
+        "rotations": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "opacities": torch.tensor([opaque]),
+    }
+    own = {name: each for name, each in vars(plain).items() if isinstance(each, Tensor)}
+    rows = {name: veil.get(name, torch.zeros_like(each[:1])).to(each) for name, each in own.items()}
+    veiled: Any = {name: torch.cat([each, rows[name], rows[name]]) for name, each in own.items()}
+    inputs = replace(seen.inputs, splats=plain, means2d_hook=None, stop=0.5)
+    behind = seen.draw(inputs).features
+    before = seen.draw(replace(inputs, splats=replace(plain, **veiled), stop=None)).features
+    if behind is None or before is None:
+        return None
+    weight, depth = behind - before / (1 - float(veil["opacities"])) ** 2
+    return torch.where(behind[0] > 0.5, depth / weight.clamp(min=1e-3), 0.0)[None]
+
+
+def _normals(seen: Seen, *signs: int) -> Tensor | None:
+    """(3, H, W) sum of alpha T n, n being the shortest axis, turned towards the camera.
+
+    Args:
+        seen: what our engine draws.
+        signs: of the axes of view space; none for the world's.
+    """
+    splats, view = seen.splats, seen.inputs.view
+    if splats is None or splats.scales is None or splats.rotations is None:
+        return None
+    w, *axis = torch.nn.functional.normalize(splats.rotations, dim=1).T
+    turn, unit = torch.stack(axis, 1), torch.eye(3).to(w)[splats.scales.argmin(1)]
+    cross = torch.linalg.cross(turn, unit)
+    normals = unit + 2 * (w[:, None] * cross + torch.linalg.cross(turn, cross))
+    away = (normals * (splats.means - view.campos)).sum(1, keepdim=True) > 0
+    normals = torch.where(away, -normals, normals)
+    if signs:
+        normals = normals @ view.viewmatrix[:3, :3] * torch.tensor(signs).to(normals)
+    return seen.draw(replace(seen.inputs, splats=replace(splats, features=normals))).features
+
+
+MEANINGS: Final[Mapping[str, Callable[[Seen], Tensor | None]]] = {
+    "the picture": lambda seen: seen.drawn.image,
+    "alpha": lambda seen: seen.drawn.alpha,
+    "transmittance": lambda seen: 1 - seen.drawn.alpha,
     "depth": _depth,
     "depth over alpha": _over_alpha,
-    "inverse depth": lambda drawn: drawn.invdepth,
-    "radii": lambda drawn: drawn.radii,
-    "on screen": lambda drawn: drawn.radii > 0,
-    "fragments": lambda drawn: drawn.fragments,
-    "fragments of each Gaussian": lambda drawn: drawn.fragments_per_gaussian,
-    "weight of each Gaussian": lambda drawn: drawn.weights_per_gaussian,
-    "pixels won by each Gaussian": lambda drawn: drawn.wins_per_gaussian,
+    "inverse depth": lambda seen: seen.drawn.invdepth,
+    "median depth": _median_depth,
+    "depth of the largest weight": _heaviest_depth,
+    "normals": _normals,
+    "normals in view space": lambda seen: _normals(seen, 1, 1, 1),
+    "normals in view space, y up": lambda seen: _normals(seen, 1, -1, -1),
+    "radii": lambda seen: seen.drawn.radii,
+    "on screen": lambda seen: seen.drawn.radii > 0,
+    "fragments": lambda seen: seen.drawn.fragments,
+    "fragments of each Gaussian": lambda seen: seen.drawn.fragments_per_gaussian,
+    "weight of each Gaussian": lambda seen: seen.drawn.weights_per_gaussian,
+    "pixels won by each Gaussian": lambda seen: seen.drawn.wins_per_gaussian,
 }
-"""What a rasterizer may give back, made from an engine's outputs for ``widened`` inputs.
+"""What a rasterizer may give back, made from what our engine draws.
 
 Depth is the sum of alpha T z, and inverse depth that of alpha T / z, both without background."""
 
@@ -127,10 +220,7 @@ def widened(inputs: RasterInputs) -> RasterInputs:
     splats, view = inputs.splats, inputs.view
     if isinstance(splats, Splats) and splats.flat:
         return replace(inputs, counts=True, scores=True)
-    if isinstance(splats, Footprints):
-        depths = splats.depths[:, None]
-    else:
-        depths = splats.means @ view.viewmatrix[:3, 2:3] + view.viewmatrix[3, 2]
+    depths = splats.depths[:, None] if isinstance(splats, Footprints) else _depths(splats, view)
     features = depths if splats.features is None else torch.cat([splats.features, depths], 1)
     return replace(
         inputs,
@@ -147,11 +237,11 @@ def narrowed(drawn: RasterOutputs) -> RasterOutputs:
     return replace(drawn, features=own if own is not None and len(own) else None)
 
 
-def meaning(output: Tensor | None, drawn: RasterOutputs) -> str:
+def meaning(output: Tensor | None, seen: Seen) -> str:
     """The one meaning that an output agrees with; "" for none, for several and for a constant."""
     if not isinstance(output, Tensor) or output.numel() == 0 or output.amin() == output.amax():
         return ""
-    fits = [name for name, of in MEANINGS.items() if not difference(output, of(drawn))]
+    fits = [name for name, of in MEANINGS.items() if not difference(output, of(seen))]
     return fits[0] if len(fits) == 1 else ""
 
 

@@ -28,6 +28,7 @@ from fragprune_plugins.hosts.graphdeco.call import ARGUMENTS
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.hosts.source import parsed
 from fragprune_plugins.injection import likeness, proofs
+from fragprune_plugins.injection.likeness import Seen
 from fragprune_plugins.injection.proofs import Proof
 
 if TYPE_CHECKING:
@@ -142,19 +143,20 @@ def answer(
 
 def _packed(
     dialect: Dialect, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
-) -> tuple[tuple[Any, ...], RasterOutputs]:
-    """The dialect's answer, and the engine's outputs with all meanings."""
-    seen: list[RasterOutputs] = []
+) -> tuple[tuple[Any, ...], Seen]:
+    """The dialect's answer, and what the engine draws with all meanings."""
+    seen: list[Seen] = []
 
     def drawing(each: RasterInputs, *part: int) -> RasterOutputs:
-        seen.append(draw(likeness.widened(each), *part))
-        return likeness.narrowed(seen[-1])
+        drawn = draw(likeness.widened(each), *part)
+        seen.append(Seen(drawn, each, lambda other: draw(other, *part)))
+        return likeness.narrowed(drawn)
 
     return _tuple(dialect.answer(call, inputs, drawing)), seen[0]
 
 
-def _made(name: str, drawn: RasterOutputs) -> Any:
-    value = likeness.MEANINGS[name.removesuffix(_DETACHED)](drawn)
+def _made(name: str, seen: Seen) -> Any:
+    value = likeness.MEANINGS[name.removesuffix(_DETACHED)](seen)
     return value.detach() if value is not None and name.endswith(_DETACHED) else value
 
 
@@ -249,14 +251,14 @@ class _Both:
         leaves: the arguments that get gradients, one row per Gaussian.
         theirs: what the host's rasterizer returned.
         ours: what the dialect answers.
-        seen: our engine's outputs with all meanings.
+        seen: what our engine draws, with all meanings.
     """
 
     what: str
     leaves: dict[str, Tensor]
     theirs: tuple[Any, ...]
     ours: tuple[Any, ...]
-    seen: RasterOutputs
+    seen: Seen
 
 
 class _Trial:
@@ -335,7 +337,7 @@ class _Trial:
         own, chart = both
         said = ours[0] is None or getattr(type(ours[0]), "unread", False)
         unread = number in self.place.unread or (number < len(own.ours) and said)
-        is_picture = not likeness.difference(ours[1], chart.seen.image)
+        is_picture = not likeness.difference(ours[1], chart.seen.drawn.image)
         name, new = likeness.meaning(ours[1], chart.seen) or "as the adapter answers", False
         if told := _first(both, map(likeness.difference, theirs, ours)):
             if is_picture:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.adapter import HostCall
@@ -182,11 +183,19 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
 
             def truncated(each: RasterInputs, part: int = 0) -> RasterOutputs:
                 if further_picture(state, view, part):
-                    return engine.rasterize(each, thresholds)
+                    return engine.rasterize(each, covering(thresholds, each))
                 return rasterize(engine, state, view, thresholds, each, part)
 
             return answer(session.dialect, drawn, inputs, truncated, proof)
     return by_host()
+
+
+def covering(thresholds: Tensor | None, inputs: RasterInputs) -> Tensor | None:
+    """The thresholds (N,), followed by neutral ones for rows that were added behind."""
+    if thresholds is None or len(thresholds) == len(inputs.splats):
+        return thresholds
+    neutral = thresholds.new_full((len(inputs.splats) - len(thresholds),), NEUTRAL_LOGIT)
+    return torch.cat([thresholds, neutral.sigmoid()])
 
 
 def further_picture(state: ModelState, view: int, part: int) -> bool:

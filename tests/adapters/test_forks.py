@@ -145,7 +145,7 @@ def test_a_proof_sees_every_value_beside_its_own_channel(scene, objects):
     inputs = DIALECT.unpack(call)
     values, seen = proof._packed(DIALECT, call, inputs, lambda each: engine.rasterize(each, None))
     assert len(values[2]) == OBJECTS
-    torch.testing.assert_close(seen.features[-1:], values[4])
+    torch.testing.assert_close(seen.drawn.features[-1:], values[4])
 
 
 def test_only_the_first_picture_of_a_view_in_a_step_is_pressed():

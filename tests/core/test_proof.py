@@ -22,6 +22,7 @@ from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.invariants.case import FixedThresholds, open_all
 from fragprune_vanilla_3dgs import Vanilla3DGS
+from reference_renderer.covariance import rotation_matrices
 
 RENDERER = "gaussian_renderer/__init__.py"
 EQUAL = {
@@ -31,6 +32,11 @@ EQUAL = {
     "depth over alpha": ("the picture", "radii", "depth over alpha"),
     "inverse depth": ("the picture", "radii", "inverse depth"),
     "alpha": ("the picture", "radii", "alpha"),
+    "median depth": ("the picture", "radii", "median depth, without gradient"),
+    "largest weight": ("the picture", "radii", "depth of the largest weight, without gradient"),
+    "normals": ("the picture", "radii", "normals, without gradient"),
+    "normals in view space": ("the picture", "radii", "normals in view space, without gradient"),
+    "normals, y up": ("the picture", "radii", "normals in view space, y up, without gradient"),
 }
 OTHERWISE = {
     "projection": "another picture: in the host's own call",
@@ -65,7 +71,7 @@ def host(tmp_path):
         folder = tmp_path / "host"
         shutil.copytree(vanilla_3dgs.HOST, folder, dirs_exist_ok=True)
         compiled.write(folder, difference)
-        if DIFFERENCES[difference].also:
+        if DIFFERENCES[difference].also or DIFFERENCES[difference].weighed:
             source = (folder / RENDERER).read_text()
             source = source.replace("image, radii =", f"image, radii, {returned} =")
             source = source.replace('"radii": radii,', f'"radii": radii, {result}')
@@ -80,16 +86,23 @@ def running(folder, **options):
     return vanilla_3dgs.running(path=folder, drop_in=None, **options)
 
 
-def draw(folder, **options):
+def draw(folder, *, turned=False, **options):
     """Draw one view under a session; its proofs."""
     with running(folder, **options) as host:
-        host.render(host.camera(96, 64), host.model(40, setup=False))
+        camera = host.camera(96, 64)
+        if turned:  # around the points, which are around the origin
+            turn = torch.eye(4)
+            turn[:3, :3] = rotation_matrices(torch.tensor([[0.9, 0.3, -0.2, 0.1]]))[0]
+            for name in ("world_view_transform", "full_proj_transform"):
+                setattr(camera, name, turn @ getattr(camera, name))
+            camera.camera_center = camera.camera_center @ turn[:3, :3].T
+        host.render(camera, host.model(40, setup=False))
         return list(host.session.proofs.values())
 
 
 @pytest.mark.parametrize("difference", EQUAL)
 def test_outputs_are_told_by_their_numbers(host, difference):
-    (proved,) = draw(host(difference))
+    (proved,) = draw(host(difference), turned=True)
     assert proved.outputs == EQUAL[difference]
     assert f"render ({RENDERER}:" in proved.call
 
@@ -117,6 +130,35 @@ def test_every_difference_is_tried():
 def test_an_unknown_output_that_nobody_reads_is_let_be(host):
     (proved,) = draw(host("unknown", "_more", ""))
     assert proved.outputs[2] == "something unknown that is not read"
+
+
+def test_normals_are_unknown_where_the_camera_stands_as_the_world_does(host):
+    with pytest.raises(ProofError, match="output 3"):
+        draw(host("normals"))
+
+
+def test_median_depth_is_made_with_thresholds(host):
+    fixed = FixedThresholds(torch.linspace(0.02, 0.4, 40))
+    options = {"path": host("median depth"), "drop_in": None, "plugins": [fixed]}
+    settings = Settings(iterations=9, goal=Pressure(0.0))
+    with vanilla_3dgs.joint(settings, **options) as running:
+        model, camera = running.model(40), running.camera(96, 64)
+        open_all(running, model)
+        found = running.render(camera, model)["more"]
+        splats = fixed.inputs.splats
+        rows = replace(fixed.inputs, splats=replace(splats, features=None), means2d_hook=None)
+        weights = torch.cat(
+            [
+                ReferenceEngine()
+                .rasterize(replace(rows, splats=replace(splats, features=each)), fixed.values)
+                .features
+                for each in torch.eye(40).split(8, dim=1)
+            ]
+        )
+        expected = compiled.median_depth(weights, splats, fixed.inputs.view)
+        off = (found[0] - expected).abs() > 1e-3
+        assert off.sum() <= off.numel() // 200
+        assert expected.gt(0).any()
 
 
 @pytest.mark.parametrize("difference", ["depth", "depth without gradient", "depth over alpha"])

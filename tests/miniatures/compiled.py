@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -44,6 +44,7 @@ class Difference:
         backward: by an argument's name, the gradient (N, ...) from the right one and the argument.
         radii: divides them.
         also: further outputs, of a rendering whose feature is the view depth.
+        weighed: a further output, of the weights (N, H, W) of all Gaussians, and of these.
     """
 
     options: dict[str, Any] | None = None
@@ -51,6 +52,7 @@ class Difference:
     backward: dict[str, Callable[[Tensor, Tensor], Tensor]] | None = None
     radii: int = 1
     also: tuple[Callable[[Rendering], Tensor], ...] = ()
+    weighed: Callable[[Tensor, Gaussians, Camera], Tensor] | None = None
 
 
 def straight(camera: Camera, points: Tensor) -> Tensor:
@@ -68,6 +70,40 @@ def unclamped(means: Tensor, campos: Tensor, sh: Tensor, degree: int) -> Tensor:
     """Colours as the oracle's, but not clamped at 0."""
     basis = sh_basis(torch.nn.functional.normalize(means - campos, dim=-1), degree)
     return (basis[:, :, None] * sh[:, : basis.shape[1]]).sum(dim=1) + 0.5
+
+
+def view_depths(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """(N,) z in view space."""
+    return (gaussians.means @ camera.viewmatrix[:3, 2] + camera.viewmatrix[3, 2]).detach()
+
+
+def median_depth(weights: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
+    """z of the first fragment, front to back, behind which less than half of the light is left."""
+    depths, order = view_depths(gaussians, camera).sort()
+    dark = 1 - weights.detach()[order].cumsum(0) < 0.5
+    return torch.where(dark.any(0), depths[dark.int().argmax(0)], 0.0)
+
+
+def heaviest_depth(weights: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
+    """z of the Gaussian of largest weight."""
+    best, rows = weights.detach().max(0)
+    return torch.where(best > 0, view_depths(gaussians, camera)[rows], 0.0)
+
+
+def normals(*signs: float) -> Callable[[Tensor, Gaussians, Camera], Tensor]:
+    """Sums of the shortest axes, in the world or with these signs in view space."""
+
+    def blended(weights: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
+        turned = covariances.rotation_matrices(gaussians.rotations)
+        rows = torch.arange(len(turned))
+        axes = turned[rows, :, gaussians.scales.argmin(1)]
+        facing = (camera.campos - gaussians.means).mul(axes).sum(1).sign()
+        axes = axes * facing[:, None]
+        if signs:
+            axes = axes @ camera.viewmatrix[:3, :3] * torch.tensor(signs)
+        return torch.einsum("nhw,nc->chw", weights, axes).detach()
+
+    return blended
 
 
 _jacobians, _squared_distances = covariances.jacobians, fragments.squared_distances
@@ -102,6 +138,11 @@ DIFFERENCES = {
     ),
     "inverse depth": Difference(also=(lambda drawn: drawn.invdepth,)),
     "alpha": Difference(also=(lambda drawn: drawn.alpha[0],)),
+    "median depth": Difference(weighed=median_depth),
+    "largest weight": Difference(weighed=heaviest_depth),
+    "normals": Difference(weighed=normals()),
+    "normals in view space": Difference(weighed=normals(1, 1, 1)),
+    "normals, y up": Difference(weighed=normals(1, -1, -1)),
     "unknown": Difference(also=(lambda drawn: drawn.features.sqrt(),)),
     "constant": Difference(also=(lambda drawn: torch.zeros_like(drawn.alpha),)),
 }
@@ -164,7 +205,12 @@ class Rasterizer(nn.Module):
         options = Options(**own | (other.options or {}))
         with other.patched():
             drawn = render(camera, gaussians, means2d_hook=given["means2D"], options=options)
-        return drawn.image, drawn.radii // other.radii, *(of(drawn) for of in other.also)
+            also = [of(drawn) for of in other.also]
+            if other.weighed is not None:
+                rows = replace(gaussians, features=torch.eye(len(means)))
+                weights = render(camera, rows, options=options).features
+                also.append(other.weighed(weights, gaussians, camera))
+        return drawn.image, drawn.radii // other.radii, *also
 
 
 def write(folder: Any, difference: str) -> None:

@@ -15,6 +15,7 @@ from fragprune_plugins.hosts.graphdeco.adapter import (
     GraphdecoDialect,
     default,
     group_names,
+    optimizers,
 )
 from fragprune_plugins.hosts.graphdeco.call import (
     CallInSource,
@@ -23,7 +24,12 @@ from fragprune_plugins.hosts.graphdeco.call import (
     read_calls,
 )
 from fragprune_plugins.hosts.graphdeco.densifying import clones, needy, reaches, splits
-from fragprune_plugins.hosts.graphdeco.reading import defaults, read_flags, read_getters
+from fragprune_plugins.hosts.graphdeco.reading import (
+    defaults,
+    read_flags,
+    read_getters,
+    training_scripts,
+)
 from fragprune_plugins.hosts.kernels import SURFEL, normal_sources, vendored
 from fragprune_plugins.hosts.source import is_off, nodes, off_by_default
 
@@ -46,10 +52,12 @@ __all__ = [
     "nodes",
     "normal_sources",
     "off_by_default",
+    "optimizers",
     "reaches",
     "read_calls",
     "read_flags",
     "read_getters",
     "splits",
+    "training_scripts",
     "vendored",
 ]

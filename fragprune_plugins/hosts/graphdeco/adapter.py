@@ -47,9 +47,10 @@ CAMERAS = "utils.camera_utils"
 
 
 def optimizers(call: SeamCall) -> list[Any]:
-    """The main one, and the exposures' where the revision has it."""
-    extra = getattr(call.model, "exposure_optimizer", None)
-    return [call.model.optimizer, *([extra] if extra is not None else [])]
+    """All of the model's, the main one first."""
+    main = call.model.optimizer
+    own = [each for each in vars(call.model).values() if hasattr(each, "param_groups")]
+    return [main, *(each for each in own if each is not main)]
 
 
 def completed(call: SeamCall) -> Any:
@@ -284,9 +285,12 @@ class GraphdecoAdapter(ScriptAdapter):
         )
 
     def scripts_of(self, repo: HostRepo) -> tuple[str, ...]:
-        """``scripts``; where a checkout has none of them, its own that train a GaussianModel."""
-        there = any((repo.root / name).is_file() for name in self.scripts)
-        return self.scripts if there else training_scripts(repo) or self.scripts
+        """``scripts``; where a checkout has none of them, its own that train one GaussianModel."""
+        if any((repo.root / name).is_file() for name in self.scripts):
+            return self.scripts
+        trains = training_scripts(repo, "*train*.py")
+        one = (each for each in trains if len(repo.calls(each[:-3], "GaussianModel")) == 1)
+        return tuple(one) or self.scripts
 
     def command_line(self, repo: HostRepo) -> CommandLine:
         """The flags of ``train.py``; the iteration count's default is read from the source.

@@ -70,11 +70,18 @@ def computed(function: Function, attribute: str) -> str | None:
     return None if returned else "computed, it returns nothing"
 
 
-def training_scripts(repo: HostRepo) -> tuple[str, ...]:
-    """Scripts right in the checkout's folder that make one GaussianModel, and go backward."""
-    names = sorted(each.stem for each in repo.root.glob("*train*.py"))
-    trains = [n for n in names if len(repo.mentions([n], ("training_setup", "backward"))) == 2]
-    return tuple(f"{each}.py" for each in trains if len(repo.calls(each, "GaussianModel")) == 1)
+def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:
+    """Scripts that train, the usual one first, by the first of the patterns that finds any."""
+    for pattern in patterns:
+        files = sorted(repo.root.glob(pattern), key=lambda each: (each.stem != "train", each))
+        paths = [each.relative_to(repo.root) for each in files if each.stem.isidentifier()]
+        parts = {each.as_posix(): ".".join(each.with_suffix("").parts) for each in paths}
+        trains = ("training_setup", "backward")
+        if found := [
+            each for each, name in parts.items() if len(repo.mentions([name], trains)) > 1
+        ]:
+            return tuple(found)
+    return ()
 
 
 def defaults(repo: HostRepo, module: str, name: str) -> Iterator[ast.expr]:
