@@ -206,29 +206,27 @@ class PressureController:
     Args:
         target: before over after, > 1.
         follows: per cents that it falls by if fragments fall by one.
-        warmup: share of the run before the first correction: thresholds have not settled.
-        period: share of the run between corrections.
-        gain: share of the error, mapped through the known curve, that one correction removes.
-        reach: lambda stays within this factor of its starting value (anti-windup).
     """
 
-    def __init__(
-        self,
-        target: float,
-        *,
-        follows: float = 1.0,
-        warmup: float = 0.2,
-        period: float = 0.04,
-        gain: float = 0.35,
-        reach: float = 60.0,
-    ) -> None:
+    warmup = 0.2
+    """Share of the run before the first correction: thresholds have not settled."""
+
+    period = 0.04
+    """Share of the run between corrections."""
+
+    gain = 0.35
+    """Share of the error, mapped through the known curve, that one correction removes."""
+
+    reach = 60.0
+    """Lambda stays within this factor of its starting value (anti-windup)."""
+
+    def __init__(self, target: float, *, follows: float = 1.0) -> None:
         self.target = target
-        self.warmup, self.period, self.gain = warmup, period, gain
         self._slope = follows * _CURVE_SLOPE
         start = LEAST_PRESSURE * (target ** (1 / follows) / _CURVE_SPEEDUP) ** (1 / _CURVE_SLOPE)
-        self._log_range = (math.log(start / reach), math.log(start * reach))
+        self._log_range = (math.log(start / self.reach), math.log(start * self.reach))
         self.value = start
-        self._next = warmup
+        self._next = self.warmup
         self._sum = 0.0
         self._count = 0
 

@@ -26,6 +26,8 @@ CALIBRATE_AT = 0.85
 CALIBRATION_VIEWS = 24
 """Number of training views that a calibration measures at most."""
 
+_REACH = 8.0  # largest shift either way, in logits
+
 
 class Target:
     """Meets a ratio of fragments.
@@ -83,7 +85,6 @@ def calibrate(
     target: float,
     *,
     tolerance: float = 0.01,
-    reach: float = 8.0,
     rounds: int = 16,
 ) -> float:
     """Shift all threshold logits by one number so that ``ratio()`` meets ``target``.
@@ -96,14 +97,13 @@ def calibrate(
         ratio: before over after, with the store as it stands.
         target: of the ratio.
         tolerance: relative distance at which to stop.
-        reach: largest shift either way, in logits.
         rounds: most measurements.
 
     Returns:
         The ratio measured last.
     """
     start = store.logits.detach().clone()
-    low, high = -reach, reach
+    low, high = -_REACH, _REACH
     shift, reached = 0.0, ratio()
     for _ in range(rounds):
         if abs(reached / target - 1) <= tolerance:

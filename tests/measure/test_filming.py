@@ -36,7 +36,7 @@ def test_an_orbit_goes_once_around_at_one_height_and_distance(up):
     splat = tiny.random_model()
     centre, _ = bounds(splat)
     axis = torch.nn.functional.normalize(torch.tensor(up), dim=0)
-    away = torch.stack([view.campos - centre for _, view in orbit(splat, 12, up, width=64)])
+    away = torch.stack([view.campos - centre for _, view in orbit(splat, 12, up)])
     heights = away @ axis
     assert float(heights.std()) < 1e-4 * float(heights.abs().mean())
     assert float(heights.mean()) > 0

@@ -1,4 +1,4 @@
-"""Scores equal what loops over floats give, fragment by fragment."""
+"""What a Gaussian is worth equals what loops over floats give; the best stay."""
 
 from __future__ import annotations
 
@@ -59,67 +59,19 @@ def colour(fragments, background):
     return [o + light * b for o, b in zip(out, background, strict=True)]
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["whole", "truncated"])
-def expected(request):
-    """Every score by brute force, and the scene."""
-    model, thresholds = scene(request.param)
-    splats = model.splats()
-    keys = ("total-weight", "largest-weight", "falloff-gradient", "removal-error", "hits")
-    found = {key: [0.0] * COUNT for key in keys}
-    mean = [[[0.0, 0, 0] for _ in VIEWS] for _ in range(COUNT)]  # weight, fragments, wins
-    for number, records, background, opacities in pixels(model, thresholds):
+@pytest.mark.parametrize("truncated", [False, True], ids=["whole", "truncated"])
+def test_the_removal_error_is_estimated_without_bias(truncated, monkeypatch):
+    """With P probes over many pixels the relative error is about sqrt(2 / (P x views))."""
+    model, thresholds = scene(truncated)
+    truth = torch.zeros(COUNT)
+    for _, records, background, _ in pixels(model, thresholds):
         pairs = [(r.alpha, r.color) for r in records]
         whole = colour(pairs, background)
-        weights = [r.alpha * r.light for r in records]
-        for k, (record, weight) in enumerate(zip(records, weights, strict=True)):
-            row = record.row
-            found["total-weight"][row] += weight
-            found["largest-weight"][row] = max(found["largest-weight"][row], weight)
-            found["hits"][row] += 1
+        for k, record in enumerate(records):
             without = colour(pairs[:k] + pairs[k + 1 :], background)
-            found["removal-error"][row] += sum(
-                (a - b) ** 2 for a, b in zip(whole, without, strict=True)
-            )
-            step = 1e-4  # a pixel is linear in one falloff: any step is exact
-            moved = record.alpha + step * opacities[row], record.color
-            more = [*pairs[:k], moved, *pairs[k + 1 :]]
-            slope = (sum(colour(more, background)) - sum(whole)) / step
-            found["falloff-gradient"][row] += slope**2
-            mean[row][number][0] += weight
-            mean[row][number][1] += 1
-        if weights:
-            mean[records[weights.index(max(weights))].row][number][2] += 1
-    found["mini-splatting"] = [
-        sum(weight / hits for weight, hits, wins in views if wins) for views in mean
-    ]
-    volumes = splats.scales.double().prod(dim=1)
-    hits = torch.tensor(found.pop("hits"), dtype=torch.float64)
-    found["light-gaussian"] = (splats.opacities.double() * hits * volumes**0.1).tolist()
-    found["opacity"] = splats.opacities.double().tolist()
-    price = hits / len(VIEWS) + scores.GAUSSIAN_PRICE
-    error = torch.tensor(found["removal-error"], dtype=torch.float64)
-    found["removal-error-per-price"] = (error / price).tolist()
-    return model, thresholds, found
-
-
-EXACT = sorted(set(scores.SCORES) - {"removal-error", "removal-error-per-price"})
-
-
-@pytest.mark.parametrize("name", EXACT)
-def test_a_score_equals_that_of_loops_over_floats(expected, name):
-    model, thresholds, found = expected
-    got = scores.SCORES[name](model, thresholds, VIEWS, create_engine("auto"))
-    assert got.shape == (COUNT,)
-    assert got.tolist() == pytest.approx(found[name], rel=1e-3, abs=1e-6)
-
-
-@pytest.mark.parametrize("name", ["removal-error", "removal-error-per-price"])
-def test_the_removal_error_is_estimated_without_bias(expected, name, monkeypatch):
-    """With P probes over many pixels the relative error is about sqrt(2 / (P x views))."""
-    model, thresholds, found = expected
+            truth[record.row] += sum((a - b) ** 2 for a, b in zip(whole, without, strict=True))
     monkeypatch.setattr(scores, "PROBES", 400)
-    got = scores.SCORES[name](model, thresholds, VIEWS, create_engine("auto"))
-    truth = torch.tensor(found[name]).float()
+    got = scores.removal_error(model, thresholds, VIEWS, create_engine("auto"))
     spread = (2 / (400 * 1)) ** 0.5  # as if only one view counted
     assert ((got - truth).abs() <= 4 * spread * truth + 1e-9).all()
     assert (got[:3] == 0).all()
@@ -163,7 +115,7 @@ def test_thresholds_and_moments_stay_with_their_rows():
 
 def test_a_model_without_thresholds_is_pruned_by_the_score_that_is_asked_for():
     model, _ = scene(False)
-    smaller = scores.keep_best(model, 0.3, VIEWS, score=scores.opacity)
+    smaller = scores.keep_best(model, 0.3, VIEWS, score=lambda *_: model.splats().opacities)
     assert smaller.thresholds is None
     faintest = model.opacity[:, 0].sort(descending=True).values[int(0.3 * COUNT) - 1]
     assert torch.equal(smaller.opacity, model.opacity[model.opacity[:, 0] >= faintest])

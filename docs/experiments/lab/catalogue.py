@@ -44,7 +44,7 @@ class Pruning:
     """Whole Gaussians that go before a training.
 
     Attributes:
-        score: its name in ``measure.scores.SCORES``; taken on the training views.
+        score: its name in ``scores.SCORES``; taken on the training views.
         keep: share of the Gaussians that stays, those of the highest score.
     """
 

@@ -20,12 +20,13 @@ from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times, measure_all
 from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.pruning.scores import SCORES, best
+from fragprune_plugins.workbench.pruning.scores import best
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from lab.catalogue import Arm, Experiment, Pruning
 from lab.folder import Folder
 from lab.rules import finetune_by
 from lab.scene import describe_drawing, describe_photographs
+from lab.scores import SCORES
 
 ENLARGED = 4
 """Frames are timed at the photographs' size, and with sides this many times as long."""

@@ -32,8 +32,8 @@ def checkpoint(case: Case) -> str:
     return "checkpoint"
 
 
-def _trained(host: Running, count: int = 20) -> Any:
-    model, camera = host.model(count), host.camera()
+def _trained(host: Running) -> Any:
+    model, camera = host.model(20), host.camera()
     for iteration in (1, 2, 3):
         host.step(model, camera, iteration)
     return model

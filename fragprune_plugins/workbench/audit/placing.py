@@ -99,7 +99,7 @@ def place(
             f"on a distant surface, and outside an object at most {ENCLOSED:.0%} do. If it is a "
             "hollow object, pass --orbit."
         )
-    views = within(eyes, 2 * count, width=pixels, height=pixels)
+    views = within(eyes, 2 * count, pixels=pixels)
     seen = [float(_met(engine, splats, _small(view), near).mean()) for _, view in views]
     half = sorted(seen, reverse=True)[count - 1]  # doors and open sides show nothing
     chosen = [view for view, share in zip(views, seen, strict=True) if share >= half]
@@ -108,7 +108,7 @@ def place(
 
 def _orbit(splat: Model, count: int, pixels: int) -> Named:
     """Cameras all around, from above first: worlds of COLMAP, which most are, have y down."""
-    views = around(splat, count, width=pixels, height=pixels)
+    views = around(splat, count, pixels=pixels)
     return sorted(views, key=lambda named: float(named[1].campos[1]))
 
 

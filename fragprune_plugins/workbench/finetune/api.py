@@ -11,7 +11,6 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.targets import Target
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for
 from fragprune_plugins.workbench.distributed.processes import processes_of
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
@@ -31,7 +30,6 @@ def finetune(
     settings: Settings | None = None,
     *,
     schedule: Schedule | None = None,
-    target: Target | None = None,
     engine: str | Engine = "auto",
     progress: bool = False,
     checkpoints: Checkpoints | None = None,
@@ -51,7 +49,6 @@ def finetune(
             and follow the model one view at a time.
         settings: iterations, what moves, the goal; defaults when None.
         schedule: gives the plan of each step; when None a plugin's, or the default one.
-        target: holds thresholds to a ratio; that of the goal when None.
         engine: a name or an engine.
         progress: draw a bar on stderr.
         checkpoints: where the unfinished fine-tuning is kept. If there is one of the same
@@ -81,8 +78,7 @@ def finetune(
         return strongest(train, settings, dataset.test, engine=engine).result
     processes = processes_of(engine, ranks, len(model))
     processes.expect_able(settings)
-    if isinstance(goal, Faster) and target is None:
-        target = FrameTarget(goal.ratio)
+    target = FrameTarget(goal.ratio) if isinstance(goal, Faster) else None
     if goal.on_area and model.pruned:
         raise UsageError(
             "finetune",

@@ -31,6 +31,7 @@ LIMIT_VIEWS = 4
 
 _ROUNDS, _SECONDS = 7, 1.5  # at least
 _NEAR = 0.02  # a share by which frame times are noisy
+_MEASURED = 5  # times at most, to meet a target
 
 
 class FrameTarget(Target):
@@ -133,8 +134,6 @@ def calibrate_measured(
     target: float,
     *,
     seen: Ratios | None = None,
-    tolerance: float = 0.02,
-    rounds: int = 5,
 ) -> float:
     """Shift all thresholds so that a measured ratio meets a target, through that of fragments.
 
@@ -144,19 +143,17 @@ def calibrate_measured(
         measured: of frame times, likewise.
         target: of the measured ratio.
         seen: what was measured before, to begin with; added to.
-        tolerance: relative distance at which to stop.
-        rounds: most measurements.
 
     Returns:
         The ratio measured last.
     """
     seen, reached = Ratios() if seen is None else seen, math.nan
-    for _ in range(rounds):
+    for _ in range(_MEASURED):
         aim = target ** (1 / seen.slope(target))
-        met = calibrate(store, fragments, aim, tolerance=tolerance / 4)
+        met = calibrate(store, fragments, aim, tolerance=_NEAR / 4)
         reached = measured()
         seen.add(met, reached)
-        if abs(reached / target - 1) <= tolerance:
+        if abs(reached / target - 1) <= _NEAR:
             break
     return reached
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -20,15 +21,13 @@ from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate
 
+_PICTURE: dict[str, Any] = {"width": 1280, "height": 720, "fov_y": 50.0}
+
 
 def orbit(
     splat: Model,
     count: int,
     up: tuple[float, float, float] = (0.0, -1.0, 0.0),
-    *,
-    width: int = 1280,
-    height: int = 720,
-    fov_y: float = 50.0,
 ) -> Named:
     """Cameras once around a splat, from ``overview``'s height and distance, evenly spaced.
 
@@ -36,14 +35,11 @@ def orbit(
         splat: N Gaussians.
         count: cameras; the one after the last would be the first.
         up: (3,) what is up in its world; COLMAP's worlds have y down.
-        width: pixels.
-        height: pixels.
-        fov_y: vertical field of view, degrees.
 
     Raises:
         InputError: there is no such view.
     """
-    first = overview(splat, up, width=width, height=height, fov_y=fov_y)
+    first = overview(splat, up, **_PICTURE)
     centre, _ = bounds(splat)
     axis = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
     away = first.campos.double() - centre.double()
@@ -51,7 +47,7 @@ def orbit(
     for number in range(count):
         turn = Rotation.from_rotvec((2 * math.pi * number / count * axis).numpy())
         eye = centre.double() + torch.from_numpy(turn.apply(away.numpy()))
-        view = View.look_at(eye.float(), centre, up, width=width, height=height, fov_y=fov_y)
+        view = View.look_at(eye.float(), centre, up, **_PICTURE)
         views.append((f"orbit{number:04d}", view))
     return views
 

@@ -32,6 +32,7 @@ ORBIT_VIEWS = 96
 _SHOWN = 0.9  # share of the Gaussians that an orbit goes around: some float far out
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 _NEARER = (0.6, 1.0)  # of the distance that shows them all: viewers zoom
+_FOV, _WIDE = 50.0, 75.0  # degrees; rooms are looked at with wide lenses
 _LEVEL = 0.5  # sine of the steepest look from inside: 30 degrees
 _NEIGHBOURS = 4
 _BETWEEN = (0.1, 0.9)  # of the way; nearer to a camera is its own picture again
@@ -57,9 +58,7 @@ def around(
     splat: Model,
     count: int = ORBIT_VIEWS,
     *,
-    width: int = 800,
-    height: int = 800,
-    fov_y: float = 50.0,
+    pixels: int = 800,
     background: Tensor | None = None,
     seed: int = 0,
 ) -> Named:
@@ -70,46 +69,33 @@ def around(
     Args:
         splat: N Gaussians.
         count: cameras.
-        width: pixels.
-        height: pixels.
-        fov_y: vertical field of view, degrees.
+        pixels: of each side of their pictures.
         background: (3,) RGB; black when None.
         seed: of the distances.
     """
     stream = random.Random(seed)
     centre, radius = bounds(splat)
-    half = math.atan(math.tan(math.radians(fov_y) / 2) * min(1.0, width / height))
     views = []
     for number in range(count):
         rise, turn = 1 - (2 * number + 1) / count, number * _GOLDEN_ANGLE
         level = math.sqrt(1 - rise * rise)
         away = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
-        eye = centre + radius / math.sin(half) * stream.uniform(*_NEARER) * away
+        far = radius / math.sin(math.radians(_FOV) / 2) * stream.uniform(*_NEARER)
+        eye = centre + far * away
         view = View.look_at(
-            eye, centre, width=width, height=height, fov_y=fov_y, background=background
+            eye, centre, width=pixels, height=pixels, fov_y=_FOV, background=background
         )
         views.append((f"around{number:03d}", view))
     return views
 
 
-def within(
-    places: Sequence[Tensor],
-    count: int,
-    *,
-    width: int = 800,
-    height: int = 800,
-    fov_y: float = 75.0,
-    background: Tensor | None = None,
-) -> Named:
+def within(places: Sequence[Tensor], count: int, *, pixels: int = 800) -> Named:
     """Cameras that look around from places inside a splat, to all sides and a little up and down.
 
     Args:
         places: (3,) each, taken in turns.
         count: cameras.
-        width: pixels.
-        height: pixels.
-        fov_y: vertical field of view, degrees; rooms are looked at with wide lenses.
-        background: (3,) RGB; black when None.
+        pixels: of each side of their pictures.
     """
     views = []
     for number in range(count):
@@ -117,9 +103,7 @@ def within(
         level = math.sqrt(1 - rise * rise)
         ahead = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
         eye = places[number % len(places)].detach().float().cpu()
-        view = View.look_at(
-            eye, eye + ahead, width=width, height=height, fov_y=fov_y, background=background
-        )
+        view = View.look_at(eye, eye + ahead, width=pixels, height=pixels, fov_y=_WIDE)
         views.append((f"within{number:03d}", view))
     return views
 

@@ -7,11 +7,11 @@ import torch
 from finetune import tiny
 from lab.catalogue import EXPERIMENTS
 from lab.rules import shrunk, without_faint
+from lab.scores import SCORES
 from lab.tests.commands import run
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.goals import Control, Pressure
-from fragprune_plugins.workbench.pruning.scores import SCORES
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
