@@ -22,7 +22,8 @@ from typing import Any
 
 from fragprune_plugins.plugins.loading import GROUP
 
-_PRELOAD = ["torch._dynamo", "scipy.spatial", "plyfile", "fragprune_plugins.testing.invariants"]
+_PRELOAD = ["torch._dynamo", "scipy.spatial", "plyfile", "PIL.Image"]
+_PRELOAD += ["fragprune_plugins.testing.invariants"]
 
 
 class FreshProcessError(AssertionError):

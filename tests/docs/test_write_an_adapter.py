@@ -101,6 +101,7 @@ def run(folder: Path, command: str) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow  # .ci/run runs it with the site
 @pytest.mark.timeout(900)  # a suite of its own inside: half a minute, more on a busy machine
 def test_following_the_page(workplace):
     page = iter(files())
