@@ -38,11 +38,12 @@ def main(demo: Path) -> None:
     """The pages of the demo, of its report, of an audit, and of the viewer."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        trained = min((demo / "model").rglob("point_cloud.ply"), key=lambda path: path.parent.name)
+        models = (demo / "model").rglob("point_cloud.ply")
+        trained, pruned = sorted(models, key=lambda path: path.parent.name)
         fragprune("audit", trained, "--data", demo / "scene", "--out", folder / "audit")
         report = folder / "report.html"
         fragprune("report", demo / "model", "--data", demo / "scene", "--out", report)
-        fragprune("view", demo, "--out", folder / "view")
+        fragprune("view", pruned, trained, "--out", folder / "view")
         pages = {
             "demo": demo / "index.html",
             "audit": next((folder / "audit").glob("*.html")),
@@ -68,6 +69,7 @@ def photograph(browser: Any, address: str, screen: dict[str, Any]) -> Image.Imag
     page = browser.new_context(**screen).new_page()
     page.goto(address)
     page.wait_for_timeout(4000)
+    page.wait_for_function("() => !window.viewer || viewer.counted", timeout=200_000)
     image = Image.open(io.BytesIO(page.screenshot(timeout=200_000))).convert("RGB")
     page.context.close()
     return image
