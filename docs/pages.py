@@ -38,12 +38,11 @@ def main(demo: Path) -> None:
     """The pages of the demo, of its report, of an audit, and of the viewer."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        models = (demo / "model").rglob("point_cloud.ply")
-        trained, pruned = sorted(models, key=lambda path: path.parent.name)
+        trained = min((demo / "model").rglob("point_cloud.ply"), key=lambda path: path.parent.name)
         fragprune("audit", trained, "--data", demo / "scene", "--out", folder / "audit")
         report = folder / "report.html"
         fragprune("report", demo / "model", "--data", demo / "scene", "--out", report)
-        fragprune("view", pruned, trained, "--out", folder / "view")
+        fragprune("view", demo, "--out", folder / "view")
         pages = {
             "demo": demo / "index.html",
             "audit": next((folder / "audit").glob("*.html")),

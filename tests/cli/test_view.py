@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import urllib.request
 from threading import Thread
 
@@ -10,6 +11,7 @@ import pytest
 from cli.commands import run, run_json
 from finetune import tiny
 
+from fragprune_plugins.files import records
 from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.workbench.view import server as serving
 
@@ -75,6 +77,22 @@ def test_two_models_of_one_file_name_are_told_apart(tmp_path):
     run_json("view", *words, "--out", tmp_path / "page")
     held = json.loads((tmp_path / "page" / "scene.json").read_text())
     assert [each["name"] for each in held["layers"]] == ["iteration_7", "iteration_9"]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_the_original_that_a_record_names_stands_left_if_it_lies_in_the_same_folder(
+    scene, tmp_path, there
+):
+    pruned = tmp_path / "pruned.ply"
+    shutil.copy(scene[1], pruned)
+    original = (tmp_path if there else tmp_path.parent) / "before.ply"
+    write_ply(original, tiny.random_model(20))
+    records.leave(pruned, "finetune", {"model": str(original), "out": str(pruned)})
+    report = run_json("view", pruned, "--out", tmp_path / "page")
+    held = json.loads((tmp_path / "page" / "scene.json").read_text())
+    names = ["Original", "Pruned"] if there else ["No cutoffs", "Pruned"]
+    assert [each["name"] for each in held["layers"]] == names
+    assert report["compare"] == (str(original) if there else None)
 
 
 def test_the_cameras_of_a_training_are_found(scene, tmp_path):

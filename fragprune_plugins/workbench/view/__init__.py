@@ -34,10 +34,11 @@ from fragprune_plugins.workbench.commands.options import CAMERAS_APART, CAMERAS_
 def command(**options: Any) -> Report:
     """Look at MODEL in the browser, with fragments, overdraw and frame times.
 
-    A model with thresholds is shown twice: without them left of a split, with them right of it.
-    OTHER is a second model, such as the original; the pruned one is right. The page needs WebGL2
-    and no network: it is served to this machine only, until Ctrl-C. With --out it is a folder that
-    any web server can serve, or one HTML file that a browser opens from disk.
+    A model with thresholds is shown right of a split. Left of it is OTHER, or the original, if a
+    record beside MODEL names it and it lies in the same folder; else MODEL without thresholds.
+    The page needs WebGL2 and no network: it is served to this machine only, until Ctrl-C. With
+    --out it is a folder that any web server can serve, or one HTML file that a browser opens from
+    disk.
 
     \b
     Examples:

@@ -10,13 +10,16 @@ import click
 import torch
 
 from fragprune_plugins.errors import OutputError
+from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.files.reading import lies_in
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
+from fragprune_plugins.workbench.scenes.output import output_folder
 from fragprune_plugins.workbench.view.server import address, open_server
 from fragprune_plugins.workbench.view.site import (
     Layer,
@@ -45,6 +48,7 @@ def view(
     if out is not None:
         _expect_our_page(out if single else out / "index.html")
         writable_folder(out.parent if single else out)
+    other = other or _original(model)
     paths = [each for each in (model, other) if each is not None]
     models = [load(each) for each in paths]
     truncated = [each.falloff is not None for each in models]
@@ -87,6 +91,20 @@ def view(
     facts |= {"bytes": size, "files": files, "rounded": rounded}
     how = f", with {', '.join(rounded)} rounded as in a .spz file" if rounded else ""
     return Report(facts, f"Wrote {what} ({size / 2**20:.1f} MiB){how}. {then}")
+
+
+def _original(model: Path) -> Path | None:
+    """The model that a fine-tuning began with, by its record, if it lies in the same folder."""
+    record = records.beside(model)
+    if record is None:
+        return None
+    with records.DOOR.stated(record.path):
+        name = record.data.get("model_before", record.data.get("model"))
+        original = None if name is None else records.located(name, record.path.parent)
+    inside = output_folder(model) or model.parent  # a record may be somebody else's
+    if original is None or not original.is_file() or not lies_in(original, inside):
+        return None
+    return None if original.samefile(model) else original
 
 
 def _layers(paths: list[Path], truncated: list[bool]) -> list[Layer]:
