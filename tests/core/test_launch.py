@@ -13,13 +13,16 @@ from types import ModuleType
 import pytest
 from miniatures.skeletons import FLAGS, skeleton
 
+from fragprune_plugins.engines.cuda import driver
 from fragprune_plugins.errors import (
+    EngineError,
     HostFailed,
     HostNeedsError,
     Interrupted,
     UnknownHostError,
     UsageError,
 )
+from fragprune_plugins.injection import process
 from fragprune_plugins.injection.command import HostCommand, split
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.injection.process import forget_modules
@@ -364,6 +367,17 @@ def test_after_ctrl_c_a_folder_that_only_the_host_named_is_named(host, tmp_path,
     with pytest.raises(Interrupted) as caught:
         run(words, AUTO)
     assert "with --stage finetune and --model_path named: stage 2" in caught.value.remedy
+
+
+def test_a_gpu_that_no_engine_of_ours_draws_on_is_refused_before_the_training(
+    host, tmp_path, monkeypatch
+):
+    script = host(f"open({str(tmp_path / 'trained')!r}, 'w')\n")
+    monkeypatch.setattr(process, "host_device", lambda wanted, engine: "cuda")
+    monkeypatch.setattr(driver, "missing", lambda: "no NVRTC library")
+    with pytest.raises(EngineError, match="no NVRTC library"):
+        run([script, "-s", str(tmp_path), "-m", str(tmp_path / "out")], RunOptions())
+    assert not (tmp_path / "trained").exists()
 
 
 def test_insisting_on_a_gpu_that_is_not_there_is_a_usage_error(host):
