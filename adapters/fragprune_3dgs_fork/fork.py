@@ -270,6 +270,15 @@ def _check_script(fork: Fork, script: str) -> None:
     if (backward := sum(name == "backward" for _, name in _method_calls(tree))) > 1:
         found = f"{backward} places that go backward, perhaps in one iteration"
         fork.refuse("script", script, found, "one, by which steps are counted")
+    phases = [
+        node.name
+        for node in graphdeco.nodes(tree)
+        if isinstance(node, ast.FunctionDef)
+        and any(name == "backward" for _, name in _method_calls(node))
+        and len(fork.repo.calls(_module(script), node.name)) > 1
+    ]
+    if phases:
+        fork.refuse("script", script, f"several calls of {phases[0]}, which trains", "one training")
     fork.one_run = fork.one_run or _not_resumed(fork.repo, script, tree)
 
 
@@ -289,8 +298,13 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
     kept = [each for each in saved if "capture()" in ast.unparse(each)]
     if not any(isinstance(each, ast.Tuple) and len(each.elts) == 2 for each in kept):
         return f"{script} has checkpoints that are not its model and the iteration"
-    if not _returns_state(_methods(repo)["capture"]):
+    capture = _methods(repo)["capture"]
+    if not _returns_state(capture):
         return "its checkpoints have no state of an optimizer"
+    whole = re.findall(r"self\.(\w+)(?=[,)])", ast.unparse(capture))
+    trained = re.findall(r"self\.(\w+)\.parameters\(", ast.unparse(repo.tree(MODEL) or ast.Pass()))
+    if networks := sorted({*whole} & {*trained}):
+        return f"its checkpoints hold whole networks, {', '.join(networks)}"
     return ""
 
 

@@ -308,9 +308,10 @@ class _Drawing:
             if others:
                 shown = ", ".join(others[:4])
                 what = f"makes {argument} from {shown}, not from its PLY alone"
-                moves = argument != "opacities" and set(others) <= self.parameters - {self.model}
-                own = any(each.startswith(f"{self.model}.get_") for each in roots)
-                yield f"{self.function.name} {what} ({at})", moves and own
+                own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
+                kept = f"{self.model}.{own.get(argument)}" in roots
+                beside = not any(re.match(rf"{self.model}($|\.get_)", each) for each in others)
+                yield f"{self.function.name} {what} ({at})", kept and beside
         if "shs" in given and "dc" not in given:
             roots = [*self._roots(given["shs"])]
             if not roots and "colors_precomp" in given:

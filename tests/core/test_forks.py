@@ -291,6 +291,7 @@ NOT_RESUMED = {
     "a dict": ("((gaussians.capture(), iteration)", '({"model": gaussians.capture(), "at": 1}'),
     "a removed folder": ("scene = Scene(", "shutil.rmtree(opt.model_path); scene = Scene("),
     "a lost state": ("self.optimizer.state_dict()", "None"),
+    "a whole network": ('"params": [self.poses]', '"params": self.poses.parameters()'),
     "several models": (
         "gaussians = GaussianModel(3)",
         "gaussians, b = GaussianModel(3), GaussianModel(3)",
@@ -337,6 +338,21 @@ def test_gaussians_that_a_network_beside_them_moves_keep_their_rows(tmp_path):
     assert "deform.optimizer" in str(ForkAdapter().match(repo).findings)
     with pytest.raises(NotComparedError, match="d_xyz"):
         ForkAdapter().drawing(repo, [])
+
+
+LAWS = {
+    "its own network": ("pc.get_xyz + pc.deform(pc.get_xyz, t)", ""),
+    "anchors of its own": ("pc.deform(pc.get_anchor, t)", "means3D from pc.deform, pc.get_anchor"),
+    "a function of the model": ("pc.get_xyz + made(pc)", "means3D from pc, not"),
+}
+
+
+@pytest.mark.parametrize("what", LAWS)
+def test_a_model_may_move_the_rows_that_it_has(tmp_path, what):
+    means, expected = LAWS[what]
+    repo = fork(tmp_path, ("means3D = pc.get_xyz", f"means3D = {means}"))
+    assert expected in "; ".join(errors(repo))
+    assert bool(errors(repo)) == bool(expected)
 
 
 def test_a_second_model_of_gaussians_is_no_network(tmp_path):
@@ -389,6 +405,11 @@ REFUSED = {
         [("        loss.backward()\n", "        loss.backward()\n        depth_loss.backward()\n")],
         "2 places that go backward",
     ),
+    "several phases": (
+        {},
+        [("\ndef read_flags", "\ntraining(opt, 0)\ntraining(opt, 1)\n\ndef read_flags")],
+        "several calls of training",
+    ),
     "processes": (
         {},
         [
@@ -417,11 +438,6 @@ REFUSED = {
         "not unpacked",
     ),
     "computed positions": ({}, [("return self._xyz\n", "return self.net()\n")], "computed"),
-    "a picture from a network": (
-        {},
-        [("means3D = pc.get_xyz", "means3D = pc.get_xyz + pc.net(t)")],
-        "means3D from pc.net",
-    ),
 }
 
 
