@@ -7,14 +7,14 @@ drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs
 its script  CommandLine, ConfigFile, Photographs
 of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
             share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages;
-            read_plain tells whether a PLY is plain 3DGS
+            read_plain tells whether a PLY is plain 3DGS, read_selection whether all rows are drawn
 files       Door, for those that a host reads; Model, read_ply
 settings    parse_goal
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
 Importing this module imports no torch. Model, read_ply and stand_ins load it when they
-are first used: import them inside functions, or under TYPE_CHECKING; so is read_plain.
+are first used: import them inside functions, or under TYPE_CHECKING; so are these two.
 """
 
 from __future__ import annotations
@@ -65,12 +65,13 @@ if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
     from fragprune_plugins.files.ply import read_ply
     from fragprune_plugins.hosts.graphdeco import stand_ins
-    from fragprune_plugins.hosts.plain import read_plain
+    from fragprune_plugins.hosts.plain import read_plain, read_selection
 
 _LATE = {
     "Model": "files.model",
     "read_plain": "hosts.plain",
     "read_ply": "files.ply",
+    "read_selection": "hosts.plain",
     "stand_ins": "hosts.graphdeco.stand_ins",
 }
 
@@ -115,6 +116,7 @@ __all__ = [
     "parse_goal",
     "read_plain",
     "read_ply",
+    "read_selection",
     "revised",
     "stand_ins",
 ]

@@ -550,6 +550,8 @@ def _positions(body: list[ast.stmt], unset: set[str]) -> bool:
 
 def _read_draws(fork: Fork) -> None:
     """The drawing functions that a script names, and their calls."""
+    from fragprune_plugins.adapting import read_selection
+
     named = {name for _, tree in fork.trees() for name in _reached(fork, tree)}
     functions = graphdeco.drawing_functions(fork.repo, RENDERER)
     while True:
@@ -578,7 +580,7 @@ def _read_draws(fork: Fork) -> None:
         fork.draws += (Draw(RENDERER, name, camera, model, calls),)
         for call in calls:
             _check_call(fork, at, name, call)
-        if body is not None and (selected := _selected(body)):
+        if selected := read_selection(fork.repo, RENDERER, name):
             fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
         fork.colours |= {
             node.test.attr
@@ -657,39 +659,6 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
             if draws and len(node.args) > number:  # type: ignore[attr-defined]
                 return False
     return True
-
-
-def _selected(body: Function) -> str:
-    """The code that picks rows of what is drawn, such as ``means3D[mask]``; "" if none does."""
-    off = graphdeco.off_by_default(body)
-    for statement in _statements(body.body, off):
-        for node in ast.walk(statement):
-            if isinstance(node, ast.Assign) and any(
-                getattr(each, "id", "") == "means3D" for each in node.targets
-            ):
-                for each in ast.walk(node.value):
-                    if isinstance(each, ast.Subscript) and _picks(each.slice):
-                        return ast.unparse(node)[:60]
-    return ""
-
-
-def _picks(index: ast.expr) -> bool:
-    first = index.elts[0] if isinstance(index, ast.Tuple) and index.elts else index
-    return not isinstance(first, ast.Slice | ast.Constant)
-
-
-def _statements(body: list[ast.stmt], off: set[str]) -> Iterator[ast.stmt]:
-    """Simple statements, without those that need an argument that is off by default."""
-    for node in body:
-        if isinstance(node, ast.If):
-            test = ast.unparse(node.test)
-            if not any(re.fullmatch(rf"{each}( is not None)?", test) for each in off):
-                yield from _statements(node.body, off)
-            yield from _statements(node.orelse, off)
-        elif hasattr(node, "body"):
-            yield from _statements(node.body, off)
-        else:
-            yield node
 
 
 # -- outputs ---------------------------------------------------------------------------------------

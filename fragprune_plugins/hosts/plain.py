@@ -221,6 +221,12 @@ def _call(function: Function) -> ast.Call | None:
     return min(calls, key=lambda each: each.lineno, default=None)
 
 
+def read_selection(repo: HostRepo, module: str, function: str) -> str:
+    """The code that picks rows of what a function draws, as ``means3D[mask]``; "" without any."""
+    body = repo.function(module, function)
+    return _Drawing(repo, module, body).selection() if body is not None else ""
+
+
 class _Drawing:
     """A drawing function: where the inputs of its rasterizer come from."""
 
@@ -293,6 +299,22 @@ class _Drawing:
                 part = child.value if isinstance(child, ast.keyword) else child
                 if isinstance(part, ast.expr):
                     yield from self._roots(part, seen)
+
+    def selection(self) -> str:
+        """The code that picks some of the model's rows, however they come to the first call."""
+        call, own, seen = _call(self.function), f"{self.model}.get_xyz", set()
+        waiting = [each.value for each in call.keywords if each.arg == "means3D"] if call else []
+        while waiting:
+            for node in ast.walk(waiting.pop()):
+                if isinstance(node, ast.Name) and node.id not in seen:
+                    seen.add(node.id)
+                    waiting += self.values.get(node.id, [])
+                elif isinstance(node, ast.Subscript) and own in self._roots(node.value):
+                    index = node.slice
+                    first = index.elts[0] if isinstance(index, ast.Tuple) and index.elts else index
+                    if not isinstance(first, ast.Slice | ast.Constant):
+                        return ast.unparse(node)[:60]
+        return ""
 
     def reasons(self) -> Iterator[tuple[str, bool]]:
         """Inputs of the first call that a plain drawing does not have, and whether arguments of

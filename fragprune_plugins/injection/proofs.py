@@ -34,8 +34,8 @@ class Proof:
     failed: str = ""
 
     def __str__(self) -> str:
-        told = f": {self.failed}" if self.failed else f" returns {', '.join(self.outputs)}"
-        return self.call + told
+        returned = f"returns {', '.join(self.outputs)}"
+        return f"{self.call}: {self.failed}" if self.failed else f"{self.call} {returned}"
 
 
 def digest_of(file: Path) -> str:

@@ -194,8 +194,8 @@ def covering(thresholds: Tensor | None, inputs: RasterInputs) -> Tensor | None:
     """The thresholds (N,), followed by neutral ones for rows that were added behind."""
     if thresholds is None or len(thresholds) == len(inputs.splats):
         return thresholds
-    neutral = thresholds.new_full((len(inputs.splats) - len(thresholds),), NEUTRAL_LOGIT)
-    return torch.cat([thresholds, neutral.sigmoid()])
+    added = thresholds.new_full((len(inputs.splats) - len(thresholds),), NEUTRAL_LOGIT).sigmoid()
+    return torch.cat([thresholds, added])
 
 
 def further_picture(state: ModelState, view: int, part: int) -> bool:

@@ -394,6 +394,11 @@ REFUSED = {
         [("    if chosen is not None:\n        means3D", "    means3D")],
         "draws a selection",
     ),
+    "a selection by another name": (
+        {},
+        [("means3D=means3D", "means3D=xyz"), ("    shs =", "    xyz = means3D[rows]\n    shs =")],
+        "draws a selection, means3D[rows]",
+    ),
     "another model": ({}, [("GaussianModel(3)", "DeformModel(3)")], "makes DeformModel"),
     "neither checkpoints nor models on the way": (
         {},

@@ -76,10 +76,8 @@ def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:
         files = sorted(repo.root.glob(pattern), key=lambda each: (each.stem != "train", each))
         paths = [each.relative_to(repo.root) for each in files if each.stem.isidentifier()]
         parts = {each.as_posix(): ".".join(each.with_suffix("").parts) for each in paths}
-        trains = ("training_setup", "backward")
-        if found := [
-            each for each, name in parts.items() if len(repo.mentions([name], trains)) > 1
-        ]:
+        wanted = ("training_setup", "backward")
+        if found := [k for k, name in parts.items() if len(repo.mentions([name], wanted)) > 1]:
             return tuple(found)
     return ()
 

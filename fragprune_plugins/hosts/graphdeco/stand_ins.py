@@ -65,11 +65,10 @@ def rasterizer(
             return visible
 
     def entry(name: str) -> Callable[..., Any]:
-        where = f"{package}:GaussianRasterizer.{name}"
-
         def call(self: GaussianRasterizer, *given: Any, **named: Any) -> Any:
             """Draw; see the adapter's dialect for what comes back."""
             arguments = dict.fromkeys(_TAKEN) | dict(zip(_TAKEN, given, strict=False)) | named
+            where = f"{package}:GaussianRasterizer.{name}"
             return draw(HostCall(self.raster_settings, arguments, where))
 
         vars(call)["__signature__"] = _SIGNATURE
