@@ -170,21 +170,24 @@ def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
         )
 
 
-def check_degree(name: str, sh: Tensor | None, degree: int) -> None:
-    """Raise InputError unless the degree is 0 to 3, and sh has coefficients enough for it."""
+def check_degree(name: str, sh: Tensor | None, degree: int, sh_rest: Tensor | None = None) -> None:
+    """Raise InputError unless the degree is 0 to 3, and has as many coefficients as it takes."""
     if not 0 <= degree <= 3:
         raise InputError(f"{name}.sh_degree", str(degree), "0 to 3", "Lower the SH degree.")
-    if sh is not None and sh.shape[1] < (degree + 1) ** 2:
+    if sh is None:
+        return
+    count = sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1])
+    if count < (degree + 1) ** 2:
         raise InputError(
             f"{name}.sh",
-            f"{sh.shape[1]} coefficients",
+            f"{count} coefficients",
             f"at least {(degree + 1) ** 2} for degree {degree}",
             "Lower the SH degree or pass all coefficients.",
         )
-    if sh is not None and sh.shape[1] > COEFFICIENTS_MAX:
+    if count > COEFFICIENTS_MAX:
         raise InputError(
             f"{name}.sh",
-            f"{sh.shape[1]} coefficients",
+            f"{count} coefficients",
             f"at most {COEFFICIENTS_MAX}",
             "Pass (N, coefficients, 3).",
         )
@@ -359,10 +362,12 @@ class Splats:
         scales: (N, 3) standard deviations, world units; (N, 2) of surfels, see ``flat``.
         rotations: (N, 4) quaternions w, x, y, z; used as given, the host normalises.
         cov3d: (N, 6) upper triangle xx, xy, xz, yy, yz, zz; scale_modifier does not apply.
-        sh: (N, K, 3), K = (degree + 1)^2 or more.
+        sh: (N, K, 3), K = (degree + 1)^2 or more; (N, 1, 3) with ``sh_rest``.
         colors: (N, 3) RGB, used as given.
         sh_degree: 0 to 3, how many bands of ``sh`` are used.
         features: (N, F), F in 1 to 8: more channels, blended as colour is, without background.
+        sh_rest: (N, K - 1, 3) coefficients behind the first, for an engine whose ``sh_apart`` is
+            True; ``joined`` serves others.
     """
 
     means: Tensor
@@ -374,6 +379,7 @@ class Splats:
     colors: Tensor | None = None
     sh_degree: int = 0
     features: Tensor | None = None
+    sh_rest: Tensor | None = None
 
     __repr__ = one_line
 
@@ -384,7 +390,8 @@ class Splats:
         check_tensor("Splats.scales", self.scales, n, 2 if self.flat else 3)
         check_tensor("Splats.rotations", self.rotations, n, 4)
         check_tensor("Splats.cov3d", self.cov3d, n, 6)
-        check_tensor("Splats.sh", self.sh, n, None, 3)
+        check_tensor("Splats.sh", self.sh, n, None if self.sh_rest is None else 1, 3)
+        check_tensor("Splats.sh_rest", self.sh_rest, n, None, 3)
         check_tensor("Splats.colors", self.colors, n, 3)
         _check_features("Splats.features", self.features, n)
         if (self.scales is None) != (self.rotations is None) or (
@@ -403,7 +410,7 @@ class Splats:
                 "exactly one of them",
                 "Pass one of the two.",
             )
-        check_degree("Splats", self.sh, self.sh_degree)
+        check_degree("Splats", self.sh, self.sh_degree, self.sh_rest)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -416,6 +423,14 @@ class Splats:
         acts on the falloff there.
         """
         return getattr(self.scales, "ndim", 0) == 2 and self.scales.shape[1] == 2  # type: ignore[union-attr]
+
+    def joined(self) -> Splats:
+        """The same with all coefficients in ``sh``."""
+        import torch
+
+        if self.sh is None or self.sh_rest is None:
+            return self
+        return replace(self, sh=torch.cat([self.sh, self.sh_rest], dim=1), sh_rest=None)
 
     @property
     def device(self) -> torch.device:

@@ -71,7 +71,7 @@ def native_inputs(
         cap_gradient=inputs.cap_gradient,
         absolute_gradient=inputs.absolute_gradient,
         sh_degree=splats.sh_degree if isinstance(splats, Splats) else 0,
-        sh_coefficients=_second_length(arrays.get("sh")),
+        sh_coefficients=sum(_second_length(arrays.get(name)) for name in ("sh", "sh_rest")),
         feature_count=_second_length(arrays.get("features")),
         widen=widen,
         flat=isinstance(splats, Splats) and splats.flat,

@@ -110,7 +110,9 @@ def camera_of(inputs: RasterInputs) -> Camera:
 
 def gaussians_of(splats: Splats) -> Gaussians:
     """The oracle's Gaussians, sharing the tensors."""
-    return Gaussians(**vars(splats))
+    given = vars(splats.joined()).copy()
+    del given["sh_rest"]
+    return Gaussians(**given)
 
 
 def projected_of(footprints: Footprints) -> Projected:

@@ -157,18 +157,24 @@ class Model:
             kept["thresholds"].keep(mask)
         return replace(self, **kept)
 
-    def splats(self) -> Splats:
-        """The Gaussians after activation, for engines; differentiable."""
+    def splats(self, sh_apart: bool = False) -> Splats:
+        """The Gaussians after activation, for engines; differentiable.
+
+        Args:
+            sh_apart: leave f_dc and f_rest as they are, for an engine that reads both.
+        """
         opacities, scales = torch.sigmoid(self.opacity[:, 0]), torch.exp(self.scaling)
         if self.filter_3d is not None:
             wider = (scales.square() + self.filter_3d.square()).sqrt()
             opacities = opacities * (scales / wider).prod(dim=1)
             scales = wider
-        return Splats(
+        splats = Splats(
             means=self.xyz,
             opacities=opacities,
             scales=scales,
             rotations=torch.nn.functional.normalize(self.rotation),
-            sh=torch.cat([self.f_dc, self.f_rest], dim=1),
+            sh=self.f_dc,
+            sh_rest=self.f_rest,
             sh_degree=self.sh_degree,
         )
+        return splats if sh_apart else splats.joined()

@@ -15,6 +15,7 @@ from footprints import footprints_of
 from fragprune_plugins.engines.arrays import address
 from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs
+from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.slicing.cutting import slice_by
 from fragprune_plugins.slicing.structs import Spacetime
@@ -22,8 +23,20 @@ from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
 
 N = 20
 WORLD = scenes.random_scene(0, N, features=2, stop=0.3)
+
+
+def apart(inputs: RasterInputs) -> RasterInputs:
+    """The same with the first coefficient in one array and the others in another."""
+    splats = inputs.splats
+    assert isinstance(splats, Splats)
+    assert splats.sh is not None
+    sh, rest = splats.sh[:, :1].contiguous(), splats.sh[:, 1:].contiguous()
+    return replace(inputs, splats=replace(splats, sh=sh, sh_rest=rest))
+
+
 GIVEN = {
     "world": WORLD,
+    "coefficients apart": apart(WORLD),
     "colours and covariances": scenes.random_scene(0, N, cov3d=True, colors=True),
     "offsets": scenes.random_scene(0, N, offsets=True),
     "image": footprints_of(WORLD),
@@ -98,6 +111,28 @@ def test_no_field_is_left_out_above(owner: type) -> None:
         if isinstance(getattr(inputs, place) if place else inputs, owner)
     }
     assert tried == {field.name for field in fields(owner)} - NO_INPUTS
+
+
+@pytest.mark.parametrize("flat", [False, True], ids=["ellipsoids", "surfels"])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_coefficients_in_two_arrays_are_drawn_and_learned_as_those_in_one(
+    library: binding.Library, degree: int, flat: bool
+) -> None:
+    """To the bit, and as the oracle has it: it joins them."""
+    scene = scenes.random_scene(3, 60, sh_degree=degree, flat=flat)
+    one, whole = scenes.leaves(scene)
+    two, parts = scenes.leaves(apart(scene))
+    engine, weights = CpuEngine(library), torch.rand(scene.view.height, scene.view.width)
+    images = [engine.rasterize(inputs, None).image for inputs in (one, two)]
+    assert torch.equal(*images)
+    for image in images:
+        (image * weights).sum().backward()
+    joined = torch.cat([parts.pop("sh").grad, parts.pop("sh_rest").grad], dim=1)
+    assert torch.equal(joined, whole.pop("sh").grad)
+    for name, leaf in parts.items():
+        assert torch.equal(leaf.grad, whole[name].grad), name
+    expected = ReferenceEngine().rasterize(two, None).image
+    assert torch.allclose(images[1], expected, atol=1e-5)
 
 
 def test_thresholds_reach_compiled_code() -> None:

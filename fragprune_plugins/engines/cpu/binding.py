@@ -13,7 +13,7 @@ from typing import Any, Final
 from fragprune_plugins import native
 from fragprune_plugins.errors import EngineError
 
-API_VERSION: Final = 10
+API_VERSION: Final = 11
 """FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
 
 ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
@@ -68,7 +68,7 @@ class Lengths(_Named):
     _fields_ = (
         *_integers("viewmatrix projmatrix campos background means opacities scales rotations"),
         *_integers("cov3d sh colors features thresholds sample_offsets"),
-        *_integers("means2d conics depths tiles times scales_t rotations_r"),
+        *_integers("means2d conics depths tiles times scales_t rotations_r sh_rest"),
     )
 
 
@@ -103,7 +103,7 @@ class Inputs(Sized):
         ("count", ctypes.c_int64),
         ("lengths", Lengths),
         *pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
-        *pointers("cov3d sh colors features thresholds sample_offsets"),
+        *pointers("cov3d sh sh_rest colors features thresholds sample_offsets"),
         *pointers("means2d conics depths tiles workspace"),
     )
 
@@ -139,8 +139,8 @@ class InputGrads(Sized):
 
     _fields_ = (
         ("size", ctypes.c_uint32),
-        *pointers("means hook opacities scales rotations cov3d sh colors features thresholds"),
-        *pointers("means2d conics depths background"),
+        *pointers("means hook opacities scales rotations cov3d sh sh_rest colors features"),
+        *pointers("thresholds means2d conics depths background"),
     )
 
 

@@ -30,6 +30,7 @@ _NAMES = (
     "rotations",
     "cov3d",
     "sh",
+    "sh_rest",
     "colors",
     "features",
     "thresholds",
@@ -192,9 +193,11 @@ class CpuEngine:
     Attributes:
         library: the build in use.
         workspace: its reusable memory.
+        sh_apart: it reads ``Splats.sh_rest``, so that nobody needs to join the coefficients.
     """
 
     name = "cpu"
+    sh_apart = True
 
     def __init__(self, library: binding.Library | None = None) -> None:
         self.library = binding.library() if library is None else library

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -114,6 +115,8 @@ class CudaEngine:
                 "Run on the CPU (--device cpu), or draw it hard: replace(inputs, rim='hard').",
             )
         self.expect_on_device(inputs.splats.device)
+        if isinstance(inputs.splats, Splats) and inputs.splats.sh_rest is not None:
+            inputs = replace(inputs, splats=inputs.splats.joined())
         drawing = Drawing(self.device, inputs, thresholds)
         tensors = {
             **learnable(inputs),

@@ -477,15 +477,13 @@ class Chain {
     const Vec<Lanes> direction = direction_to(c_.centre, mean, inv_length);
     Harmonics<Lanes> h;
     const int terms = harmonics(in_.sh_degree, direction, h, by_direction);
-    const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
     Coefficients coefficients, by;
-    load_coefficients(in_.sh, width, who.ids, terms, coefficients);
+    load_coefficients(coefficient_rows(in_), who.ids, terms, coefficients);
     const Vec<Lanes> g =
         through_clamp(raw_colour(h, terms, coefficients), {sums.r, sums.g, sums.b});
-    if (to_.sh) {
+    if (to_.sh || to_.sh_rest) {
       for (int k = 0; k < terms; k++) by.set(k, h.value[k] * g);
-      store_coefficients(by, terms, who, to_.sh, width);
-      clear_rest(who, to_.sh, 3 * static_cast<size_t>(terms), width);
+      store_coefficients(by, terms, who, coefficient_rows(in_, to_));
     }
     if (!by_direction) return Vec<Lanes>();
     return direction_gradient(h, terms, direction, inv_length, g, coefficients);
@@ -563,7 +561,7 @@ FP_STAGE void backward(const fragprune_state& state, const fragprune_output_grad
   if (to.means || to.hook || to.scales || to.rotations || to.cov3d || to.means2d || to.conics ||
       to.depths)
     want |= kGeometry;
-  if (to.sh || to.colors || (to.means && in.sh && in.sh_degree > 0)) want |= kColour;
+  if (to.sh || to.sh_rest || to.colors || (to.means && in.sh && in.sh_degree > 0)) want |= kColour;
   if (to.thresholds) want |= kThreshold;
   if (grads.invdepth) want |= kDepth;
   Extras extras = state.extras;
@@ -572,11 +570,14 @@ FP_STAGE void backward(const fragprune_state& state, const fragprune_output_grad
       (to.hook && in.absolute_gradient))
     want |= kWholeExtra;
   if (softens(in)) want |= kWholeSoft;
-  const size_t n = static_cast<size_t>(in.count), sh_size = 3 * size_t(in.sh_coefficients);
+  const size_t n = static_cast<size_t>(in.count);
+  const ShRows<float> by_sh = coefficient_rows(in, to);
   const GradientRows arrays[] = {
+      {by_sh.part[0].rows, by_sh.part[0].width},
+      {by_sh.part[1].rows, by_sh.part[1].width},
       {to.means, 3},      {to.hook, 3},       {to.opacities, 1},
       {to.scales, 3},     {to.rotations, 4},  {to.cov3d, 6},
-      {to.sh, sh_size},   {to.colors, 3},     {to.features, size_t(in.feature_count)},
+      {to.colors, 3},     {to.features, size_t(in.feature_count)},
       {to.thresholds, 1}, {to.means2d, 2},    {to.conics, 3},
       {to.depths, 1}};
   bool per_gaussian = false;
@@ -703,8 +704,9 @@ int check_lengths(const fragprune_inputs& in, fragprune_error* error) {
   return check_lengths(
       {FP_HELD(viewmatrix, 16), FP_HELD(projmatrix, 16), FP_HELD(campos, 3), FP_HELD(background, 3),
        FP_HELD(means, 3 * n), FP_HELD(opacities, n), FP_HELD(scales, (in.flat ? 2 : 3) * n),
-       FP_HELD(rotations, 4 * n), FP_HELD(cov3d, 6 * n), FP_HELD(sh, 3 * n * in.sh_coefficients),
-       FP_HELD(colors, 3 * n), FP_HELD(features, n * in.feature_count), FP_HELD(thresholds, n),
+       FP_HELD(rotations, 4 * n), FP_HELD(cov3d, 6 * n),
+       FP_HELD(sh, 3 * n * (in.sh_rest ? 1 : in.sh_coefficients)),
+       FP_HELD(sh_rest, 3 * n * (in.sh_coefficients - 1)), FP_HELD(colors, 3 * n), FP_HELD(features, n * in.feature_count), FP_HELD(thresholds, n),
        FP_HELD(sample_offsets, 2 * pixels), FP_HELD(means2d, 2 * n), FP_HELD(conics, 3 * n),
        FP_HELD(depths, n), FP_HELD(tiles, 4 * n)},
       error);
@@ -723,7 +725,7 @@ int check_lengths(const fragprune_spacetime& in, fragprune_error* error) {
 #undef FP_HELD
 
 const char* footprints_fault_of(const fragprune_inputs* in) {
-  if (in->means || in->scales || in->rotations || in->cov3d || in->sh)
+  if (in->means || in->scales || in->rotations || in->cov3d || in->sh || in->sh_rest)
     return "with means2d, neither means, scales, rotations, cov3d nor sh may be given";
   if (in->count == 0) return nullptr;
   if (!in->conics || !in->depths || !in->tiles || !in->opacities || !in->colors)
@@ -740,6 +742,7 @@ const char* splats_fault_of(const fragprune_inputs* in) {
   if (!in->scales != !in->rotations || !in->scales == !in->cov3d)
     return "either scales and rotations or cov3d is needed";
   if (!in->sh == !in->colors) return "either sh or colors is needed";
+  if (in->sh_rest && !in->sh) return "sh_rest goes with sh";
   if (in->sh && (in->sh_degree < 0 || in->sh_degree > 3 ||
                  in->sh_coefficients < (in->sh_degree + 1) * (in->sh_degree + 1)))
     return "sh_degree must be 0 to 3, sh_coefficients (sh_degree + 1)^2 or more";
@@ -787,7 +790,7 @@ bool wants_absent(const fragprune_inputs& in, const fragprune_input_grads& to) {
   const std::pair<const void*, const void*> pairs[] = {
       {to.means, in.means},   {to.scales, in.scales},     {to.rotations, in.rotations},
       {to.cov3d, in.cov3d},   {to.sh, in.sh},             {to.colors, in.colors},
-      {to.means2d, in.means2d}, {to.conics, in.conics},   {to.depths, in.depths},
+      {to.sh_rest, in.sh_rest}, {to.means2d, in.means2d}, {to.conics, in.conics},   {to.depths, in.depths},
       {to.features, in.features}, {to.opacities, in.opacities}};
   for (const auto& [wanted, given] : pairs)
     if (wanted && !given && in.count) return true;

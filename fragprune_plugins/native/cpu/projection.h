@@ -149,8 +149,8 @@ class Colours {
     const size_t id = s.id;
     if (in_.means) __builtin_prefetch(in_.means + 3 * id);
     if (!in_.sh) return;
-    const size_t width = 3 * static_cast<size_t>(in_.sh_coefficients);
-    for (size_t k = 0; k < width; k += 16) __builtin_prefetch(in_.sh + id * width + k, 0, 2);
+    for (const Part<const float>& p : coefficient_rows(in_).part)
+      for (size_t k = 0; k < p.width; k += 16) __builtin_prefetch(p.rows + id * p.width + k, 0, 2);
   }
 
   // A splat's colour and 1/z: r, g, b, inv_z.
@@ -185,8 +185,7 @@ class Colours {
       const int terms =
           harmonics(in_.sh_degree, direction_to(c_.centre, means_.load(ids), inv_length), h, false);
       Coefficients coefficients;
-      load_coefficients(in_.sh, 3 * static_cast<size_t>(in_.sh_coefficients), ids, terms,
-                        coefficients);
+      load_coefficients(coefficient_rows(in_), ids, terms, coefficients);
       colour = raw_colour(h, terms, coefficients);
     }
     const Lanes size = abs(colour.x) + abs(colour.y) + abs(colour.z);

@@ -41,9 +41,10 @@ class SpacetimeRows {
   // The coefficients of what the cosines add up to, and of the highest alone.
   void coefficients(const uint32_t* ids, int terms, const Waves<Lanes>& w, Coefficients& all,
                     Coefficients& top) const {
-    load_coefficients(in_.sh, width, ids, terms, all);
+    const size_t used = 3 * static_cast<size_t>(terms);
+    load_numbers(in_.sh, width, ids, used, all.column);
     for (int order = 1; order <= m.orders; order++) {
-      load_coefficients(in_.sh + 3 * kBands * order, width, ids, terms, top);
+      load_numbers(in_.sh + 3 * kBands * order, width, ids, used, top.column);
       const Lanes wave = order == 1 ? w.first : w.second;
       for (int k = 0; k < 3 * terms; k++)
         all.column[k] = fma(wave, top.column[k], all.column[k]);
@@ -181,15 +182,15 @@ class Unslicer {
     harmonics(in_.sh_degree, direction, h, moves_);
     if (to_.sh) {
       Coefficients by_sh;
+      const size_t used = 3 * static_cast<size_t>(terms);
       for (int order = 0; order <= m.orders; order++) {
         for (int k = 0; k < terms; k++)
           by_sh.set(k, order == 0   ? given_harmonic(m, h, k) * g
                        : order == 1 ? (w.first * h.value[k]) * g
                                     : (w.second * h.value[k]) * g);
-        store_coefficients(by_sh, terms, who, to_.sh + 3 * kBands * order, rows_.width);
+        store_numbers(by_sh.column, used, who, to_.sh + 3 * kBands * order, rows_.width);
       }
-      clear_rest(who, to_.sh, 3 * static_cast<size_t>(m.orders ? kBands * (m.orders + 1) : terms),
-                 rows_.width);
+      clear_rest(who, to_.sh, m.orders ? size_t{3} * kBands * (m.orders + 1) : used, rows_.width);
     }
     if (!moves_) return;
     by.mean = by.mean + direction_gradient(h, terms, direction, inv_length, g, all);

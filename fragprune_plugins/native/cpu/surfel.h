@@ -140,8 +140,8 @@ inline Vec3 surfel_colour(const fragprune_inputs& in, size_t i, Harmonics<float>
   if (in.colors) return read3(in.colors + 3 * i);
   direction = direction_to(read3(in.campos), read3(in.means + 3 * i), inv_length);
   terms = harmonics(in.sh_degree, direction, h, with_slope);
-  const float* sh = in.sh + i * 3 * static_cast<size_t>(in.sh_coefficients);
-  return raw_colour(h, terms, [&](int k) { return read3(sh + 3 * k); });
+  const ShRows<const float> sh = coefficient_rows(in);
+  return raw_colour(h, terms, [&](int k) { return read3(sh.at(i, k)); });
 }
 
 // False: nothing of it is drawn. The radius is the host's, whatever the thresholds.
@@ -311,7 +311,7 @@ inline void unproject_surfel(const fragprune_inputs& in, const Surfel& surfel, c
   };
   write(to.colors, three(kByColour));
   Wide3 by_mean = {0, 0, 0};
-  if (in.sh && (to.sh || to.means)) {
+  if (in.sh && (to.sh || to.sh_rest || to.means)) {
     Harmonics<float> h;
     int terms;
     Vec3 direction;
@@ -319,14 +319,14 @@ inline void unproject_surfel(const fragprune_inputs& in, const Surfel& surfel, c
     const bool slope = to.means && in.sh_degree > 0;
     const Vec3 raw = surfel_colour(in, i, h, terms, direction, inv_length, slope);
     const Vec3 by = through_clamp(raw, narrow3(three(kByColour)));
-    const size_t width = 3 * static_cast<size_t>(in.sh_coefficients);
-    for (int k = 0; to.sh && k < terms; k++)
-      for (int c = 0; c < 3; c++)
-        to.sh[i * width + static_cast<size_t>(3 * k + c)] = h.value[k] * (&by.x)[c];
-    const float* sh = in.sh + i * width;
+    const ShRows<const float> sh = coefficient_rows(in);
+    const ShRows<float> by_sh = coefficient_rows(in, to);
+    for (int k = 0; k < terms; k++)
+      if (float* row = by_sh.at(i, k))
+        for (int c = 0; c < 3; c++) row[c] = h.value[k] * (&by.x)[c];
     if (slope) {
       const Vec3 d = direction_gradient(h, terms, direction, inv_length, by,
-                                        [&](int k) { return read3(sh + 3 * k); });
+                                        [&](int k) { return read3(sh.at(i, k)); });
       by_mean = {d.x, d.y, d.z};
     }
   }

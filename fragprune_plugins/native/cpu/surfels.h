@@ -340,10 +340,11 @@ FP_STAGE inline void undraw_surfels(const SurfelScene& scene, const fragprune_ou
   Team team(threads);
   const fragprune_inputs& in = scene.in;
   const size_t n = static_cast<size_t>(in.count), tiles = scene.first.size() - 1;
+  const ShRows<float> by_sh = coefficient_rows(in, to);
   const std::pair<float*, size_t> arrays[] = {
       {to.means, 3},     {to.hook, 3}, {to.opacities, 1}, {to.scales, 2},
-      {to.rotations, 4}, {to.sh, 3 * static_cast<size_t>(in.sh_coefficients)},
-      {to.colors, 3},    {to.thresholds, 1}};
+      {to.rotations, 4}, {by_sh.part[0].rows, by_sh.part[0].width},
+      {by_sh.part[1].rows, by_sh.part[1].width}, {to.colors, 3},    {to.thresholds, 1}};
   for (const auto& [data, width] : arrays)
     if (data) std::fill_n(data, n * width, 0.f);
   Buffer<float> slots(scene.memory, scene.slots * kSurfelSums);

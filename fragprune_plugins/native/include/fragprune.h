@@ -10,7 +10,7 @@
 
 #include <stdint.h>
 
-#define FRAGPRUNE_API_VERSION 10
+#define FRAGPRUNE_API_VERSION 11
 
 /* The field's constants and ours; fragprune_plugins/constants.py says why, a test compares the two. */
 #define FRAGPRUNE_ALPHA_MIN (1.0 / 255.0)
@@ -93,6 +93,7 @@ typedef struct fragprune_lengths {
   int64_t times;
   int64_t scales_t;
   int64_t rotations_r;
+  int64_t sh_rest;
 } fragprune_lengths;
 
 /* N Gaussians are given in the world (means, scales and rotations or cov3d, sh or colors) or, when
@@ -125,7 +126,7 @@ typedef struct fragprune_inputs {
   int32_t cap_gradient;    /* the gradient passes through the cap; else it is 0 where capped */
   int32_t absolute_gradient; /* fill the hook's third column, see fragprune_input_grads */
   int32_t sh_degree;       /* 0 to 3 */
-  int32_t sh_coefficients; /* K, the second dimension of sh; 0 to 1024 */
+  int32_t sh_coefficients; /* K, coefficients of a Gaussian; 0 to 1024 */
   int32_t feature_count;   /* F, 0 to 8 */
   int32_t widen;           /* keep rim fragments: thresholds will want a gradient */
   int32_t flat;            /* surfels: scales are (N, 2), see below; the cpu engine's alone */
@@ -141,7 +142,8 @@ typedef struct fragprune_inputs {
   const float *scales;     /* (N, 3), or (N, 2) of surfels, with rotations; or NULL */
   const float *rotations;  /* (N, 4) w x y z, used as given; or NULL */
   const float *cov3d;      /* (N, 6) xx xy xz yy yz zz; or NULL */
-  const float *sh;         /* (N, K, 3); or NULL */
+  const float *sh;         /* (N, K, 3), or (N, 1, 3) with sh_rest; or NULL */
+  const float *sh_rest;    /* (N, K - 1, 3); or NULL. The cpu engine's alone */
   const float *colors;     /* (N, 3); or NULL */
   const float *features;   /* (N, F), blended as colour is; or NULL: F is 0 */
   const float *thresholds; /* (N) falloff in (0, 1); or NULL: no truncation */
@@ -198,7 +200,8 @@ typedef struct fragprune_input_grads {
   float *scales;     /* (N, 3), or (N, 2) of surfels */
   float *rotations;  /* (N, 4) */
   float *cov3d;      /* (N, 6) */
-  float *sh;         /* (N, K, 3) */
+  float *sh;         /* (N, K, 3), or (N, 1, 3) with sh_rest */
+  float *sh_rest;    /* (N, K - 1, 3) */
   float *colors;     /* (N, 3) */
   float *features;   /* (N, F) */
   float *thresholds; /* (N) */

@@ -277,7 +277,8 @@ class Training:
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
         """Draw a view with its thresholds; also return the pressure."""
         rules = self.stage.store.rules
-        inputs = RasterInputs(shot.view, self.model.splats(), planes=(), **rules)
+        splats = self.model.splats(sh_apart=getattr(self.engine, "sh_apart", False))
+        inputs = RasterInputs(shot.view, splats, planes=(), **rules)
         thresholds = self.stage.thresholds(inputs)
 
         outputs, plain = self.engine.rasterize(inputs, thresholds), None
