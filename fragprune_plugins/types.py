@@ -367,7 +367,7 @@ class Splats:
         sh_degree: 0 to 3, how many bands of ``sh`` are used.
         features: (N, F), F in 1 to 8: more channels, blended as colour is, without background.
         sh_rest: (N, K - 1, 3) coefficients behind the first, for an engine whose ``sh_apart`` is
-            True; ``joined`` serves others.
+            True.
     """
 
     means: Tensor
@@ -423,14 +423,6 @@ class Splats:
         acts on the falloff there.
         """
         return getattr(self.scales, "ndim", 0) == 2 and self.scales.shape[1] == 2  # type: ignore[union-attr]
-
-    def joined(self) -> Splats:
-        """The same with all coefficients in ``sh``."""
-        import torch
-
-        if self.sh is None or self.sh_rest is None:
-            return self
-        return replace(self, sh=torch.cat([self.sh, self.sh_rest], dim=1), sh_rest=None)
 
     @property
     def device(self) -> torch.device:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, get_args
 
 import torch
@@ -81,6 +82,13 @@ def native_inputs(
         workspace=workspace,
         **{name: address(array) for name, array in arrays.items()},
     )
+
+
+def joined(splats: Splats) -> Splats:
+    """The same with all coefficients in ``sh``."""
+    if splats.sh is None or splats.sh_rest is None:
+        return splats
+    return replace(splats, sh=torch.cat([splats.sh, splats.sh_rest], dim=1), sh_rest=None)
 
 
 def native_lengths(arrays: dict[str, Tensor]) -> binding.Lengths:

@@ -110,9 +110,8 @@ def camera_of(inputs: RasterInputs) -> Camera:
 
 def gaussians_of(splats: Splats) -> Gaussians:
     """The oracle's Gaussians, sharing the tensors."""
-    given = vars(splats.joined()).copy()
-    del given["sh_rest"]
-    return Gaussians(**given)
+    given = vars(splats.joined())
+    return Gaussians(**{name: given[name] for name in given.keys() - {"sh_rest"}})
 
 
 def projected_of(footprints: Footprints) -> Projected:

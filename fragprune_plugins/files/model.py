@@ -168,13 +168,12 @@ class Model:
             wider = (scales.square() + self.filter_3d.square()).sqrt()
             opacities = opacities * (scales / wider).prod(dim=1)
             scales = wider
-        splats = Splats(
+        return Splats(
             means=self.xyz,
             opacities=opacities,
             scales=scales,
             rotations=torch.nn.functional.normalize(self.rotation),
-            sh=self.f_dc,
-            sh_rest=self.f_rest,
+            sh=self.f_dc if sh_apart else torch.cat([self.f_dc, self.f_rest], dim=1),
+            sh_rest=self.f_rest if sh_apart else None,
             sh_degree=self.sh_degree,
         )
-        return splats if sh_apart else splats.joined()

@@ -6,6 +6,8 @@ import ctypes
 import os
 import threading
 import weakref
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -204,33 +206,19 @@ def open_build(build: str) -> Library:
         raise Unavailable(f"{path} cannot be opened: {error}") from error
     if version != API_VERSION:
         raise Unavailable(f"{path} speaks version {version}, this package {API_VERSION}; reinstall")
-    calls.fragprune_forward.argtypes = [
-        ctypes.POINTER(Inputs),
-        ctypes.POINTER(Outputs),
-        ctypes.POINTER(_POINTER),
-        ctypes.POINTER(Error),
-    ]
-    calls.fragprune_backward.argtypes = [
-        _POINTER,
-        ctypes.POINTER(OutputGrads),
-        ctypes.POINTER(InputGrads),
-        ctypes.c_int32,
-        ctypes.POINTER(Error),
-    ]
-    calls.fragprune_photometric_loss.argtypes = [
-        ctypes.POINTER(Photometric),
-        ctypes.POINTER(Error),
-    ]
-    calls.fragprune_free.argtypes = [_POINTER]
-    calls.fragprune_free.restype = None
-    calls.fragprune_workspace_new.argtypes = []
-    calls.fragprune_workspace_new.restype = _POINTER
-    calls.fragprune_workspace_free.argtypes = [_POINTER]
-    calls.fragprune_workspace_free.restype = None
-    calls.fragprune_workspace_take.argtypes = [_POINTER, ctypes.c_uint64]
-    calls.fragprune_workspace_take.restype = _POINTER
-    calls.fragprune_workspace_give.argtypes = [_POINTER, _POINTER, ctypes.c_uint64]
-    calls.fragprune_workspace_give.restype = None
+    at, size, whole = ctypes.POINTER, ctypes.c_uint64, ctypes.c_int32
+    for name, result, *arguments in (
+        ("forward", whole, at(Inputs), at(Outputs), at(_POINTER), at(Error)),
+        ("backward", whole, _POINTER, at(OutputGrads), at(InputGrads), whole, at(Error)),
+        ("photometric_loss", whole, at(Photometric), at(Error)),
+        ("free", None, _POINTER),
+        ("workspace_new", _POINTER),
+        ("workspace_free", None, _POINTER),
+        ("workspace_take", _POINTER, _POINTER, size),
+        ("workspace_give", None, _POINTER, _POINTER, size),
+    ):
+        call = getattr(calls, f"fragprune_{name}")
+        call.restype, call.argtypes = result, arguments
     return Library(build, path, int(calls.fragprune_lanes()), calls)
 
 
@@ -242,18 +230,17 @@ def cpu_features() -> int:
         return 0
 
 
-def usable_builds() -> list[str]:
-    """The builds that are installed and run on this machine, best first."""
-    features = cpu_features()
-    found = []
+def _usable(features: int) -> Iterator[Library]:
+    """The builds that are installed and run on a machine with these features, best first."""
     for build, needs in BUILDS.items():
         if needs & ~features == 0:
-            try:
-                open_build(build)
-            except Unavailable:
-                continue
-            found.append(build)
-    return found
+            with suppress(Unavailable):
+                yield open_build(build)
+
+
+def usable_builds() -> list[str]:
+    """The builds that are installed and run on this machine, best first."""
+    return [each.build for each in _usable(cpu_features())]
 
 
 def choose() -> Library:
@@ -274,13 +261,7 @@ def choose() -> Library:
         if BUILDS[wanted] & ~features:
             raise Unavailable(f"{ENVIRONMENT}={wanted}, which this processor lacks")
         return open_build(wanted)
-    for build, needs in BUILDS.items():
-        if needs & ~features == 0:
-            try:
-                return open_build(build)
-            except Unavailable:
-                continue
-    return baseline
+    return next(_usable(features), baseline)
 
 
 _lock = threading.Lock()
@@ -329,23 +310,14 @@ def library() -> Library:
 
 def describe() -> dict[str, Any]:
     """What ``fragprune doctor`` prints: the build in use, or the reason why there is none."""
-    answer = _answer()
-    if isinstance(answer, Library):
-        return {
-            "available": True,
-            "build": answer.build,
-            "lanes": answer.lanes,
-            "path": answer.path,
-            "usable": usable_builds(),
-            "reason": None,
-        }
+    known = answer if isinstance(answer := _answer(), Library) else None
     return {
-        "available": False,
-        "build": None,
-        "lanes": None,
-        "path": None,
-        "usable": [],
-        "reason": answer,
+        "available": known is not None,
+        "build": known and known.build,
+        "lanes": known and known.lanes,
+        "path": known and known.path,
+        "usable": usable_builds() if known else [],
+        "reason": None if known else answer,
     }
 
 
