@@ -84,7 +84,7 @@ def native_inputs(
     )
 
 
-def joined(splats: Splats) -> Splats:
+def with_joined_sh(splats: Splats) -> Splats:
     """The same with all coefficients in ``sh``."""
     if splats.sh is None or splats.sh_rest is None:
         return splats

@@ -8,6 +8,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from fragprune_plugins.constants import TILE
+from fragprune_plugins.engines.inputs import with_joined_sh
 from fragprune_plugins.types import (
     Footprints,
     RasterInputs,
@@ -110,7 +111,7 @@ def camera_of(inputs: RasterInputs) -> Camera:
 
 def gaussians_of(splats: Splats) -> Gaussians:
     """The oracle's Gaussians, sharing the tensors."""
-    given = vars(splats.joined())
+    given = vars(with_joined_sh(splats))
     return Gaussians(**{name: given[name] for name in given.keys() - {"sh_rest"}})
 
 

@@ -160,8 +160,7 @@ class Model:
     def splats(self, sh_apart: bool = False) -> Splats:
         """The Gaussians after activation, for engines; differentiable.
 
-        Args:
-            sh_apart: leave f_dc and f_rest as they are, for an engine that reads both.
+        With ``sh_apart``, f_dc and f_rest stay as they are, for an engine that reads both.
         """
         opacities, scales = torch.sigmoid(self.opacity[:, 0]), torch.exp(self.scaling)
         if self.filter_3d is not None:

@@ -16,6 +16,7 @@ from fragprune_plugins.engines.cuda.frame import (
     Wanted,
     learnable,
 )
+from fragprune_plugins.engines.inputs import with_joined_sh
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterOutputs, Splats
 
@@ -115,8 +116,8 @@ class CudaEngine:
                 "Run on the CPU (--device cpu), or draw it hard: replace(inputs, rim='hard').",
             )
         self.expect_on_device(inputs.splats.device)
-        if isinstance(inputs.splats, Splats) and inputs.splats.sh_rest is not None:
-            inputs = replace(inputs, splats=inputs.splats.joined())
+        if isinstance(inputs.splats, Splats):
+            inputs = replace(inputs, splats=with_joined_sh(inputs.splats))
         drawing = Drawing(self.device, inputs, thresholds)
         tensors = {
             **learnable(inputs),
