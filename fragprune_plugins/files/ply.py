@@ -62,7 +62,7 @@ _QUATERNION_MIN = 1e-12  # torch's normalize divides by no less
 log = logging.getLogger("fragprune")
 
 _SHOWN_COLUMNS = 12
-
+_BLOCK = 4096  # rows that are read column by column, so that they stay in the cache
 _SHOWN_ROWS = 5  # of those that a message is about
 
 
@@ -163,19 +163,19 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
         raise ModelFileError(str(path), "0 Gaussians", "at least one", _REMEDY)
 
     def column(*wanted: str) -> Tensor:
+        data = np.empty((count, len(wanted)), np.float32)
         with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is refused
-            data = np.stack([columns[name].astype(np.float32) for name in wanted], axis=1)
+            for first in range(0, count if wanted else 0, _BLOCK):
+                rows = slice(first, first + _BLOCK)
+                several = [columns[name][rows] for name in wanted]
+                np.stack(several, axis=1, out=data[rows], casting="unsafe")
         _require_finite(path, wanted, data)
         return torch.from_numpy(data)
 
     splat = Model(
         xyz=column(*_XYZ),
         f_dc=column(*_DC)[:, None, :],
-        f_rest=(
-            column(*rest).reshape(count, 3, -1).transpose(1, 2).contiguous()
-            if rest
-            else torch.zeros(count, 0, 3)
-        ),
+        f_rest=column(*np.reshape(rest, (3, -1)).T.flat).reshape(count, len(rest) // 3, 3),
         opacity=column("opacity"),
         scaling=column(*scales),
         rotation=column(*_ROTATION),
