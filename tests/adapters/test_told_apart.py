@@ -34,7 +34,7 @@ MODEL = "scene/gaussian_model.py"
             RENDERER,
             "low_pass=low_pass,\n",
             "",
-            "nothing besides the shared settings",
+            "nothing besides what hosts share",
         ),
         ("rain-gs", RainHost, MODEL, "divide_ratio", "ratio", "no divide_ratio"),
         ("rain-gs", RainHost, "scene/__init__.py", "args_dict", "options", "no args_dict"),

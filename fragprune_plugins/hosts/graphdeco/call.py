@@ -50,7 +50,7 @@ class RasterizerCall:
         more = ", ".join(sorted(self.besides | self.arguments)) or "nothing"
         back = "the result kept whole" if self.outputs is None else f"{self.outputs} values back"
         package = f", from {self.package}" if self.package else ""
-        return f"{more} besides the shared settings and arguments, {back}{package}"
+        return f"{more} besides what hosts share, {back}{package}"
 
 
 @dataclass(frozen=True)
