@@ -84,12 +84,14 @@ def find(folder: Path) -> list[Record]:
     """
     found = files(folder, below=True)
     if not found:
-        raise RecordError(
-            str(folder),
-            f"no file *{SUFFIX} in it or below" if folder.is_dir() else "no such folder",
-            "an output folder of fragprune run, finetune, or of compare and profile with --out",
-            "Run one of these first.",
-        )
+        what, remedy = f"no file *{SUFFIX} in it or below", "Run one of these first."
+        if folder.is_file():
+            look = f"To look at a model: fragprune view {folder}"
+            what, remedy = "a file", f"Name its folder: fragprune report {folder.parent}. {look}"
+        elif not folder.exists():
+            what, remedy = "no such folder", f"Check the name. {remedy}"
+        expected = "a folder that run or finetune wrote, or compare or profile with --out"
+        raise RecordError(str(folder), what, expected, remedy)
     return [_read(path) for path in found]
 
 

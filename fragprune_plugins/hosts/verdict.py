@@ -79,7 +79,7 @@ def judge(repo: HostRepo, tried: Sequence[Tried], adapters: Sequence[HostAdapter
         within = (_within(each) for each in _hosts(repo.root))
         plain = next((found for found in within if found is not None), plain)
     fitting_inside = " ".join(
-        f"{folder}/ in it fits {fits}: fragprune check {repo.root / folder}"
+        f"Its folder {folder}/ fits {fits}: fragprune check {repo.root / folder}"
         for folder, fits in inside
     )
     if plain:
@@ -131,9 +131,9 @@ def _line(repo: HostRepo, finding: Finding) -> str:
         found, expected = finding.found.split(", "), finding.expected.split(", ")
         more = [each for each in found if each not in expected]
         less = [each for each in expected if each not in found]
-        parts = [f"groups beyond: {', '.join(more)}"] if more else []
-        parts += [f"groups missing: {', '.join(less)}"] if less else []
-        return "; ".join(parts) or f"groups in another order: {finding.found}"
+        parts = [f"further groups of the optimizer: {', '.join(more)}"] if more else []
+        parts += [f"groups that the optimizer lacks: {', '.join(less)}"] if less else []
+        return "; ".join(parts) or f"the optimizer's groups in another order: {finding.found}"
     if finding.code == "other-host":
         scripts = sorted(each.name for each in repo.root.glob("*train*.py"))
         there = f" (scripts: {', '.join(scripts[:_SHOWN])})" if scripts else ""

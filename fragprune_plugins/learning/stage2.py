@@ -50,6 +50,9 @@ log = logging.getLogger("fragprune")
 RESET, MOSTLY = 0.0101, 0.9
 """Opacity that a host's reset leaves at most, and the share of Gaussians that have no more then."""
 
+LOOKED_AT_EVERY = 10
+"""Steps from one look at all parameters to the next: a look reads all of them."""
+
 CURVE_POINTS = 100
 """Thresholds' median, a sort of all rows, is taken this often in a run."""
 
@@ -340,13 +343,17 @@ class Stage2:
         """The driver's optimizer has stepped: so do the thresholds.
 
         Raises:
-            DivergedError: the step left NaN or infinity.
+            DivergedError: NaN or infinity in the thresholds; every tenth step, and after the last,
+                in what the driver trains, too.
         """
         self.taken = self.steps
         if self.learning and self.settings.goal.learns:
             assert self.plan is not None
             self.store.step(self.plan.threshold_lr)
-        if not are_finite([*self.parameters().values(), self.store.logits]):
+        looked_at = [self.store.logits]
+        if self.steps % LOOKED_AT_EVERY == 0 or self.steps == self.settings.iterations:
+            looked_at += self.parameters().values()
+        if not are_finite(looked_at):
             self.check()
 
     def close(self) -> None:

@@ -190,8 +190,8 @@ def joined(device: torch.device) -> Iterator[Ranks]:
             "learning",
             f"{ranks.size} processes that do not find each other ({str(error)[:200]})",
             "the environment that torchrun sets",
-            "Start them with torchrun; see docs/how-to/several-gpus.md. To learn in this process "
-            "alone, unset WORLD_SIZE.",
+            "Start them with torchrun --nproc_per_node 2 -m fragprune_plugins finetune ... "
+            "To learn in this process alone, unset WORLD_SIZE.",
         ) from error
     try:
         yield ranks

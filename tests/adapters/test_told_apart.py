@@ -21,10 +21,10 @@ MODEL = "scene/gaussian_model.py"
 @pytest.mark.parametrize(
     ("adapter", "host", "file", "old", "new", "found"),
     [
-        ("2dgs", SurfelHost, RENDERER, "radii, allmap = Gauss", "radii = Gauss", "2 values back"),
+        ("2dgs", SurfelHost, RENDERER, "radii, allmap = Gauss", "radii = Gauss", "gives 2 values"),
         ("light-gaussian", LightGaussianHost, RENDERER, "f_count", "f_counts", "f_counts"),
         ("mcmc", MCMCHost, "utils/reloc_utils.py", "compute_relocation", "another", "compute_rel"),
-        ("mip-splatting", MipHost, RENDERER, "subpixel_offset=", "offset=", "offset besides"),
+        ("mip-splatting", MipHost, RENDERER, "subpixel_offset=", "offset=", "kernel_size, offset"),
         ("mip-splatting", MipHost, MODEL, "compute_3D_filter", "compute", "no compute_3D_filter"),
         ("mip-splatting", MipHost, MODEL, "grads_abs", "absolute", "absolute"),
         ("mip-splatting", MipHost, RENDERER, "means2D=", "view2gaussian=0, means2D=", "view2gauss"),
@@ -34,7 +34,7 @@ MODEL = "scene/gaussian_model.py"
             RENDERER,
             "low_pass=low_pass,\n",
             "",
-            "nothing besides what hosts share",
+            "takes what hosts share",
         ),
         ("rain-gs", RainHost, MODEL, "divide_ratio", "ratio", "no divide_ratio"),
         ("rain-gs", RainHost, "scene/__init__.py", "args_dict", "options", "no args_dict"),

@@ -248,33 +248,44 @@ def test_hands_and_keys(browser, tmp_path):
 
 
 def test_slow_frames_stay_small_while_the_camera_turns(browser, tmp_path):
-    """A hand waits for the frame it sees. The wait is no rest, which is drawn in full size."""
+    """A hand waits for the frame it sees. The wait is no rest, which is drawn in full size.
+
+    The page's clock is the test's, so a busy machine changes nothing.
+    """
     write_page(tmp_path, [a_model()], a_view())
     with viewing(browser, tmp_path) as tab:
         tab.page.wait_for_function("() => viewer.counted")
         sizes = tab.run(
             """async () => {
                 const { gl } = viewer.drawing, until = new Map(), sizes = [];
+                let clock = performance.now();
+                performance.now = () => clock;
                 const real = { fence: gl.fenceSync, state: gl.getSyncParameter };
                 gl.fenceSync = (...given) => {
                     const fence = real.fence.call(gl, ...given);
-                    until.set(fence, performance.now() + 400);  // longer than a hand may rest
+                    until.set(fence, clock + 400);  // longer than a hand may rest
                     return fence;
                 };
                 gl.getSyncParameter = (fence, name) =>
-                    performance.now() < until.get(fence) ? 0 : real.state.call(gl, fence, name);
+                    clock < until.get(fence) ? 0 : real.state.call(gl, fence, name);
                 const draw = viewer.draw.bind(viewer);
                 viewer.draw = (quality = 1) => { sizes.push(quality); draw(quality); };
-                const pause = (time = 10) => new Promise(done => setTimeout(done, time));
+                const frame = () => new Promise(done => requestAnimationFrame(done));
                 viewer.quality = 0.5;
                 for (let turn = 0; turn < 4; turn++) {
                     const { position } = viewer.camera, drawn = sizes.length;
                     viewer.go({ ...viewer.camera, position: position.map(each => each + 0.01) });
-                    while (sizes.length === drawn || viewer.pending) await pause();
-                    await pause(60);  // to see it, and to go on
+                    while (sizes.length === drawn) await frame();
+                    while (viewer.pending) {
+                        clock += 50;
+                        await frame();
+                    }
+                    clock += 60;  // to see it, and to go on
+                    for (let i = 0; i < 3; i++) await frame();
                 }
                 const turning = sizes.slice();
-                while (!viewer.sharp) await pause();
+                clock += 1000;
+                while (!viewer.sharp) await frame();
                 return { turning, resting: sizes.at(-1) };
             }"""
         )

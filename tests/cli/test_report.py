@@ -84,6 +84,21 @@ def test_as_text_the_result_comes_first(folder):
     assert not (out / "report.html").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "found", "remedy"),
+    [
+        ("pruned.ply", "a file", "fragprune view "),
+        ("nowhere", "no such folder", "Check the name"),
+    ],
+)
+def test_what_is_no_folder_is_refused_with_the_next_command(folder, name, found, remedy):
+    out, _, _ = folder
+    error = json.loads(run("report", out / name, "--json").stdout)["error"]
+    assert (error["where"], error["found"]) == (str(out / name), found)
+    assert remedy in error["remedy"]
+    assert (f"fragprune report {out}." in error["remedy"]) == (name == "pruned.ply")
+
+
 def test_comparisons_come_along_with_their_pictures(folder):
     out, data, _ = folder
     pruned = out / "pruned.ply"
@@ -230,7 +245,7 @@ def test_a_record_that_is_none_is_refused(tmp_path, text):
 def test_a_folder_without_records_says_what_to_run(tmp_path):
     result = run("report", tmp_path)
     assert result.exit_code == 1
-    assert "fragprune run, finetune" in result.stderr
+    assert "run or finetune" in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 

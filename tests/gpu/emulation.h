@@ -112,9 +112,6 @@ struct Register {
 #define __ffs(v) __builtin_ffs(static_cast<int>(v))
 #define __clz(v) ((v) ? __builtin_clz(v) : 32)
 
-inline float __uint_as_float(uint32_t v) {
-  return emulated::from_word<float>(emulated::as_word(v));
-}
 inline uint32_t __float_as_uint(float v) { return emulated::from_word<uint32_t>(emulated::as_word(v)); }
 
 template <class T, class U>

@@ -101,7 +101,7 @@ def draw(device: EmulatedDevice, seed: int) -> None:
         everything(engine, scenes.random_scene(seed, 700, 70, 50), None)
         everything(engine, scenes.stack([0.3, 0.9, 0.999, 0.5] * 90), None)
         everything(engine, poisoned(scenes.random_scene(seed, 60, 1, 1), seed), None)
-    engine = CudaEngine(device, packed=True)
+    engine = CudaEngine(device)
     engine._capacity = 7
     engine.rasterize(scenes.random_scene(seed, 300, 330, 290, scale_modifier=3.0), None)
     engine.rasterize(scenes.empty(), None)

@@ -104,7 +104,7 @@ def _sorting(gpu: Device, where: torch.device, count: int) -> Iterator[str]:
             [one.data_ptr(), other.data_ptr()]
             for one, other in zip((sorted_keys, order), others, strict=True)
         )
-        launch_sort(gpu, where, {"FP_PACKED": 0}, arguments, keys_at, values_at, PASSES)
+        launch_sort(gpu, where, arguments, keys_at, values_at, PASSES)
         expected = keys.sort(stable=True)
         wrong = (sorted_keys.cpu() != expected.values) | (order.cpu() != expected.indices)
         if wrong.any():

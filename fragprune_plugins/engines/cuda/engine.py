@@ -68,10 +68,6 @@ class CudaEngine:
         device: runs the kernels; None for the GPU of the tensors.
         deterministic: make gradients the same to the bit in each run, at the cost of time and
             memory; None follows torch.use_deterministic_algorithms. Images are always the same.
-        packed: if no gradients are needed, store projected Gaussians in 32 bytes instead of 48,
-            with colours and inverse depths in half precision, opacities and cutoffs in 16 bits. A
-            pixel changes by up to 2^-11 of the largest colour, and by a fragment that lies on a
-            cut.
 
     Raises:
         EngineError: kernels cannot be compiled or run here; the message says why.
@@ -79,17 +75,11 @@ class CudaEngine:
 
     name = "cuda"
 
-    def __init__(
-        self,
-        device: Device | None = None,
-        *,
-        deterministic: bool | None = None,
-        packed: bool = False,
-    ) -> None:
+    def __init__(self, device: Device | None = None, *, deterministic: bool | None = None) -> None:
         if device is None:
             device = Driver()
         self.device = device
-        self._deterministic, self._packed = deterministic, packed
+        self._deterministic = deterministic
         self._capacity = _FIRST_CAPACITY
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
@@ -148,10 +138,9 @@ class CudaEngine:
         deterministic = self._deterministic
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
-        how = {"deterministic": deterministic, "packed": self._packed}
-        drawn = drawing.draw(self._capacity, wanted, **how)
+        drawn = drawing.draw(self._capacity, wanted, deterministic=deterministic)
         if (entries := drawing.read()) > self._capacity:
             self._capacity = entries + entries // 4
-            drawn = drawing.draw(self._capacity, wanted, **how)
+            drawn = drawing.draw(self._capacity, wanted, deterministic=deterministic)
             drawing.read()
         return drawn

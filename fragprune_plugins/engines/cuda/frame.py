@@ -37,7 +37,6 @@ SORT_KEYS: Final = 16 * THREADS
 PASSES: Final = 4
 DIGITS: Final = 256
 BRUSH: Final = 12
-PACKED_BRUSH: Final = 8
 COUNTERS: Final = 4 * 8 + 4 * (2 + 2 * PASSES)
 
 ENTRIES_MAX: Final = (1 << 30) - 1
@@ -106,7 +105,6 @@ def blend_macros(
     *,
     counts: bool = False,
     scores: bool = False,
-    packed: bool = False,
     stop: bool = False,
 ) -> dict[str, int]:
     """The macros with which native/cuda/blend.cu is compiled."""
@@ -114,7 +112,6 @@ def blend_macros(
         "FP_FEATURES": features,
         "FP_COUNTS": int(counts),
         "FP_SCORES": int(scores),
-        "FP_PACKED": int(packed),
         "FP_STOP": int(stop),
     }
 
@@ -222,7 +219,6 @@ def launch(
 def launch_sort(
     device: Device,
     where: torch.device,
-    macros: dict[str, int],
     arguments: Sort,
     keys: list[int],
     values: list[int],
@@ -233,7 +229,7 @@ def launch_sort(
     for k in range(passes):
         arguments.keys, arguments.sorted_keys = keys[k % 2], keys[1 - k % 2]
         arguments.values, arguments.sorted_values = values[k % 2], values[1 - k % 2]
-        launch(device, where, "scene", macros, "fp_sort", blocks, arguments)
+        launch(device, where, "scene", {}, "fp_sort", blocks, arguments)
         arguments.shift += 8
         arguments.histogram += 4 * DIGITS
         arguments.words += 4 * DIGITS * blocks
@@ -335,32 +331,29 @@ class Drawing:
 
     # ---- forward -------------------------------------------------------------------------------
 
-    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool, packed: bool) -> Drawn:
+    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool) -> Drawn:
         """Launch the forward pass. Its result is invalid if entries exceed the capacity.
 
         Args:
             capacity: the number of list entries, over all tiles, to allocate room for.
             wanted: names of the inputs that will need gradients.
             deterministic: give each entry its own slot, so that backward can add in order.
-            packed: store Gaussians in fewer bytes; only without gradients.
         """
         inputs, n, where = self._inputs, self._n, self.where
         tiles, pixels = self._across * self._down, inputs.view.width * inputs.view.height
         keep = bool(wanted)
-        packed = packed and not keep
-        memory = self._room(capacity, keep, keep and deterministic, packed)
+        memory = self._room(capacity, keep, keep and deterministic)
         outputs = self._new_outputs()
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
         frame = self._new_frame(capacity, memory)
         frame.inputs = native_inputs(inputs, self._arrays, widen="thresholds" in wanted)
         frame.outputs = binding.Outputs(**{name: address(each) for name, each in outputs.items()})
         frame.weights = address(weights)
-        self._list(frame, memory, {"FP_PACKED": int(packed)})
+        self._list(frame, memory)
         macros = blend_macros(
             self._channels,
             counts=inputs.counts,
             scores=inputs.scores,
-            packed=packed,
             stop=inputs.stop is not None,
         )
         self._launch("blend", macros, "fp_blend", tiles, frame)
@@ -376,14 +369,13 @@ class Drawing:
             **outputs,
         )
 
-    def _room(self, capacity: int, keep: bool, slots: bool, packed: bool) -> Memory:
+    def _room(self, capacity: int, keep: bool, slots: bool) -> Memory:
         """The memory of a frame.
 
         Args:
             capacity: list entries.
             keep: gradients will be needed.
             slots: in a fixed order.
-            packed: Gaussians are stored in fewer bytes.
         """
         n, where = self._n, self.where
         tiles = self._across * self._down
@@ -411,7 +403,7 @@ class Drawing:
         kept = Arena(
             where,
             torch.empty,
-            brushes=4 * (PACKED_BRUSH if packed else BRUSH) * n,
+            brushes=4 * BRUSH * n,
             tiles=4 * n,
             first_slot=4 * n * slots,
             entry_values=4 * capacity,
@@ -450,13 +442,12 @@ class Drawing:
             stop=kept["stop"] if keep else None,
         )
 
-    def _list(self, frame: Frame, memory: Memory, scene: dict[str, int]) -> None:
+    def _list(self, frame: Frame, memory: Memory) -> None:
         """Project the Gaussians, and list them by tile and depth.
 
         Args:
             frame: the kernels' arguments; told where the lists end up.
             memory: of the frame.
-            scene: macros of these kernels.
         """
         n, capacity, passes = self._n, frame.capacity, memory.passes
         cleared, scratch, kept = memory.cleared, memory.scratch, memory.kept
@@ -480,15 +471,15 @@ class Drawing:
             words=cleared["tile_sort"],
             ticket=counters + 4 * 8 + 4 * (2 + PASSES),
         )
-        self._launch("scene", scene, "fp_project", blocks_of(n), frame)
+        self._launch("scene", {}, "fp_project", blocks_of(n), frame)
         ids = [scratch["depth_ids"], scratch["ids_2"]]
         depths = [scratch["depth_keys"], scratch["keys_2"]]
-        launch_sort(self._device, self.where, scene, by_depth, depths, ids, PASSES)
-        self._launch("scene", scene, "fp_emit", blocks_of(n), frame)
+        launch_sort(self._device, self.where, by_depth, depths, ids, PASSES)
+        self._launch("scene", {}, "fp_emit", blocks_of(n), frame)
         if n:
-            launch_sort(self._device, self.where, scene, by_tile, keys, values, passes)
+            launch_sort(self._device, self.where, by_tile, keys, values, passes)
             frame.entry_keys, frame.entry_values = keys[passes % 2], values[passes % 2]
-            self._launch("scene", scene, "fp_ranges", blocks_of(capacity), frame)
+            self._launch("scene", {}, "fp_ranges", blocks_of(capacity), frame)
 
     def read(self) -> int:
         """Wait for the GPU, then return the number of entries.

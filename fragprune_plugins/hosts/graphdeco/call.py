@@ -47,10 +47,11 @@ class RasterizerCall:
         return found.arguments <= self.arguments and passed == self
 
     def __str__(self) -> str:
-        more = ", ".join(sorted(self.besides | self.arguments)) or "nothing"
-        back = "the result kept whole" if self.outputs is None else f"{self.outputs} values back"
-        package = f", from {self.package}" if self.package else ""
-        return f"{more} besides what hosts share, {back}{package}"
+        more = ", ".join(sorted(self.besides | self.arguments))
+        takes = f"also takes {more}" if more else "takes what hosts share"
+        gives = "its result kept whole" if self.outputs is None else f"gives {self.outputs} values"
+        package = f" of {self.package}" if self.package else ""
+        return f"the rasterizer{package} {takes}, {gives}"
 
 
 @dataclass(frozen=True)

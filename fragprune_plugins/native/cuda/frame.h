@@ -6,9 +6,6 @@
 
 #include "../cpu/ellipse.h"
 
-#ifndef FP_PACKED  // brushes of 32 bytes instead of 48, for pictures alone
-#define FP_PACKED 0
-#endif
 #ifndef FP_FEATURES  // channels blended beside colour, 0 to 8
 #define FP_FEATURES 0
 #endif
@@ -20,7 +17,7 @@ constexpr int kWarps = kThreads / 32;
 constexpr int kDigits = 256;     // buckets of one pass of sorting
 constexpr int kSortItems = 16;   // of each thread
 constexpr int kPasses = 4;       // at most, 8 bits each
-constexpr int kBrush = FP_PACKED ? 8 : 12;  // floats of a Brush in memory
+constexpr int kBrush = 12;       // floats of a Brush in memory
 
 // Zero when a frame begins.
 struct Counters {
@@ -112,42 +109,17 @@ __device__ inline Camera<float> camera_of(const Frame& f) {
   return unpack_camera(f.in, f.spread ? *f.spread : 0.f);
 }
 
-// Where brushes are packed: logarithms of alpha, -8 to 8, in 16 bits; half a step is 2^-13.
-__device__ inline uint32_t to_fixed(float v) {
-  return static_cast<uint32_t>(clamp(floor((v + 8.f) * 4096.f + 0.5f), 0.f, 65535.f));
-}
-__device__ inline float from_fixed(uint32_t v) {
-  return static_cast<float>(v & 65535u) * (1.f / 4096.f) - 8.f;
-}
-
 __device__ inline void store_brush(float* brushes, size_t row, const Brush<float>& b) {
   float4* to = reinterpret_cast<float4*>(brushes + kBrush * row);
   to[0] = make_float4(b.x, b.y, b.scale, b.skew);
-#if FP_PACKED
-  const auto both_of = [](uint32_t low, uint32_t high) {
-    return __uint_as_float(low | high << 16);
-  };
-  to[1] = make_float4(b.down, both_of(to_fixed(b.log_opacity), to_fixed(b.cut)),
-                      both_of(to_half(b.r), to_half(b.g)), both_of(to_half(b.b), to_half(b.inv_z)));
-#else
   to[1] = make_float4(b.down, b.log_opacity, b.cut, b.list_cut);
   to[2] = make_float4(b.r, b.g, b.b, b.inv_z);
-#endif
 }
 
 __device__ inline Brush<float> load_brush(const float* brushes, size_t row) {
   const float4* from = reinterpret_cast<const float4*>(brushes + kBrush * row);
-  const float4 p = from[0], q = from[1];
-#if FP_PACKED
-  const uint32_t logs = __float_as_uint(q.y), rg = __float_as_uint(q.z), bz = __float_as_uint(q.w);
-  const float cut = from_fixed(logs >> 16);
-  return {p.x, p.y, p.z, p.w, q.x, from_fixed(logs), cut, cut,
-          from_half(static_cast<uint16_t>(rg)), from_half(static_cast<uint16_t>(rg >> 16)),
-          from_half(static_cast<uint16_t>(bz)), from_half(static_cast<uint16_t>(bz >> 16))};
-#else
-  const float4 r = from[2];
+  const float4 p = from[0], q = from[1], r = from[2];
   return {p.x, p.y, p.z, p.w, q.x, q.y, q.z, q.w, r.x, r.y, r.z, r.w};
-#endif
 }
 
 // Whose entry it is, from entry_values.

@@ -49,17 +49,6 @@ FP_HD inline float fnma(float a, float b, float c) { return fmaf(-a, b, c); }
 #ifdef FP_EMULATED
 FP_HD inline float exp2(float a) { return emulated::rounded(exp2f(a), 2); }
 FP_HD inline float reciprocal(float a) { return emulated::rounded(1.f / a, 1); }
-FP_HD inline uint16_t to_half(float a) {
-  const _Float16 half = static_cast<_Float16>(a);
-  uint16_t bits;
-  memcpy(&bits, &half, sizeof bits);
-  return bits;
-}
-FP_HD inline float from_half(uint16_t bits) {
-  _Float16 half;
-  memcpy(&half, &bits, sizeof bits);
-  return static_cast<float>(half);
-}
 #else
 // The special function unit's: 2 and 1 units in the last place.
 FP_HD inline float exp2(float a) {
@@ -70,16 +59,6 @@ FP_HD inline float exp2(float a) {
 FP_HD inline float reciprocal(float a) {
   float r;
   asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(a));
-  return r;
-}
-FP_HD inline uint16_t to_half(float a) {
-  uint16_t bits;
-  asm("cvt.rn.f16.f32 %0, %1;" : "=h"(bits) : "f"(a));
-  return bits;
-}
-FP_HD inline float from_half(uint16_t bits) {
-  float r;
-  asm("cvt.f32.f16 %0, %1;" : "=f"(r) : "h"(bits));
   return r;
 }
 #endif

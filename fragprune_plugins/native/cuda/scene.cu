@@ -62,10 +62,6 @@ __device__ inline bool cut_out(const fragprune_inputs& in, float opacity, size_t
   b.log_opacity = log2(opacity);
   b.cut = cut_of(b.log_opacity, threshold);
   b.list_cut = in.widen ? cut_of(b.log_opacity, rim_reach(threshold)) : b.cut;
-#if FP_PACKED  // what is read back decides, here too
-  b.log_opacity = from_fixed(to_fixed(b.log_opacity));
-  b.cut = b.list_cut = from_fixed(to_fixed(b.cut));
-#endif
   return b.log_opacity >= b.list_cut;
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -61,14 +62,15 @@ def _single(host: Path, adapters: list[HostAdapter], adapter: str | None) -> Rep
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
     lines += ["", judged.sentence]
     lines += [f"  {proof}" for proof in failed or proved]
-    if judged.differs:
-        lines += ["", f"It differs from {judged.adapter}:", *(f"  {d}" for d in judged.differs)]
-    lines += [""]
-    lines += _in_full(tried, fitting) if adapter else _in_short(tried, fitting)
+    if adapter:
+        lines += ["", *_in_full(tried, fitting)]
+    elif judged.kind != "inside":  # its sentence is the command to go on with
+        lines += ["", *_in_short(tried, fitting, judged.differs)]
     if missing:
         lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
         lines += [f"  {install(missing)}"]
-    lines += ["", _conclusion(repo, fitting)]
+    if judged.kind != "inside":
+        lines += ["", _conclusion(repo, fitting)]
     data = {
         "host": str(host),
         "commit": repo.commit,
@@ -104,22 +106,35 @@ def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter]) -> Report:
     return Report({"hosts": rows, "counts": counts}, "\n".join(lines))
 
 
+_NEAREST = 3
+"""Adapters that are named where none fits."""
+
 _KINDS = ("fits", "several", "inside", "finetune", "never")
 
 
-def _in_short(tried: list[Tried], fitting: list[Tried]) -> list[str]:
-    """A line for each adapter that fits. If none fits, for each that finds a seam of its host."""
-    shown = fitting or [each for each in tried if each.held]
+def _in_short(tried: list[Tried], fitting: list[Tried], differs: Sequence[str]) -> list[str]:
+    """A line for each adapter that fits; else how the nearest differs, and the next reasons."""
+    shown = fitting or _nearest(tried)
     if not shown:
-        return [f"None of {len(tried)} adapters finds anything of its host."]
+        return [f"None of {len(tried)} adapters knows anything of it."]
     ancestors = [each for each in tried if each.match.fits and each not in shown]
     others = len(tried) - len(shown) - len(ancestors)
-    why = "do not fit (--adapter NAME says why)" if fitting else "find nothing of their hosts"
+    differences = [] if fitting else [f"{shown[0].verdict()}:", *(f"  {each}" for each in differs)]
     return [
-        *(each.brief() for each in shown),
+        *differences,
+        *(each.brief() for each in shown[bool(differences) :]),
         *(f"{each.verdict()}; {_aside(each, fitting)}" for each in ancestors),
-        *([f"{others} others {why}."] if others else []),
+        *([f"{others} others do not fit (--adapter NAME says why)."] if others else []),
     ]
+
+
+def _nearest(tried: list[Tried]) -> list[Tried]:
+    """The adapters that come nearest, of several with the same reason the first."""
+    reasons: dict[str, Tried] = {}
+    for each in tried:
+        if each.held and each.errors:
+            reasons.setdefault(each.errors[0].found, each)
+    return list(reasons.values())[:_NEAREST]
 
 
 def _aside(tried: Tried, fitting: list[Tried]) -> str:
@@ -220,4 +235,7 @@ def _conclusion(repo: HostRepo, fitting: list[Tried]) -> str:
     if fitting:
         names = ", ".join(each.adapter.name for each in fitting)
         return f"Several adapters fit: {names}. Name one with fragprune run --adapter."
-    return "No adapter fits. docs/how-to/write-an-adapter.md tells how to write an adapter."
+    return (
+        "To write an adapter: the documentation's page Write an adapter in 30 minutes, or "
+        "python -m pydoc fragprune_plugins.adapting"
+    )

@@ -11,7 +11,7 @@ from fragprune_plugins.engines.cuda.frame import blend_macros, unblend_macros
 _TRAINED: Final = frozenset(("means", "hook", "opacities", "scales", "rotations", "sh"))
 
 VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
-    ("scene", {"FP_PACKED": 0}),
+    ("scene", {}),
     ("blend", blend_macros()),
     ("blend", blend_macros(counts=True)),
     ("blend", blend_macros(stop=True)),
