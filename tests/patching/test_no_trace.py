@@ -94,6 +94,7 @@ def after_run(folder: Path, scene: Path, name: str) -> tuple[int, list[str]]:
         settings=OPTIONS.settings,
         from_iter=4 if stage == "joint" else None,
     )
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     warm_up()
     before = Snapshot()
     said = None
