@@ -1,7 +1,5 @@
 """What every room of the suite shares: one torch thread, calm Hypothesis, fresh processes."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os

@@ -1,7 +1,5 @@
 """Scenes as footprints: the same picture, projected in torch before any engine sees it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -4,8 +4,6 @@ Everything is drawn in float64 on the CPU from a generator of its own, then cast
 float64 engine see the same Gaussians up to rounding, and the global random stream is never touched.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Gaussians in space and time, cut by an engine and by the oracle in double precision."""
 
-from __future__ import annotations
-
 import torch
 
 from fragprune_plugins.engines.reference import ReferenceEngine

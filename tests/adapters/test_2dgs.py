@@ -1,7 +1,5 @@
 """2D Gaussian Splatting: surfels and their maps, on a miniature of the host."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """4DGaussians: two phases, a network beside the PLY and Python configurations, on a miniature."""
 
-from __future__ import annotations
-
 import os
 import runpy
 import shutil

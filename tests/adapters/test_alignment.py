@@ -4,8 +4,6 @@ The oracle is the host itself: each row's red coefficient is set to a number, an
 from parents to children bit for bit. Thresholds start as a function of that number.
 """
 
-from __future__ import annotations
-
 import torch
 from miniatures.vanilla_3dgs import expect_ancestors, joint, label
 

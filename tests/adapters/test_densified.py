@@ -1,7 +1,5 @@
 """When a host's densification is over, read from its own arguments: joint learning begins then."""
 
-from __future__ import annotations
-
 import pytest
 from miniatures.compact_3dgs import CompactHost
 from miniatures.light_gaussian import LightGaussianHost

@@ -1,7 +1,5 @@
 """NaN and infinity end stage 2 with a stated error, and nothing of them is saved."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Whole runs of a fork of the demo's host, which no adapter names."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The calls of forks: values besides the picture, and what must be neutral or stand still."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Invariant 6: in stage 2 only what ``--train`` names and the thresholds move, to the bit."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from miniatures.vanilla_3dgs import running, tensors

@@ -1,7 +1,5 @@
 """What a step costs besides drawing: on a GPU, each number read back stops it."""
 
-from __future__ import annotations
-
 from collections import Counter
 from unittest.mock import Mock
 

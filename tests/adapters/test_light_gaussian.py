@@ -1,7 +1,5 @@
 """LightGaussian: counts, pruning and distillation, on a miniature of the host."""
 
-from __future__ import annotations
-
 import copy
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """3DGS-MCMC: relocation, addition and noise, on a miniature of the host."""
 
-from __future__ import annotations
-
 import json
 import sys
 

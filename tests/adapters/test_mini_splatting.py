@@ -1,7 +1,5 @@
 """Mini-Splatting: scores, new points, simplification, compression, on a miniature of the host."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import sys

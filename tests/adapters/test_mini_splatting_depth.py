@@ -1,7 +1,5 @@
 """Mini-Splatting's render_depth against its definition, pixel by pixel and fragment by fragment."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

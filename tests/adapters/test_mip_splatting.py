@@ -1,7 +1,5 @@
 """Mip-Splatting: two filters, absolute gradients, on a miniature of the host."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 

@@ -1,7 +1,5 @@
 """Invariants 1 and 7: off is off, and what is unknown is refused whole."""
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 

@@ -1,7 +1,5 @@
 """The fragment pressure that rides on the host's loss is the one written on paper."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

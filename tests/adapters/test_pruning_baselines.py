@@ -1,7 +1,5 @@
 """Speedy-Splat, LP-3DGS and Compact-3DGS: what runs, and what is refused by name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """RAIN-GS: far splits, wide dilation, an own clock, on a miniature of the host."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Invariant 5 where files meet other files; the round trips are tests/conformance's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """RT-4DGS: its call, its rows, its YAML and its checkpoints, on a miniature of the host."""
 
-from __future__ import annotations
-
 import itertools
 from importlib import import_module
 

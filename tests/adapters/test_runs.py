@@ -1,7 +1,5 @@
 """Whole runs of the demo's host through the launcher: neutral, interrupted, resumed, rendered."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import json

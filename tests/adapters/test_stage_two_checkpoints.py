@@ -1,7 +1,5 @@
 """A checkpoint that the host writes in stage 2 is the host's: from it everything trains again."""
 
-from __future__ import annotations
-
 import runpy
 import shutil
 import sys

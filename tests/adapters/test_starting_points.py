@@ -1,7 +1,5 @@
 """``--stage finetune`` starts from the last file of the host's own training, and names it."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from dataclasses import replace

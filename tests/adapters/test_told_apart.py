@@ -1,7 +1,5 @@
 """A host is known by what it does otherwise than its relatives; seams are the kit's to change."""
 
-from __future__ import annotations
-
 import pytest
 from miniatures.light_gaussian import LightGaussianHost
 from miniatures.mcmc import MCMCHost

@@ -1,7 +1,5 @@
 """setup.py builds what the loader looks for, from every header there is."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path

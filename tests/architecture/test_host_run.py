@@ -1,7 +1,5 @@
 """What a host's training loads of ours and of others, in a fresh process."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fragprune_plugins.workbench.demo.scene import make_scene

@@ -1,7 +1,5 @@
 """The size of the house, counted from its source. A bound is lowered whenever the figure falls."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 from collections import Counter

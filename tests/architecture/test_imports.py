@@ -1,7 +1,5 @@
 """What may be imported by whom, and what importing costs."""
 
-from __future__ import annotations
-
 import ast
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Whoever installed the package sees its types."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -4,8 +4,6 @@ The compiler is a stand-in that writes its arguments where the library goes. `.c
 installs and runs real ones.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

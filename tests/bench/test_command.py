@@ -1,7 +1,5 @@
 """``fragprune bench``: its JSON shape, its options, a model of one's own."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is measured: rows, repeats, turns, stages, pictures compared; and what is made of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

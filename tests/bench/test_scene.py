@@ -1,7 +1,5 @@
 """The bench scene is the same everywhere: figures from two machines are of the same work."""
 
-from __future__ import annotations
-
 import hashlib
 
 import pytest

@@ -7,8 +7,6 @@ with served(folder) as address, chromium() as browser, opened(browser, address) 
     assert tab.errors == []
 """
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Iterator

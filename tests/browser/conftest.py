@@ -1,7 +1,5 @@
 """One Chromium for all tests of a worker."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

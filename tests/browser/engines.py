@@ -6,8 +6,6 @@ with drawing(browser, "spark", model, view, bridge=True) as page:
     page.frames(10)     # milliseconds of each
 """
 
-from __future__ import annotations
-
 import subprocess
 import tempfile
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """PlayCanvas and Spark, unmodified from npm, draw our cutoffs through the bridges."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What all tests of pages stand on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from browser.chromium import opened, served

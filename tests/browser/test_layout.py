@@ -1,7 +1,5 @@
 """All pages fit a phone, and what they say can be read, in light and in dark."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

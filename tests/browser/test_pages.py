@@ -1,7 +1,5 @@
 """Pages of reports and audits, as a real browser shows them: dividers, phones, darkness."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

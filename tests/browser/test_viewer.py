@@ -1,7 +1,5 @@
 """The viewer draws what our engines draw, counts what it draws, and asks nobody for anything."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

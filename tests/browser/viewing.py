@@ -1,7 +1,5 @@
 """The viewer in a tab: what it draws and counts from a camera, and what our engine draws."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Each runs in a child of its own, which may raise, hang or die. The exit code is 
 if it gave nonsense without a word.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

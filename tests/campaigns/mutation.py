@@ -5,8 +5,6 @@ This command draws a sample of them, because all take hours, and prints a table.
 if less than the wanted share of any module's was noticed.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import json

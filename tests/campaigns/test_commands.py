@@ -1,7 +1,5 @@
 """The machinery of ``campaigns.commands``, and a few of its inputs."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

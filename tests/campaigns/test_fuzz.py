@@ -3,8 +3,6 @@
 Seconds of it; ``python -m campaigns.fuzz`` has the hours.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 

@@ -1,7 +1,5 @@
 """The table of ``campaigns.mutation``; mutmut itself takes an hour."""
 
-from __future__ import annotations
-
 import pytest
 from campaigns import mutation
 

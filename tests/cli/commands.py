@@ -1,7 +1,5 @@
 """Running a command in this process, and what every one of them promises."""
 
-from __future__ import annotations
-
 import json
 
 from click.testing import CliRunner, Result

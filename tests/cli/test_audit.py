@@ -1,7 +1,5 @@
 """fragprune audit: a page, a JSON and maps from a model alone."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Each bad input has one message, exit code 1, and touches nothing that was there."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

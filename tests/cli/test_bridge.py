@@ -1,7 +1,5 @@
 """fragprune bridge: JavaScript modules for web viewers."""
 
-from __future__ import annotations
-
 import json
 from importlib.metadata import EntryPoint
 from pathlib import Path

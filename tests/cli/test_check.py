@@ -1,7 +1,5 @@
 """``fragprune check`` says what is where, what changed, and what a codebase is not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """fragprune compare."""
 
-from __future__ import annotations
-
 import importlib
 import json
 

@@ -3,8 +3,6 @@
 There is no GPU here: a device that is none stands for one.
 """
 
-from __future__ import annotations
-
 import json
 
 import elsewhere

@@ -1,7 +1,5 @@
 """``fragprune doctor --prove``: who draws otherwise is named, and never timed."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """fragprune export."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """fragprune finetune, end to end on a tiny scene."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

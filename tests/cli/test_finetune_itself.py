@@ -1,7 +1,5 @@
 """fragprune finetune --self: no photograph, the model's own pictures instead."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

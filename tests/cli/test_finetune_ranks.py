@@ -1,7 +1,5 @@
 """``torchrun -m fragprune_plugins finetune``: one writes and prints, and they end together."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

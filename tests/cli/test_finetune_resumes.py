@@ -1,7 +1,5 @@
 """The same ``fragprune finetune`` again, after a kill or after its end."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """--log, --config and what a shell completes."""
 
-from __future__ import annotations
-
 import csv
 import io
 import logging

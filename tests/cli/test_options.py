@@ -1,7 +1,5 @@
 """What commands make of words that are misspelt, missing or without effect."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """A training's output folder in place of a model, and what is known of the training then."""
 
-from __future__ import annotations
-
 import json
 from argparse import Namespace
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """fragprune profile."""
 
-from __future__ import annotations
-
 from cli.commands import run, run_json
 from finetune import tiny
 

@@ -1,7 +1,5 @@
 """fragprune render."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

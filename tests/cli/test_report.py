@@ -1,7 +1,5 @@
 """``fragprune report``: one page from what commands leave beside their results."""
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Options that exclude or need each other: what is given, and what is said."""
 
-from __future__ import annotations
-
 import click
 import pytest
 from click.testing import CliRunner

@@ -1,7 +1,5 @@
 """fragprune run, on a small host: what is said of its result, and how it is compared."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

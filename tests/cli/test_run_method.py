@@ -1,7 +1,5 @@
 """fragprune run, where stage 2 is a method of the host itself."""
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Commands in processes without streams, letters, or a folder to stand in."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """fragprune view."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import urllib.request

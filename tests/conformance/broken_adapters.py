@@ -1,7 +1,5 @@
 """Adapters with one fault each, which the conformance kit must find."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Hosts that share their patches with vanilla 3DGS, or with another variant of themselves."""
 
-from __future__ import annotations
-
 from fragprune_plugins.testing import AdapterConformance
 
 

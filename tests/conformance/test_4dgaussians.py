@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from conformance.relatives import RelativeConformance
 from miniatures.moving import MovingHost
 

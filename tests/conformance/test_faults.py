@@ -1,7 +1,5 @@
 """What one host alone can show of its adapter is found on that host."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 
 import pytest

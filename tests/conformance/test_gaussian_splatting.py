@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from installed.gaussian_splatting_host import GaussianSplattingHost, MCMCHost
 
 from fragprune_plugins.testing import AdapterConformance

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from installed.gsplat_host import GsplatHost
 
 from fragprune_plugins.testing import AdapterConformance

@@ -1,7 +1,5 @@
 """The kit finds what it is there to find, and says so."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

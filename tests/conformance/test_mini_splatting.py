@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from conformance.relatives import RelativeConformance
 from miniatures.mini_splatting import MiniSplattingHost
 

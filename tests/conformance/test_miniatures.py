@@ -1,7 +1,5 @@
 """A miniature is a program of its own, as a checkout is."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

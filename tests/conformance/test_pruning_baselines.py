@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from conformance.relatives import RelativeConformance
 from miniatures.lp_3dgs import LPHost
 from miniatures.speedy_splat import SpeedyHost

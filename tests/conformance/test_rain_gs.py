@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from conformance.relatives import RelativeConformance
 from miniatures.rain_gs import RainHost
 

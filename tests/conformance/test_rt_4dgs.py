@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from conformance.relatives import RelativeConformance
 from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from fragprune_plugins.testing import AdapterConformance
 
 

@@ -1,7 +1,5 @@
 """Hostile parts of files."""
 
-from __future__ import annotations
-
 import io
 import math
 import os

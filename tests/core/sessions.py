@@ -1,7 +1,5 @@
 """A session's state over a host that is three lines long, to call its handlers by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Which optimizers step in the fused kernel; it takes memory as it lies."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

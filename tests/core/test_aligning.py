@@ -1,7 +1,5 @@
 """What a session does with a host's rows, handler by handler. Whole hosts: tests/conformance."""
 
-from __future__ import annotations
-
 import contextlib
 
 import pytest

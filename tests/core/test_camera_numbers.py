@@ -1,7 +1,5 @@
 """Numbers of cameras as each layout writes them, against the definition of a pinhole."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

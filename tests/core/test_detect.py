@@ -1,7 +1,5 @@
 """Detection reads source: every tree here is a skeleton written from the hosts' interfaces."""
 
-from __future__ import annotations
-
 import pytest
 from miniatures.skeletons import FLAGS, GROUPS, SETTINGS, STATES, skeleton
 

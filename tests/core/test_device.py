@@ -1,7 +1,5 @@
 """``--device cpu``: what names CUDA runs on the CPU, and afterwards nothing has happened."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

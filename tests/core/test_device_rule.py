@@ -1,7 +1,5 @@
 """One rule says where a command works; there need be no GPU to test it."""
 
-from __future__ import annotations
-
 import contextlib
 
 import pytest

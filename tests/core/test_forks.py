@@ -1,7 +1,5 @@
 """A fork is served if reading shows that its model is plain, and refused by name if not."""
 
-from __future__ import annotations
-
 from functools import partial
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The launcher over skeleton hosts, whose training script is whatever a test wants."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Loading and saving a model from Python."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from cli.commands import run_json

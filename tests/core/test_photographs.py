@@ -1,7 +1,5 @@
 """Photographs are read at the size that the host reads them at, or refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Columns of a PLY, whatever stands around them."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a host's script imports is found in its source, and only what it cannot do without."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

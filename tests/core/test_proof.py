@@ -1,7 +1,5 @@
 """A host's own rasterizer is compared with our engine before anything is trained."""
 
-from __future__ import annotations
-
 import json
 import logging
 import shutil

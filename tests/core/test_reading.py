@@ -1,7 +1,5 @@
 """The one door for files: what it opens, what it says, and every reader behind it."""
 
-from __future__ import annotations
-
 import ast
 import errno
 import json

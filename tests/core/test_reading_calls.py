@@ -1,7 +1,5 @@
 """How a fork spells its rasterizer: aliases, modules, positions and two packages."""
 
-from __future__ import annotations
-
 import pytest
 from miniatures.skeletons import SETTINGS, skeleton
 

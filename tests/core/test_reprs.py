@@ -1,7 +1,5 @@
 """What holds tensors is shown on one line, without their numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 import pkgutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A session, from its activation to its summary, over the smallest host."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """What all handlers of a session share."""
 
-from __future__ import annotations
-
 import logging
 from types import SimpleNamespace
 

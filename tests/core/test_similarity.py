@@ -1,7 +1,5 @@
 """A host's SSIM is answered in compiled code only where both ways agree."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """The core of stage 2, driven by hand: no host, no data set, no rasterizer."""
 
-from __future__ import annotations
-
 import json
 import math
 from itertools import pairwise

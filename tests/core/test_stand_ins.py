@@ -1,7 +1,5 @@
 """What answers for the hosts' compiled packages, against re-derivations in plain Python."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Files are whole, and a model and its sidecar belong together, whatever ends the process."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

@@ -1,7 +1,5 @@
 """One sentence for each checkout: it fits, its PLY does, or never, and why."""
 
-from __future__ import annotations
-
 import pytest
 from miniatures.skeletons import GROUPS, skeleton
 

@@ -1,7 +1,5 @@
 """A checkout may have every name and shape of vanilla 3DGS and still compute something else."""
 
-from __future__ import annotations
-
 import pytest
 from miniatures.skeletons import skeleton
 

@@ -1,7 +1,5 @@
 """What does not fit the Gaussians is refused before anything is drawn, by every engine alike."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Pages link to pages that exist, and what is read off the code names everything it is to name."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from runpy import run_path

@@ -1,7 +1,5 @@
 """docs/how-to/renderers.md against checkouts of these renderers, in $FRAGPRUNE_RENDERERS."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import re

@@ -1,7 +1,5 @@
 """docs/how-to/several-gpus.md: what it shows runs."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import sys

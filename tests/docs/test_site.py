@@ -3,8 +3,6 @@
 It needs the extra [docs].
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

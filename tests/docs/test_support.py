@@ -1,7 +1,5 @@
 """Every adapter says what it serves and what it refuses."""
 
-from __future__ import annotations
-
 import pytest
 from cli.commands import run_json
 

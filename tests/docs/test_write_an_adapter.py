@@ -4,8 +4,6 @@ Of ``pip install`` only the package's metadata is made, by setuptools: more woul
 environment of every other test.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

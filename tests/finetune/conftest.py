@@ -1,7 +1,5 @@
 """A tiny model that is to be learned again from its pictures."""
 
-from __future__ import annotations
-
 import pytest
 from finetune import tiny
 

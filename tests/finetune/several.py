@@ -3,8 +3,6 @@
 A child of its own keeps the store, as torchrun's agent does, so that it outlives any of them.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import signal

@@ -1,7 +1,5 @@
 """Readers of photographs and cameras: COLMAP text and binary, Blender, cameras.json."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cameras around a splat and between given ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

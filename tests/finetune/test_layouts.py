@@ -1,7 +1,5 @@
 """What people have on disk: nerfstudio's folder, smaller images, other suffixes, masks."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

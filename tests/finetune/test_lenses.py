@@ -1,7 +1,5 @@
 """Bent photographs are straightened: against a picture whose bend is known by formula."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

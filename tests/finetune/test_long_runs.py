@@ -1,7 +1,5 @@
 """Long fine-tunings: memory stays flat, and thresholds that have settled do not drift."""
 
-from __future__ import annotations
-
 import gc
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Stage 2 without a host: what moves, what stays, where it lands."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The training loss against scikit-image and against its own definition."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch.nn.functional import conv2d

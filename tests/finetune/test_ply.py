@@ -1,7 +1,5 @@
 """The PLY of a trained splat: round trips, refusals."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Portable: no thresholds, less area, and a file that every viewer draws as it is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Several processes learn what one learns that draws as many views a step."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """A fine-tuning that was cut off goes on, and ends with the same bits as one that was not."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Gaussians that are divided among processes: drawn as in one, learned as by one."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ The same Gaussians, views, order, loss and engine go through both drivers. Whate
 or a plugin changes must act alike in both, so every case compares the whole course.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from dataclasses import dataclass

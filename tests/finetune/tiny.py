@@ -1,7 +1,5 @@
 """A scene of a few Gaussians, drawn by our engine, written to disk by small writers of its own."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

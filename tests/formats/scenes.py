@@ -1,7 +1,5 @@
 """Splats for the tests of formats, and how far apart two are."""
 
-from __future__ import annotations
-
 import torch
 from hypothesis import strategies as st
 

@@ -1,7 +1,5 @@
 """The conformance files, and our own engine against them."""
 
-from __future__ import annotations
-
 import json
 
 import cutoff_files

@@ -3,8 +3,6 @@
 It is installed from npm into a temporary folder, or found in $FRAGPRUNE_NPM.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

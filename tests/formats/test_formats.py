@@ -1,7 +1,5 @@
 """Every format: what is written comes back within its own quantisation."""
 
-from __future__ import annotations
-
 import gzip
 import math
 import struct

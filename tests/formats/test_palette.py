@@ -1,7 +1,5 @@
 """Codebooks and palettes against exhaustive choices and their own promises."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Readers made from docs/reference/cutoff.md alone find what we write, where the page says."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

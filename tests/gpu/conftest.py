@@ -1,7 +1,5 @@
 """The kernels' own sources, emulated; and what else the tests of a GPU's engine share."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

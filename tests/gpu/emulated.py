@@ -1,7 +1,5 @@
 """A device that runs the kernels' own sources on the CPU, thread by thread, in shuffled order."""
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import os

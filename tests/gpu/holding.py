@@ -1,7 +1,5 @@
 """How much memory torch's tensors hold on the CPU, to the byte."""
 
-from __future__ import annotations
-
 import torch
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode

@@ -3,8 +3,6 @@
 cd tests && python -m gpu.sanitized thread --resident 3 --seeds 100
 """
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import os

@@ -5,8 +5,6 @@ the last bit but for exp2 and 1/x, where a GPU takes its special unit (2 and 1 u
 place); threads run in another order each time a seed says so.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

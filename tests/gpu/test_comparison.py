@@ -1,7 +1,5 @@
 """What the cuda engine is held against on a GPU: the whole of it, with the emulation as the GPU."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Every kernel compiles for every architecture, and none of its numbers leaves the registers."""
 
-from __future__ import annotations
-
 import sys
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,7 +1,5 @@
 """What ``fragprune doctor`` says about GPUs, and what it builds for them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Proves what is packed and passed to the driver, and in which order; not that a GPU likes it.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

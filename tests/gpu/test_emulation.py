@@ -1,7 +1,5 @@
 """The emulation notices what it is there to notice."""
 
-from __future__ import annotations
-
 import ctypes
 from pathlib import Path
 

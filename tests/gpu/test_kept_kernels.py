@@ -1,7 +1,5 @@
 """Compiled kernels are kept: by source, macros, architecture and toolkit; whole or not at all."""
 
-from __future__ import annotations
-
 import errno
 import threading
 import time

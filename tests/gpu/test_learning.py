@@ -1,7 +1,5 @@
 """Fine-tuning and measuring with the cuda engine, emulated: the same course as on the CPU."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from finetune import tiny

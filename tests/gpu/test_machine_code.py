@@ -4,8 +4,6 @@ A step is one Gaussian on the pixels of one warp. Read off the machine code by n
 nvidia-cuda-nvdisasm); nothing runs, and nothing is timed.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """What a frame leaves in memory: its outputs while somebody holds them, and nothing else."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """On a GPU, against the reference engine on the same GPU in float64. Needs one: -m gpu."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The kernels, emulated, under sanitizers; and that these see what is planted for them."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

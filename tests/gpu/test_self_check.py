@@ -1,7 +1,5 @@
 """The cuda engine is used by default only where it has drawn what other engines draw."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

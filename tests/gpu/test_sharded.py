@@ -1,7 +1,5 @@
 """The kernels, emulated, under Gaussians that are divided among processes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Slices of Gaussians in space and time: the kernels' own sources, emulated, against the oracle."""
 
-from __future__ import annotations
-
 import ctypes
 
 import pytest

@@ -1,7 +1,5 @@
 """Thresholds, an engine, a schedule of a plugin: alike in every command and function that draws."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

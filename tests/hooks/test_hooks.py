@@ -1,7 +1,5 @@
 """One test a hook: what a plugin answers has its effect; what it is told is true."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A plugin that fails in a hook is named; what it answers is looked at before it is used."""
 
-from __future__ import annotations
-
 import logging
 from types import SimpleNamespace
 

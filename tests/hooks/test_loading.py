@@ -1,7 +1,5 @@
 """Plugins are found, blocked, loaded one by one and checked; none stops another."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

@@ -1,7 +1,5 @@
 """An installed package adds to every edge; a folder that is deleted takes only itself away."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -3,8 +3,6 @@
 The host resizes pictures of this layout to 800x800, so a few dozen iterations take minutes.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

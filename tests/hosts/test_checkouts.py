@@ -4,8 +4,6 @@ None is kept here: their licence is not ours. ``FRAGPRUNE_TEST_DATA`` may name a
 ``fox/colmap160``, or is itself a COLMAP dataset; otherwise the demo's room is photographed.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

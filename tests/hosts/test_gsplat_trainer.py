@@ -5,8 +5,6 @@ Its packages are not ours to require: the readers of COLMAP's files, tyro, torch
 model in binary files: name one by ``FRAGPRUNE_TEST_DATA``.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

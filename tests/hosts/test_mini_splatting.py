@@ -1,7 +1,5 @@
 """The real Mini-Splatting, unmodified, where ``FRAGPRUNE_HOSTS`` points at a folder with it."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

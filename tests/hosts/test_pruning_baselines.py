@@ -1,7 +1,5 @@
 """The real Speedy-Splat and LP-3DGS, unmodified, where ``FRAGPRUNE_HOSTS`` points at them."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import pytest

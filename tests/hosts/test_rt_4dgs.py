@@ -1,7 +1,5 @@
 """The real RT-4DGS, unmodified, where ``FRAGPRUNE_HOSTS`` points at a folder with it."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """How the conformance kit drives the pip packages of gaussian-splatting, as they are installed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module

@@ -1,7 +1,5 @@
 """How the conformance kit drives gsplat, as it is installed."""
 
-from __future__ import annotations
-
 import math
 import os
 from importlib import import_module

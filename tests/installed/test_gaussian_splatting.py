@@ -1,7 +1,5 @@
 """The real packages gaussian-splatting and gaussian-splatting-mcmc, on the CPU."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace

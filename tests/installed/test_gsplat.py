@@ -1,7 +1,5 @@
 """The real gsplat on the CPU, where only our kernels answer."""
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import io

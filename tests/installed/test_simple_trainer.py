@@ -1,7 +1,5 @@
 """``fragprune run`` with gsplat's own training script: a small one with its interface."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

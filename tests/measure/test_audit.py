@@ -1,7 +1,5 @@
 """What a splat costs and what of it nobody sees, against pictures that were drawn without it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

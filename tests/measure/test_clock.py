@@ -1,7 +1,5 @@
 """A frame is timed from an idle device to an idle device, its backward pass included."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

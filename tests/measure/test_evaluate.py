@@ -1,7 +1,5 @@
 """Measuring splats on photographs, and the pictures of it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from finetune import tiny

@@ -1,7 +1,5 @@
 """What viewers with rules of their own are asked to shade."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

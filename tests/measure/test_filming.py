@@ -1,7 +1,5 @@
 """Films: where the camera is in each frame, and what the file holds."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Image quality figures."""
 
-from __future__ import annotations
-
 import math
 import sys
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The frame of all pages."""
 
-from __future__ import annotations
-
 import re
 from html.parser import HTMLParser
 

@@ -1,7 +1,5 @@
 """Names of pictures: each view its own file, inside the folder, whatever the view is called."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

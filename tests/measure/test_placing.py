@@ -1,7 +1,5 @@
 """Whether a splat is looked at from outside or from inside."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """What a Gaussian is worth equals what loops over floats give; the best stay."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The strongest truncation within a bound: where it looks next, what it keeps, what it says."""
 
-from __future__ import annotations
-
 from dataclasses import make_dataclass
 from types import SimpleNamespace
 

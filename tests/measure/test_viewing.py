@@ -1,7 +1,5 @@
 """Cameras that are given by what they look at, and pictures from Python."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gaussians that reach no pixel go; no picture changes, to the bit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

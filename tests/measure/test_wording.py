@@ -1,7 +1,5 @@
 """The sentence that one quotes: fragments, time and PSNR together, and the control beside them."""
 
-from __future__ import annotations
-
 import pytest
 
 from fragprune_plugins.workbench.figures.wording import describe, fewer, gain, headlines, outcome

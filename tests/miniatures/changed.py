@@ -1,7 +1,5 @@
 """A fork of the demo's host: other groups, optimizers, names and values back; depth in the loss."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fragprune_plugins.testing import Host

@@ -1,7 +1,5 @@
 """A miniature Compact-3DGS: the demo's host with a mask, codebooks and a network for colours."""
 
-from __future__ import annotations
-
 import inspect
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A rasterizer that stands for a host's compiled one: the oracle, with one difference built in."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace

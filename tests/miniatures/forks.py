@@ -1,7 +1,5 @@
 """A fork of 3DGS with nothing inside: what its scripts, model and renderer say, to be varied."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fragprune_plugins.hosts.source import HostRepo

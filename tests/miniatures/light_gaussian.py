@@ -1,7 +1,5 @@
 """A miniature LightGaussian: the demo's host with what the method adds, from its interface."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A miniature LP-3DGS: the demo's host with what the method adds, from its interface."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fragprune_plugins.testing.host import Host, densify_and_prune

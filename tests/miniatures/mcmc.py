@@ -1,7 +1,5 @@
 """A miniature 3DGS-MCMC: the demo's host with what the method adds, from its public interface."""
 
-from __future__ import annotations
-
 import inspect
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A miniature Mini-Splatting: the demo's host with what the method adds, from its interface."""
 
-from __future__ import annotations
-
 import inspect
 import random
 from pathlib import Path

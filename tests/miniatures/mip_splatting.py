@@ -1,7 +1,5 @@
 """A miniature Mip-Splatting: the demo's host with what the method adds, from its interface."""
 
-from __future__ import annotations
-
 import math
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A miniature 4DGaussians: the demo's host, and a network that moves its Gaussians with time."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 from argparse import ArgumentParser

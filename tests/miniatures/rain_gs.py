@@ -1,7 +1,5 @@
 """A miniature RAIN-GS: the demo's host with what the method adds, from its interface."""
 
-from __future__ import annotations
-
 import inspect
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A miniature RT-4DGS: the demo's host with space and time, from the method's interface."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 from importlib import import_module

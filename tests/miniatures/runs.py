@@ -1,7 +1,5 @@
 """Whole runs of a miniature's own scripts, and what must not have moved in them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

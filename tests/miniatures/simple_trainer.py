@@ -3,8 +3,6 @@
 python simple_trainer.py default|mcmc --data_dir IN --result_dir OUT [--max_steps 30] [--ckpt FILE]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

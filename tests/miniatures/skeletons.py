@@ -1,7 +1,5 @@
 """Hosts with nothing inside: signatures and the rasterizer call, written from their interfaces."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

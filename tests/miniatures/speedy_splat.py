@@ -1,7 +1,5 @@
 """A miniature Speedy-Splat: the demo's host with what the method adds, from its interface."""
 
-from __future__ import annotations
-
 import inspect
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A miniature 2D Gaussian Splatting: the demo's host with what the method adds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """The demo's host in this process, under the vanilla adapter unless told otherwise."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """One engine per build that runs on this machine."""
 
-from __future__ import annotations
-
 import pytest
 from native.sanitize import building
 

@@ -6,8 +6,6 @@ not by the other, a pixel's stop likewise: pixels with unequal fragment counts a
 comparison and of the loss, and must be few. What is left differs by accumulated float32 rounding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, get_args

@@ -4,8 +4,6 @@ The rules of test_against_oracle.py apply: both engines see the same float32 num
 whose fragment counts differ by rounding are few and left out.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any, get_args

@@ -1,7 +1,5 @@
 """List entries that the cpu engine counts, against tiles that can be counted by hand."""
 
-from __future__ import annotations
-
 import pytest
 import scenes
 import torch

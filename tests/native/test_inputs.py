@@ -1,7 +1,5 @@
 """What goes into compiled code: every field arrives, and no array is read beyond its end."""
 
-from __future__ import annotations
-
 import ctypes
 from dataclasses import Field, fields, replace
 from typing import Any

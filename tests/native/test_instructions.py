@@ -7,8 +7,6 @@ compiler's minor version, and is less than each of the losses this guards agains
 cheaper writes the new counts down.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

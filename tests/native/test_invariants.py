@@ -1,7 +1,5 @@
 """What the cpu engine promises to the bit: threads, runs, neutral thresholds, monotone cuts."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import get_args

@@ -1,7 +1,5 @@
 """Which build is opened, and what is said when none can be; header and Python agree."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import subprocess

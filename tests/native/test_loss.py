@@ -1,7 +1,5 @@
 """The compiled photometric loss against 121 taps written out in double precision."""
 
-from __future__ import annotations
-
 import math
 import sys
 from importlib.machinery import ModuleSpec

@@ -1,7 +1,5 @@
 """What a step frees is there for the next one, without the kernel."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Planes that nobody asked for are not drawn, and the others are the same without them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Compiled slices of Gaussians in space and time against the oracle in double precision."""
 
-from __future__ import annotations
-
 import ctypes
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Surfels on the cpu engine; what all Gaussians have in common is in test_against_oracle.py."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

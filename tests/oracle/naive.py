@@ -4,8 +4,6 @@ One record per (Gaussian, pixel) pair that the host would visit, in blend order;
 the thresholds' gradient are sums over records.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

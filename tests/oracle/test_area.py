@@ -1,7 +1,5 @@
 """The ellipses' area: against pixels counted one by one, and its gradient against differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

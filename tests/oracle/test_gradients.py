@@ -1,7 +1,5 @@
 """Derivatives: by finite differences with the cuts off, and the host's own quirks with them on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

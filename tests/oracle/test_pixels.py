@@ -1,7 +1,5 @@
 """Images: by hand, and against loops over Python floats."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

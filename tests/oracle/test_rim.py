@@ -1,7 +1,5 @@
 """A soft rim: how much of a pixel it covers, and the derivatives of that."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

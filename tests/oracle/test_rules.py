@@ -1,7 +1,5 @@
 """The host's rules, one by one: what is culled, where a splat may draw, when a pixel stops."""
 
-from __future__ import annotations
-
 import ast
 import math
 import sys

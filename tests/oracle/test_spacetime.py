@@ -1,7 +1,5 @@
 """The 3D Gaussians and colours of a moment, against another way to say the same, in float64."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The colour basis against its definition by Legendre functions."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from oracle.naive import harmonic

@@ -1,7 +1,5 @@
 """Surfels against geometry: rays, planes and points in the world, none of the oracle's matrices."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Thresholds: what they cut, what they must leave alone, and what gradient they get."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The ledger over modules of this test's own making."""
 
-from __future__ import annotations
-
 import sys
 from types import ModuleType
 

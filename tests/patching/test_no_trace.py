@@ -1,7 +1,5 @@
 """A process after a session is the process before it, but for modules that were imported."""
 
-from __future__ import annotations
-
 import builtins
 import gc
 import logging

@@ -1,7 +1,5 @@
 """Hosts with worker processes, a compiled render function, or several ranks."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

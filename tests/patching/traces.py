@@ -1,7 +1,5 @@
 """What a session could leave behind in a process: a snapshot, and what differs from it later."""
 
-from __future__ import annotations
-
 import atexit
 import io
 import locale

@@ -3,8 +3,6 @@
 docs/how-to/nerfstudio.md says what to install.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

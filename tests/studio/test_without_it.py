@@ -1,7 +1,5 @@
 """What nerfstudio's adapter promises where nerfstudio is not installed."""
 
-from __future__ import annotations
-
 import sys
 from importlib.metadata import entry_points
 from pathlib import Path

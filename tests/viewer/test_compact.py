@@ -1,7 +1,5 @@
 """A page's own model is what a .spz file makes of it, in few bytes."""
 
-from __future__ import annotations
-
 import json
 import zlib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A model's tables hold what the model holds, to the stated precision."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

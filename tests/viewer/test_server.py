@@ -1,7 +1,5 @@
 """The server gives its own files to its own machine, and nothing else to anybody."""
 
-from __future__ import annotations
-
 import http.client
 import socket
 import threading

@@ -1,7 +1,5 @@
 """The files of a viewer, in a folder or in one page."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -4,8 +4,6 @@ The exit code is 1 if any reader raises what is not ours, gives nonsense, takes 
 or a gibibyte, or dies.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import time

@@ -1,7 +1,5 @@
 """Changes a good file in ways that parsers trip over: counts, lengths, numbers, nesting."""
 
-from __future__ import annotations
-
 import random
 import re
 import struct

@@ -1,7 +1,5 @@
 """Every reader as a function of bytes: what it gives is looked at, what it raises is judged."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Feeds inputs to readers in a child of bounded memory, and watches it."""
 
-from __future__ import annotations
-
 import mmap
 import os
 import random

@@ -4,8 +4,6 @@ All of it is our own, made from numbers. Files named ``found-*`` are inputs that
 reader; nothing here makes or removes them.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -8,8 +8,6 @@ time says nothing:
     python -m pytest tests/native/arm -m slow -s
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Seconds of the fuzz target: any bytes as one call. docs/how-to/sanitize.md has the hours."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

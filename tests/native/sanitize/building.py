@@ -1,7 +1,5 @@
 """Compiles the engine's source with sanitizers, together with a C++ program of the tests."""
 
-from __future__ import annotations
-
 import os
 import runpy
 import shlex

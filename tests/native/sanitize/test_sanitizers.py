@@ -4,8 +4,6 @@
 the seed in hand. For a longer run see docs/how-to/sanitize.md.
 """
 
-from __future__ import annotations
-
 import pytest
 from native.sanitize import building
 from native.sanitize.building import MEMORY, THREADS, Toolchain
