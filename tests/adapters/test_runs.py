@@ -5,12 +5,12 @@ import gc
 import json
 import os
 import random
-import runpy
 import shutil
 import signal
 import sys
 import weakref
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ import torch
 from click.testing import CliRunner
 from miniatures import runs
 from miniatures.runs import OPTIONS, check_stage_two
-from miniatures.vanilla_3dgs import HOST, InterruptAt, running
+from miniatures.vanilla_3dgs import HOST, InterruptAt, run_script, running
 
 from fragprune_plugins.errors import Interrupted, SessionError, UsageError
 from fragprune_plugins.files import sidecar
@@ -27,7 +27,6 @@ from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.injection.process import forget_modules, host_process
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.goals import Portable
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -35,9 +34,7 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands import cli
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
-
-def command(scene, out, iterations, *more):
-    return runs.command(HOST / "train.py", scene, out, iterations, *more)
+command = partial(runs.command, HOST / "train.py")
 
 
 class Never(Schedule):
@@ -57,18 +54,8 @@ def host_run(scene, out, wrapped):
         freeze=False,
         drop_in=True,
     )
-    script, *arguments = command(scene, out, 25, "--checkpoint_iterations", 25)
-    known = set(sys.modules)
-    with host_process(HOST / "train.py", arguments, "cpu"):
-        try:
-            if wrapped:
-                session.activate()
-            else:
-                session.install_stand_ins()
-            runpy.run_path(script, run_name="__main__")
-        finally:
-            session.deactivate()
-            forget_modules(HOST, known)
+    words = command(scene, out, 25, "--checkpoint_iterations", 25)
+    run_script(words, session, activated=wrapped)
     (capture, _) = torch.load(out / "chkpnt25.pth", weights_only=False)
     ply = out / "point_cloud" / "iteration_25" / "point_cloud.ply"
     streams = random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state()

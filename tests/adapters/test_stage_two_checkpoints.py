@@ -1,46 +1,27 @@
 """A checkpoint that the host writes in stage 2 is the host's: from it everything trains again."""
 
-import runpy
 import shutil
-import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from miniatures.runs import TINY
-from miniatures.vanilla_3dgs import HOST
+from miniatures import runs
+from miniatures.vanilla_3dgs import HOST, run_script
 
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.injection.process import forget_modules, host_process
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 NAMES = ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")
+command = partial(runs.command, HOST / "train.py")
 SETTINGS = Settings(iterations=8, threshold_lr=0.3, train="opacity")
 OPTIONS = RunOptions(device="cpu", settings=SETTINGS)
 EVERYTHING = {"xyz", "f_dc", "scaling", "rotation", "opacity"}  # a second band comes much later
-
-
-def command(scene, out, iterations, *more):
-    words = ["-s", scene, "-m", out, "--iterations", iterations, *TINY, *more]
-    return [str(HOST / "train.py"), *map(str, words)]
-
-
-def alone(words):
-    """The host without fragprune, but for what stands in for its compiled packages."""
-    session = Session(Vanilla3DGS(), HostRepo(HOST), load_plugins(), drop_in=True)
-    known = set(sys.modules)
-    with host_process(Path(words[0]), words[1:], "cpu"):
-        try:
-            session.install_stand_ins()
-            runpy.run_path(words[0], run_name="__main__")
-        finally:
-            session.deactivate()
-            forget_modules(HOST, known)
 
 
 def parameters(checkpoint):
@@ -73,7 +54,8 @@ def test_everything_trains_that_would_have_trained(photographs, trained, tmp_pat
     more = ["--start_checkpoint", start, "--checkpoint_iterations", 23]
     words = command(photographs, out, 24, *more)
     if stage == "alone":
-        alone(words)
+        session = Session(Vanilla3DGS(), HostRepo(HOST), load_plugins(), drop_in=True)
+        run_script(words, session, activated=False)
     else:
         settings = replace(SETTINGS, train="all")
         run(words, replace(OPTIONS, stage=stage, settings=settings))

@@ -3,11 +3,12 @@
 import logging
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from miniatures.runs import TINY
+from miniatures import runs
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
@@ -16,6 +17,7 @@ from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.schedule import Settings
 
+command = partial(runs.command, HOST / "train.py")
 SETTINGS = Settings(iterations=6, threshold_lr=0.3, train="opacity")
 OPTIONS = RunOptions(device="cpu", settings=SETTINGS)
 FINETUNE = replace(OPTIONS, stage="finetune")
@@ -37,11 +39,6 @@ def once(photographs, tmp_path_factory):
 @pytest.fixture
 def out(once, tmp_path):
     return Path(shutil.copytree(once, tmp_path / "out"))
-
-
-def command(scene, out, iterations, *more):
-    words = ["-s", scene, "-m", out, "--iterations", iterations, *TINY, *more]
-    return [str(HOST / "train.py"), *map(str, words)]
 
 
 @pytest.fixture

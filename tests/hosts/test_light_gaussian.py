@@ -1,28 +1,12 @@
 """The real LightGaussian, unmodified, where ``FRAGPRUNE_HOSTS`` points at a folder with it."""
 
-import os
-from pathlib import Path
-
 import pytest
+from hosts.test_checkouts import each_of
 
 from fragprune_light_gaussian import LightGaussian
-from fragprune_plugins.hosts.source import HostRepo
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
-
-FOLDER = os.environ.get("FRAGPRUNE_HOSTS")
-FOUND = [
-    script.parent
-    for script in (sorted(Path(FOLDER).glob("*/prune_finetune.py")) if FOLDER else [])
-    if LightGaussian().match(HostRepo(script.parent)).fits
-]
-
-
-@pytest.fixture(params=FOUND or [None], ids=lambda path: path.name if path else "none")
-def host(request):
-    if request.param is None:
-        pytest.skip("FRAGPRUNE_HOSTS names no folder with a checkout of LightGaussian in it")
-    return request.param
+every_host = each_of(LightGaussian())
 
 
 RUN = """
@@ -94,6 +78,7 @@ print(json.dumps(report))
 """
 
 
+@every_host
 def test_thresholds_are_learned_and_stay_with_the_survivors_of_pruning(
     host, dataset, tmp_path, python
 ):

@@ -1,28 +1,12 @@
 """The real Mini-Splatting, unmodified, where ``FRAGPRUNE_HOSTS`` points at a folder with it."""
 
-import os
-from pathlib import Path
-
 import pytest
+from hosts.test_checkouts import each_of
 
 from fragprune_mini_splatting import MiniSplatting
-from fragprune_plugins.hosts.source import HostRepo
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
-
-FOLDER = os.environ.get("FRAGPRUNE_HOSTS")
-FOUND = [
-    script.parents[1]
-    for script in (sorted(Path(FOLDER).glob("*/ms/train.py")) if FOLDER else [])
-    if MiniSplatting().match(HostRepo(script.parents[1])).fits
-]
-
-
-@pytest.fixture(params=FOUND or [None], ids=lambda path: path.name if path else "none")
-def host(request):
-    if request.param is None:
-        pytest.skip("FRAGPRUNE_HOSTS names no folder with a checkout of Mini-Splatting in it")
-    return request.param
+every_host = each_of(MiniSplatting())
 
 
 RUN = """
@@ -92,6 +76,7 @@ FLAGS = {
 }
 
 
+@every_host
 @pytest.mark.parametrize("variant", FLAGS)
 def test_thresholds_are_learned_after_points_made_anew(host, dataset, tmp_path, python, variant):
     report = python(RUN, host, dataset, tmp_path, variant, *FLAGS[variant].split())

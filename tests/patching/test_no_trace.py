@@ -23,7 +23,6 @@ from fragprune_plugins.errors import FragpruneError, HostFailed, Interrupted
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing import Host
 from fragprune_plugins.testing.fresh import fresh
-from fragprune_plugins.workbench.demo.scene import make_scene
 
 STEP = "        loss.backward()\n"
 FAIL = "        if iteration == 9:\n            note()\n            raise ValueError('theirs')\n"
@@ -53,13 +52,6 @@ RUNS: dict[str, tuple[str, str, type[FragpruneError] | None]] = {
 
 OBJECTS = 50_000
 """Fewer would mean that the walk has missed torch."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, views=6, width=40, points=150)
-    return folder
 
 
 def host_of(folder: Path, does: str = "") -> Path:
@@ -118,9 +110,9 @@ def test_activating_and_deactivating_leaves_no_trace(tmp_path):
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_a_run_leaves_no_trace(name, scene, tmp_path):
+def test_a_run_leaves_no_trace(name, photographs, tmp_path):
     """The host itself seeds the random streams; after the run they are where the host left them."""
-    count, differences = fresh(after_run, tmp_path, scene, name)
+    count, differences = fresh(after_run, tmp_path, photographs, name)
     assert count > OBJECTS
     assert differences == [], "\n".join(differences)
 

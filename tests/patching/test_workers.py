@@ -14,7 +14,6 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing import Host
 from fragprune_plugins.testing.fresh import fresh
-from fragprune_plugins.workbench.demo.scene import make_scene
 
 WORKERS = """
 import json
@@ -66,13 +65,6 @@ def same(here, there):
 JOINT = RunOptions(stage="joint", from_iter=4, device="cpu", settings=OPTIONS.settings)
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, views=6, width=40, points=150)
-    return folder
-
-
 def trained(root: Path, scene: Path, options: RunOptions) -> tuple[bytes, list[float], list[str]]:
     """Train 12 iterations: the model, its thresholds, and what Python could only print."""
     unraisable: list[str] = []
@@ -84,14 +76,14 @@ def trained(root: Path, scene: Path, options: RunOptions) -> tuple[bytes, list[f
 
 @pytest.mark.parametrize("kind", ["fork", "spawn"])
 def test_workers_load_the_hosts_views_and_draw_with_thresholds_or_are_refused(
-    kind, scene, tmp_path
+    kind, photographs, tmp_path
 ):
     """A forked worker knows the thresholds of its moment; a spawned one has none."""
     root = written(Host, tmp_path / "host")
     (root / "watching.py").write_text(WORKERS)
     look = f"    from watching import look\n    look('{kind}', scene.getTrainCameras(), pipe, "
     edit(root / "train.py", "    bar.close()\n", look + "gaussians, dataset.model_path)\n")
-    fresh(trained, tmp_path, scene, JOINT)
+    fresh(trained, tmp_path, photographs, JOINT)
     for name, photograph, picture in json.loads((tmp_path / "out/seen").read_text()):
         assert (name, photograph) == (True, True)
         if kind == "fork":
@@ -101,7 +93,7 @@ def test_workers_load_the_hosts_views_and_draw_with_thresholds_or_are_refused(
             assert "Start workers by fork" in picture
 
 
-def test_a_compiled_render_function_learns_the_same_bits(scene, tmp_path):
+def test_a_compiled_render_function_learns_the_same_bits(photographs, tmp_path):
     results = []
     for name in ("plain", "compiled"):
         root = written(Host, tmp_path / name / "host")
@@ -109,28 +101,28 @@ def test_a_compiled_render_function_learns_the_same_bits(scene, tmp_path):
             line = "    gaussians.training_setup(opt)\n"
             compiled = "    global render\n    render = torch.compile(render, backend='eager')\n"
             edit(root / "train.py", line, line + compiled)
-        results.append(fresh(trained, tmp_path / name, scene, JOINT))
+        results.append(fresh(trained, tmp_path / name, photographs, JOINT))
     assert results[0] == results[1]
     assert results[1][2] == []
 
 
 @pytest.mark.parametrize("stage", ["auto", "finetune", "joint"])
 def test_under_torchrun_learning_is_refused_before_the_host_runs(
-    stage, scene, tmp_path, monkeypatch
+    stage, photographs, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("WORLD_SIZE", "2")
     script = written(Host, tmp_path / "host") / "train.py"
     script.write_text(f"raise SystemExit('it ran')\n{script.read_text()}")
-    words = command(script, scene, tmp_path / "out", 12)
+    words = command(script, photographs, tmp_path / "out", 12)
     with pytest.raises(RanksError) as caught:
         run(words, RunOptions(stage=stage, device="cpu"))
     assert caught.value.found == "WORLD_SIZE=2 in the environment"
     assert "--stage finetune without torchrun" in caught.value.remedy
 
 
-def test_under_torchrun_run_says_once_why_it_learns_in_one_process(scene, tmp_path):
+def test_under_torchrun_run_says_once_why_it_learns_in_one_process(photographs, tmp_path):
     script = written(Host, tmp_path / "host") / "train.py"
-    words = command(script, scene, tmp_path / "out", 12)
+    words = command(script, photographs, tmp_path / "out", 12)
     ended = several.command(2, "run", "--device", "cpu", "--", *words)
     left = [each.left for each in ended]
     assert [code for code, _, _ in left] == [1, 1]
@@ -183,6 +175,6 @@ def as_two_ranks(root: Path, scene: Path) -> str:
     return "not refused"
 
 
-def test_a_host_that_makes_ranks_itself_is_refused_when_it_begins_to_train(scene, tmp_path):
+def test_a_host_that_makes_ranks_itself_is_refused_when_it_begins_to_train(photographs, tmp_path):
     written(Host, tmp_path / "host")
-    assert fresh(as_two_ranks, tmp_path, scene) == "torch.distributed with 2 processes"
+    assert fresh(as_two_ranks, tmp_path, photographs) == "torch.distributed with 2 processes"
