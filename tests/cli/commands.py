@@ -16,3 +16,9 @@ def run_json(*arguments: object) -> dict:
     result = run(*arguments, "--json")
     assert result.exit_code == 0, result.stderr
     return json.loads(result.stdout)
+
+
+def finetune_words(scene: tuple, out: object, *more: object) -> tuple:
+    """A short fine-tuning of a model on its photographs."""
+    data, path = scene
+    return ("finetune", path, "--data", data, "--out", out, "--iters", 20, *more)

@@ -54,7 +54,6 @@ def untouched(out):
 @pytest.mark.parametrize(
     ("how", "code", "words"),
     [
-        ("model missing", "model-file", "no such file"),
         ("model cut off", "model-file", "not readable as PLY"),
         ("a checkpoint", "model-file", "(4D models)"),
         ("data missing", "dataset", "no such folder"),
@@ -67,9 +66,7 @@ def untouched(out):
 @pytest.mark.parametrize("command", ["finetune", "profile", "render", "compare"])
 def test_refused(scene, tmp_path, how, code, words, command):
     data, path, out = scene
-    if how == "model missing":
-        path.unlink()
-    elif how == "model cut off":
+    if how == "model cut off":
         path.write_bytes(path.read_bytes()[:-50])
     elif how == "a checkpoint":
         path = path.rename(path.with_name("chkpnt30.pth"))
@@ -92,26 +89,6 @@ def test_refused(scene, tmp_path, how, code, words, command):
     }[command]
     refused(arguments, code, words)
     assert untouched(out)
-
-
-RENDER = """
-import json, sys
-from click.testing import CliRunner
-from fragprune_plugins.workbench.commands import cli
-result = CliRunner().invoke(cli, ["render", *sys.argv[1:]])
-print(json.dumps([result.exit_code, result.stderr]))
-"""
-
-
-def test_one_threshold_beside_many_gaussians_reads_no_foreign_memory(scene, tmp_path, python):
-    """In a process of its own, because of what became of it once: SIGSEGV."""
-    data, path, _ = scene
-    write_ply(path, tiny.random_model(1_000_000, degree=0))
-    sidecar.save(path, opened(1))
-    code, message = python(RENDER, path, "--data", data, "--out", tmp_path / "pictures")
-    assert code == 1
-    assert message.startswith("[sidecar] ")
-    assert "1000000" in message
 
 
 def test_unwritable_output_is_refused_before_learning(scene, tmp_path, monkeypatch):

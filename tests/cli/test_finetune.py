@@ -2,12 +2,8 @@
 
 import json
 import math
-import os
 import signal
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -190,15 +186,6 @@ def test_an_interrupted_removal_goes_on_with_the_same_gaussians(scene, tmp_path,
     assert not run_json(*arguments[:-1], 0.6, "--out", parts)["already_finished"]
 
 
-@pytest.mark.parametrize("share", ["0", "1.5", "x", "nan"])
-def test_a_share_to_keep_that_is_none_is_refused(scene, tmp_path, share):
-    data, path, _ = scene
-    out = tmp_path / "out.ply"
-    result = run("finetune", path, "--data", data, "--out", out, "--keep", share)
-    assert result.exit_code == 2
-    assert "--keep" in result.stderr
-
-
 def test_a_control_of_all_gaussians_is_none_for_fewer(scene, tmp_path):
     data, path, _ = scene
     arguments = ("finetune", path, "--data", data, "--iters", 3)
@@ -320,58 +307,6 @@ def test_divergence_is_a_stated_failure_and_writes_nothing(scene, tmp_path, monk
     assert error["where"].startswith("stage 2, step 1, view view0")
     assert "opacity" in error["found"]
     assert not list(tmp_path.glob("out*"))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        ("--quick", "--iters", "5"),
-        ("--pressure", "1e-4", "--target-speedup", "2"),
-        ("--control", "--pressure", "1e-4"),
-        ("--iters", "0"),
-        ("--pressure", "-1"),
-        ("--target-speedup", "0.5"),
-        ("--train", "everything"),
-    ],
-)
-def test_contradictions_are_usage_errors(scene, tmp_path, options):
-    data, path, _ = scene
-    result = run("finetune", path, "--data", data, "--out", tmp_path / "out.ply", *options)
-    assert result.exit_code == 2
-    assert not (tmp_path / "out.ply").exists()
-
-
-def test_as_a_program(scene, tmp_path):
-    data, path, _ = scene
-    root = Path(__file__).parents[2]
-    done = subprocess.run(
-        [
-            *(
-                sys.executable,
-                "-c",
-                "from fragprune_plugins.workbench.commands import main; main()",
-            ),
-            *("finetune", str(path), "--data", str(data), "--out", str(tmp_path / "out.ply")),
-            *("--iters", "3", "--threads", "1", "--json"),
-        ],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(root / "adapters")])},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["iterations"] == 3
-
-
-def test_help_needs_no_torch():
-    program = (
-        "import sys; from click.testing import CliRunner;"
-        "from fragprune_plugins.workbench.commands import cli;"
-        "out = CliRunner().invoke(cli, ['--help']).output;"
-        "assert 'finetune' in out and 'export' in out, out;"
-        "assert 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[2])
 
 
 @pytest.mark.parametrize("name", ["finetune", "render", "profile", "compare", "export"])

@@ -11,25 +11,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from cli.commands import finetune_words as words
 from cli.commands import run, run_json
-from finetune import tiny
 from finetune.several import command
 
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.scenes.dataset import Photograph
-
-
-@pytest.fixture
-def scene(tmp_path, single_thread):
-    data, path, _ = tiny.scene(tmp_path)
-    return data, path
-
-
-def words(scene, out, *more):
-    data, path = scene
-    return ("finetune", path, "--data", data, "--out", out, "--iters", 20, *more)
 
 
 def names(folder):

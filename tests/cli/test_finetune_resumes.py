@@ -6,22 +6,11 @@ import os
 import signal
 
 import pytest
+from cli.commands import finetune_words as words
 from cli.commands import run, run_json
-from finetune import tiny
 
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.workbench.finetune import loop, resuming
-
-
-@pytest.fixture
-def scene(tmp_path, single_thread):
-    data, path, _ = tiny.scene(tmp_path)
-    return data, path
-
-
-def words(scene, out, *more):
-    data, path = scene
-    return ("finetune", path, "--data", data, "--out", out, "--iters", 40, *more)
 
 
 def killed(step, *arguments):
@@ -54,7 +43,7 @@ def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path)
     assert "resuming at step" in result.stderr
     report = json.loads(result.stdout)
     assert report["resumed_at"] == 19
-    assert report["iterations"] == 40
+    assert report["iterations"] == 20
     assert out.read_bytes() == whole.read_bytes()
     left = {each.name for each in tmp_path.iterdir() if "out" in each.name or each.name[0] == "."}
     assert left == {"out.ply", "out.fragprune.json"}

@@ -163,23 +163,6 @@ def test_a_config_file_gives_the_options(tmp_path):
     assert other["iterations"] == 2
 
 
-CONFIGS = {
-    "unknown = 1": "'unknown' is no option of",
-    "iters = 'x'": "not a valid integer",
-    "iters": "not readable as TOML",
-    "config = 'a.toml'": "'config' is no option of",
-    "train = 'paper'": "is not one of",
-}
-
-
-@pytest.mark.parametrize("text", CONFIGS)
-def test_a_config_file_that_is_wrong_is_a_usage_error(tmp_path, text):
-    (tmp_path / "a.toml").write_text(text)
-    result = run("finetune", __file__, "--out", "b.ply", "--config", tmp_path / "a.toml")
-    assert result.exit_code == 2
-    assert CONFIGS[text] in " ".join(result.stderr.split())
-
-
 def test_a_config_file_that_is_missing_is_a_usage_error(tmp_path):
     result = run("run", "--config", tmp_path / "a.toml", "--", "python", "train.py")
     assert result.exit_code == 2
@@ -221,6 +204,11 @@ def test_a_pipe_that_nobody_reads_is_not_waited_for(tmp_path):
 
 
 VALUES = {
+    "unknown = 1": "'unknown' is no option of",
+    "iters = 'x'": "not a valid integer",
+    "iters": "not readable as TOML",
+    "config = 'a.toml'": "'config' is no option of",
+    "train = 'paper'": "is not one of",
     "iters = [1]": "where one value belongs",
     "iters = true": "where one value belongs",
     "iters = inf": "not a valid integer",
@@ -238,7 +226,7 @@ VALUES = {
 
 
 @pytest.mark.parametrize("text", VALUES)
-def test_a_value_is_read_as_on_the_line(tmp_path, text):
+def test_a_config_file_is_read_as_the_line_is_and_what_is_wrong_is_a_usage_error(tmp_path, text):
     (tmp_path / "a.toml").write_text(text)
     words = [] if "out" in text else ["--out", "b.ply"]
     result = run("finetune", __file__, *words, "--config", tmp_path / "a.toml")

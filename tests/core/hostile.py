@@ -56,19 +56,6 @@ def camera_entry() -> dict[str, Any]:
     return tiny.host_cameras(tiny.cameras(1))[0]
 
 
-def image_record(
-    points: int = 0,
-    count: int = 1,
-    quaternion: tuple[float, ...] = (1, 0, 0, 0),
-    name: bytes = b"view00.png\0",
-    translation: tuple[float, ...] = (0, 0, 3),
-    camera: int = 7,
-) -> bytes:
-    """An images.bin of one image."""
-    pose = struct.pack("<i7di", 1, *quaternion, *translation, camera)
-    return struct.pack("<Q", count) + pose + name + struct.pack("<Q", points)
-
-
 def png(width: int, height: int) -> bytes:
     """A PNG of some 70 bytes that says that it is so large."""
     out = io.BytesIO()

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from core.hostile import EYE, GEOMETRY, NAN, camera_entry, header, image_record, png, special
+from core.hostile import EYE, GEOMETRY, NAN, camera_entry, header, png, special
 from finetune import tiny
-from safetensors.torch import load_file, save_file
 
 import fragprune_plugins
 from fragprune_plugins.errors import (
@@ -31,7 +30,6 @@ from fragprune_plugins.files.reading import NESTING, Door, lies_in, parse_json
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import _read_checkpoint
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes import colmap
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
@@ -184,16 +182,9 @@ def test_json_is_bounded_in_depth(tmp_path, depth):
     ("content", "words"),
     [
         (header(f"element vertex {2**63}", "property float x"), "cut off|line 3"),
-        (header("element vertex 99999999999999999999", "property float x"), "line 3 of the header"),
         (header(f"element vertex {2**40}", "property float x"), f"cut off in row 0 of {2**40}"),
         (header("element vertex -1", "property float x"), "line 3 of the header"),
-        (header("element vertex 1", "property list uchar int x"), "element vertex has lists"),
-        (header("element vertex 1", "property float x", "property float x"), "line 5"),
         (header("element face 9", "property list int int x", "element vertex 1"), "has lists"),
-        (header("element vertex 1"), "element vertex has no columns"),
-        (header("element vertex 1", "property quad x"), "line 4 of the header"),
-        (header("property float x"), "line 3 of the header"),
-        (header(start="ply\n"), "no format"),
         (
             header(f"element vertex {2**31}", "property float x", start="ply\nformat ascii 1.0\n"),
             f"{2**31} rows announced, in 0 bytes of text",
@@ -223,6 +214,7 @@ def test_a_header_is_checked_against_the_file(tmp_path, content, words):
         ("rotation", 1e-30, "quaternions of length 0"),
         ("rotation", 1e25, "quaternions too long"),
         ("xyz", torch.nan, r"2 of 8 rows \(x, y, z\): 1, 6"),
+        ("f_dc", torch.inf, r"NaN or infinity in 2 of 8 rows"),
     ],
 )
 def test_gaussians_that_cannot_be_drawn_are_refused_with_their_rows(tmp_path, part, value, words):
@@ -281,7 +273,6 @@ def test_a_camera_that_is_none_is_refused_with_its_place(tmp_path, how):
         (EYE, {"frames": [3]}),
         (EYE, {"frames": 3}),
         (EYE, {"k1": 1e30}),
-        (EYE, {"camera_model": "EQUIRECTANGULAR"}),
     ],
 )
 def test_transforms_that_are_none_are_refused(tmp_path, matrix, changed):
@@ -295,23 +286,6 @@ def test_rounded_matrices_are_accepted(tmp_path, rounded):
     assert len(load_cameras(write_cameras(tmp_path / "cameras.json", rotation=turn))) == 2
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (image_record(points=1 << 40), "bytes announced"),
-        (image_record(name=b"\xff\xfe\0"), "number 1 of 1, byte 8"),
-    ],
-    ids=range(2),
-)
-def test_colmaps_counts_are_checked_against_the_file(tmp_path, content, words):
-    tiny.write_colmap(tmp_path, [torch.zeros(3, 4, 4)] * 9, binary=True)
-    path = tmp_path / "sparse" / "0" / "images.bin"
-    path.write_bytes(content)
-    with pytest.raises(DatasetError, match=words) as stated:
-        colmap.read(tmp_path)
-    assert stated.value.where == str(path)
-
-
 @pytest.mark.parametrize("number", [0.0, -1.0, NAN, float("inf")])
 def test_a_lens_that_is_none_is_refused_in_python_too(number):
     with pytest.raises(InputError, match="fx"):
@@ -321,46 +295,6 @@ def test_a_lens_that_is_none_is_refused_in_python_too(number):
 
 
 # -- the rest ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", [torch.int32, torch.bool, torch.float64, torch.float16])
-def test_a_sidecar_of_another_type_is_refused(tmp_path, dtype):
-    model = tmp_path / "m.ply"
-    write_ply(model, tiny.random_model(4))
-    path = sidecar.save(model, ThresholdStore(4))
-    metadata = sidecar_metadata(path)
-    save_file({k: v.to(dtype) for k, v in load_file(path).items()}, path, metadata=metadata)
-    with pytest.raises(SidecarError, match=f"tensor logits .*{dtype}"):
-        sidecar.load(model, 4)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("settings", "[" * 100_000),
-        ("settings", "[]"),
-        ("adam_step", "inf"),
-        ("adam_step", "-1"),
-        ("steps", "9" * 5000),
-        ("steps", str(1 << 80)),
-        ("rows", "four"),
-    ],
-)
-def test_a_sidecar_of_other_metadata_is_refused(tmp_path, key, value):
-    model = tmp_path / "m.ply"
-    write_ply(model, tiny.random_model(4))
-    path = sidecar.save(model, ThresholdStore(4))
-    metadata = sidecar_metadata(path) | {key: value}
-    save_file(load_file(path), path, metadata=metadata)
-    with pytest.raises(SidecarError, match="at its metadata"):
-        sidecar.load(model, 4)
-
-
-def sidecar_metadata(path):
-    from safetensors import safe_open
-
-    with safe_open(path, framework="pt") as file:
-        return file.metadata()
 
 
 @pytest.mark.parametrize("size", [(20_000, 8_001), (60_000, 60_000), (2**31 - 1, 1)])

@@ -154,10 +154,6 @@ def kill_in_a_loop(path: Path, kills: int) -> None:
     assert names(path) == ["a.fragprune.safetensors", "a.ply"]
 
 
-def test_random_kills_break_no_pair(tmp_path, without_waiting_for_the_disk):
-    kill_in_a_loop(tmp_path / "a.ply", 20)
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_a_thousand_random_kills_break_no_pair(tmp_path, without_waiting_for_the_disk):

@@ -130,7 +130,7 @@ BLENDER = {
     "no test file": (lambda f: (f / TEST).unlink(), "transforms_test.json: no such file"),
     "no frames": (without_frames, "not a transforms file"),
     "not json": (lambda f: (f / TEST).write_text("{"), "not readable as JSON"),
-    "unknown lens": (of_a_lens, "camera_model 'EQUIRECTANGULAR'"),
+    "unknown lens": (of_a_lens, r"/view\d+\S*: camera_model 'EQUIRECTANGULAR'"),
 }
 COLMAP = {
     "image missing": (lambda f: (f / VIEW).unlink(), "view03.png: no such image"),
