@@ -5,17 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from click.testing import CliRunner
+from cli.commands import run as command_line
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST, joint, running
 
 from fragprune_plugins.errors import DivergedError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.workbench.commands import cli
 
 
 def spoil(tensor, rows, value):
@@ -109,16 +106,11 @@ class SpoilAt:
             spoil(self.model._opacity, 7, torch.nan)
 
 
-def test_a_run_that_diverges_ends_with_exit_code_1_and_saves_nothing(
-    photographs, tmp_path, monkeypatch
-):
-    plugins = load_plugins()
-    plugins.register(SpoilAt(4), "test")
-    monkeypatch.setattr(launch, "installed", lambda: plugins)
+def test_a_run_that_diverges_ends_with_exit_code_1_and_saves_nothing(photographs, tmp_path, plug):
+    plug(SpoilAt(4))
     out = tmp_path / "out"
     words = [HOST / "train.py", "-s", photographs, "-m", out, "--iterations", 10, *TINY]
-    options = ["run", "--device", "cpu", "--iters", 8, "--json", "--", *words]
-    result = CliRunner().invoke(cli, [str(word) for word in options])
+    result = command_line("run", "--device", "cpu", "--iters", 8, "--json", "--", *words)
     assert result.exit_code == 1
     error = json.loads(result.stdout)["error"]
     assert error["code"] == "not-finite"

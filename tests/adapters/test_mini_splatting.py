@@ -1,7 +1,6 @@
 """Mini-Splatting: scores, new points, simplification, compression, on a miniature of the host."""
 
 import logging
-import signal
 import sys
 from dataclasses import replace
 from importlib import import_module
@@ -18,7 +17,6 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -132,7 +130,7 @@ def test_stage_two_stands_still_where_points_would_be_made_anew(
 
 @pytest.mark.parametrize("variant", ["ms", "ms_d"])
 def test_thresholds_learn_through_new_points_and_simplification(
-    mini, photographs, tmp_path, variant
+    mini, photographs, tmp_path, plug, variant
 ):
     class Rows:
         def __init__(self):
@@ -143,12 +141,10 @@ def test_thresholds_learn_through_new_points_and_simplification(
             neutral = bool((store.logits <= -13).all())
             self.changes.append((change.operation, change.before, change.after, neutral))
 
-    rows, plugins = Rows(), load_plugins()
-    plugins.register(rows, "test")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(launch, "installed", lambda: plugins)
-        options = replace(OPTIONS, stage="joint", from_iter=2)
-        summary = run(command(mini, variant, photographs, tmp_path, 16), options)
+    rows = Rows()
+    plug(rows)
+    options = replace(OPTIONS, stage="joint", from_iter=2)
+    summary = run(command(mini, variant, photographs, tmp_path, 16), options)
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == len(read_ply(summary.model_after).xyz)
     anew = [change for change in rows.changes if change[0] == "training_setup"]
@@ -190,18 +186,13 @@ def test_the_metric_without_its_weights_is_said_once(mini, photographs, tmp_path
     assert "no way there" in said[0].getMessage()
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_an_interrupted_run_saves_at_its_iteration_whatever_the_hosts_clock_says(
-    mini, photographs, tmp_path, monkeypatch
+    mini, photographs, tmp_path, plug
 ):
-    plugins = load_plugins()
-    plugins.register(InterruptAt(3), "test")
-    monkeypatch.setattr(launch, "installed", lambda: plugins)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(Interrupted):
-            run(command(mini, "ms", photographs, tmp_path, 16), OPTIONS)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    plug(InterruptAt(3))
+    with pytest.raises(Interrupted):
+        run(command(mini, "ms", photographs, tmp_path, 16), OPTIONS)
     (saved,) = tmp_path.glob("point_cloud/*/*.safetensors")
     assert saved.parent.name == "iteration_19"  # 16 and 3 steps; the host's own clock is at 5009
 

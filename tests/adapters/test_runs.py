@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
+from cli.commands import run as command_line
 from miniatures import runs
 from miniatures.runs import OPTIONS, check_stage_two
 from miniatures.vanilla_3dgs import HOST, InterruptAt, run_script, running
@@ -25,13 +25,11 @@ from fragprune_plugins.errors import Interrupted, SessionError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.goals import Portable
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.workbench.commands import cli
+from fragprune_plugins.plugins.loading import installed, load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 command = partial(runs.command, HOST / "train.py")
@@ -83,12 +81,6 @@ def test_a_neutral_run_is_the_hosts_own_to_the_bit(photographs, tmp_path):
     assert not list(tmp_path.rglob("*.safetensors"))
 
 
-def with_plugin(monkeypatch, plugin):
-    plugins = load_plugins()
-    plugins.register(plugin, "test")
-    monkeypatch.setattr(launch, "installed", lambda: plugins)
-
-
 @pytest.fixture
 def trained(photographs, tmp_path):
     """A finished stage 1 of ten iterations."""
@@ -99,11 +91,11 @@ def trained(photographs, tmp_path):
 
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_in_stage_two_keeps_what_was_learned_and_the_run_can_be_resumed(
-    photographs, trained, monkeypatch
+    photographs, trained, plug
 ):
     finetune = replace(OPTIONS, stage="finetune")
     plugin = InterruptAt(4)
-    with_plugin(monkeypatch, plugin)
+    plug(plugin)
     with pytest.raises(Interrupted) as caught:
         run(command(photographs, trained, 10), finetune)
     (saved,) = trained.glob("point_cloud/*/*.safetensors")
@@ -116,7 +108,7 @@ def test_ctrl_c_in_stage_two_keeps_what_was_learned_and_the_run_can_be_resumed(
     assert "diff_gaussian_rasterization" not in sys.modules
     assert [summary.steps for summary in plugin.finished] == [4]  # however it ended
 
-    monkeypatch.undo()
+    installed.cache_clear()
     learned = store.values.detach()
     assert f"--start_checkpoint {model}" in caught.value.remedy
     named = command(photographs, trained, 10, "--start_checkpoint", model)
@@ -127,14 +119,11 @@ def test_ctrl_c_in_stage_two_keeps_what_was_learned_and_the_run_can_be_resumed(
     assert sidecar.load(anew.model_after)[0].steps == 8
 
 
-def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(
-    photographs, trained, monkeypatch
-):
+def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(photographs, trained, plug):
     before = signal.getsignal(signal.SIGTERM)
-    with_plugin(monkeypatch, InterruptAt(4, signal.SIGTERM))
+    plug(InterruptAt(4, signal.SIGTERM))
     options = ["run", "--device", "cpu", "--stage", "finetune", "--iters", 8, "--json", "--"]
-    words = [*options, *command(photographs, trained, 10)]
-    result = CliRunner().invoke(cli, [str(word) for word in words])
+    result = command_line(*options, *command(photographs, trained, 10))
     assert result.exit_code == 143
     error = json.loads(result.stdout)["error"]
     (saved,) = trained.glob("point_cloud/*/*.safetensors")
@@ -146,14 +135,14 @@ def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(
 
 @pytest.mark.parametrize("moment", ["learning", "saving"])
 def test_killed_in_stage_two_it_starts_again_from_stage_one_and_leaves_nothing(
-    photographs, trained, tmp_path, monkeypatch, single_thread, moment
+    photographs, trained, tmp_path, monkeypatch, plug, single_thread, moment
 ):
     finetune = replace(OPTIONS, stage="finetune")
     killed = Path(shutil.copytree(trained, tmp_path / "killed"))
     pid = os.fork()
     if pid == 0:
         if moment == "learning":
-            with_plugin(monkeypatch, InterruptAt(4, signal.SIGKILL))
+            plug(InterruptAt(4, signal.SIGKILL))
         else:  # the host has written its model, the sidecar is not there yet
             monkeypatch.setattr(sidecar, "put", lambda *_: signal.raise_signal(signal.SIGKILL))
         with contextlib.suppress(BaseException):
@@ -179,7 +168,7 @@ def test_sigterm_in_stage_one_ends_the_process_as_the_host_alone(photographs, tm
     pid = os.fork()
     if pid == 0:
         with contextlib.suppress(BaseException):
-            cli(words, standalone_mode=False)
+            command_line(*words)
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGTERM
 
@@ -214,10 +203,8 @@ def test_a_portable_run_moves_shapes_and_leaves_thresholds_neutral(photographs, 
 
 
 @pytest.mark.usefixtures("ctrl_c")
-def test_ctrl_c_keeps_a_portable_model_though_it_has_no_thresholds(
-    photographs, trained, monkeypatch
-):
-    with_plugin(monkeypatch, InterruptAt(4))
+def test_ctrl_c_keeps_a_portable_model_though_it_has_no_thresholds(photographs, trained, plug):
+    plug(InterruptAt(4))
     with pytest.raises(Interrupted, match="the model learned so far is "):
         run(command(photographs, trained, 10), PORTABLE)
     (saved,) = trained.glob("point_cloud/*/*.safetensors")

@@ -17,10 +17,20 @@ import torch
 from cli.commands import run as run_command
 
 from fragprune_plugins.errors import FragpruneError
+from fragprune_plugins.learning.goals import Control, Fewer, Portable
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.ranks import joined
 
 LONGEST = 60  # seconds that a child may live
+STEPS = 12
+CASES = {
+    "all": Settings(iterations=STEPS, views_per_step=2),
+    "target": Settings(iterations=STEPS, views_per_step=2, train="opacity", goal=Fewer(1.3)),
+    "control": Settings(iterations=STEPS, views_per_step=2, goal=Control(), seed=3),
+    "portable": Settings(iterations=STEPS, views_per_step=2, goal=Portable()),
+    "two views each": Settings(iterations=STEPS, views_per_step=4, train="appearance"),
+}
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from finetune import tiny
-from finetune.several import launch, learn, lose_nan
+from finetune import test_shards, tiny
+from finetune.several import CASES, STEPS, launch, learn, lose_nan
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench import ranks as module
 from fragprune_plugins.workbench.distributed import processes
@@ -26,15 +26,6 @@ from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint, launched, speaks
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-STEPS = 12
-
-CASES = {
-    "all": Settings(iterations=STEPS, views_per_step=2),
-    "target": Settings(iterations=STEPS, views_per_step=2, train="opacity", goal=Fewer(1.3)),
-    "control": Settings(iterations=STEPS, views_per_step=2, goal=Control(), seed=3),
-    "portable": Settings(iterations=STEPS, views_per_step=2, goal=Portable()),
-    "two views each": Settings(iterations=STEPS, views_per_step=4, train="appearance"),
-}
 
 
 @pytest.fixture(autouse=True)
@@ -153,7 +144,8 @@ def test_replicas_that_part_are_noticed_and_named(model, dataset, monkeypatch):
     assert one == other
 
 
-def test_a_gradient_that_is_not_finite_stops_all_with_the_same_words(model, dataset):
+@pytest.mark.parametrize("learned", [learned, test_shards.learned], ids=["replicas", "shards"])
+def test_a_gradient_that_is_not_finite_stops_all_with_the_same_words(model, dataset, learned):
     def work(ranks):
         lose_nan(ranks)
         return learned(model, dataset, Settings(iterations=4, views_per_step=2), ranks)

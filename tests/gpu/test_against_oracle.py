@@ -11,15 +11,28 @@ import pytest
 import scenes
 import torch
 from gpu.emulated import EmulatedDevice
-from native.test_against_oracle import check_gradients, check_images, draw_pair
-from native.test_dialects import check_scores, dialect, flat
+from native.test_against_oracle import (
+    check_gradients,
+    draw_pair,
+    expect_oracle,
+    test_changes_in_place_are_noticed,
+    test_nothing_to_draw_leaves_the_background,
+    test_tall_stacks_stop_where_the_oracle_does,
+)
+from native.test_dialects import dialect, flat
 from native.test_invariants import assert_identical, everything
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.types import RasterInputs
+
+# those of the cpu engine, over this one
+__all__ = [
+    "test_changes_in_place_are_noticed",
+    "test_nothing_to_draw_leaves_the_background",
+    "test_tall_stacks_stop_where_the_oracle_does",
+]
 
 KINDS = {
     "plain": {},
@@ -35,6 +48,7 @@ KINDS = {
     "near, low cap": {"near": 2.5, "alpha_max": 0.6, "cap_gradient": False},
     "features, colours": {"features": 3, "colors": True, "scale_modifier": 0.7},
     "stopped": {"stop": 0.2},
+    "scores": {"scores": True},
 }
 
 
@@ -44,19 +58,14 @@ def test_images_and_gradients_equal_the_oracle(
 ) -> None:
     inputs = dialect(1, **KINDS[kind])
     thresholds = scenes.random_thresholds(1, 60) if thresholded else None
-    truth, ours, same = draw_pair(engine, inputs, thresholds)
-    assert torch.equal(truth.radii, ours.radii)
-    check_images(truth, ours, same)
-    check_gradients(engine, inputs, thresholds, same)
+    expect_oracle(engine, inputs, thresholds)
 
 
 @pytest.mark.parametrize("kind", ["plain", "features, colours"])
 def test_footprints_equal_the_oracle(engine: CudaEngine, kind: str) -> None:
     inputs = replace(flat(dialect(5, **KINDS[kind])), absolute_gradient=True)
     thresholds = scenes.random_thresholds(5, 60)
-    truth, ours, same = draw_pair(engine, inputs, thresholds)
-    check_images(truth, ours, same)
-    check_gradients(engine, inputs, thresholds, same)
+    expect_oracle(engine, inputs, thresholds)
 
 
 def test_a_soft_rim_is_refused(engine: CudaEngine) -> None:
@@ -74,32 +83,6 @@ def test_tiles_of_footprints_may_be_any_integers(engine: CudaEngine) -> None:
     wide = replace(inputs, splats=replace(inputs.splats, tiles=inputs.splats.tiles.long()))
     drawn = [everything(engine, each, None)["image"] for each in (inputs, wide)]
     assert torch.equal(*drawn)
-
-
-@pytest.mark.parametrize("stop", [None, 0.011])
-def test_tall_stacks_stop_where_the_oracle_does(engine: CudaEngine, stop: float | None) -> None:
-    inputs = scenes.stack([0.3, 0.9, 0.999, 0.5] * 90)  # more than is staged at once
-    inputs = replace(inputs, stop=stop)
-    thresholds = torch.linspace(0.01, 0.6, 360)
-    truth, ours, same = draw_pair(engine, inputs, thresholds)
-    check_images(truth, ours, same)
-    check_gradients(engine, inputs, thresholds, same)
-
-
-@pytest.mark.parametrize("scene", [scenes.empty(), scenes.behind_camera()])
-def test_nothing_to_draw_leaves_the_background(engine: CudaEngine, scene: RasterInputs) -> None:
-    _, ours, same = draw_pair(engine, scene, None)
-    assert same.all()
-    assert torch.equal(ours.image, scene.view.background[:, None, None].expand_as(ours.image))
-    assert not ours.radii.any()
-    check_gradients(engine, scene, None, same)
-
-
-def test_scores_equal_the_oracles(engine: CudaEngine) -> None:
-    inputs = replace(scenes.random_scene(2, 200, 50, 37), scores=True)
-    truth, ours, same = draw_pair(engine, inputs, scenes.random_thresholds(2, 200))
-    check_images(truth, ours, same)
-    check_scores(truth, ours, same)
 
 
 def test_what_fine_tuning_freezes_costs_no_kernel_and_changes_no_gradient(
@@ -207,15 +190,6 @@ def test_thresholds_of_another_model_are_refused(
     with pytest.raises(InputError, match=rf"thresholds: shape \({rows},\)"):
         engine.rasterize(scenes.random_scene(0), torch.full((rows,), 0.1))
     assert len(device.launched) == before
-
-
-def test_changes_in_place_are_noticed(engine: CudaEngine) -> None:
-    made, leaves = scenes.leaves(scenes.random_scene(0))
-    loss = engine.rasterize(made, None).image.sum()
-    with torch.no_grad():
-        leaves["opacities"].mul_(0.5)
-    with pytest.raises(RuntimeError, match="inplace"):
-        loss.backward()
 
 
 def test_a_poisoned_pixel_reaches_those_alone_that_draw_there(engine: CudaEngine) -> None:

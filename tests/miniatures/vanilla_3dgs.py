@@ -15,13 +15,10 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing import host as kit
 from fragprune_plugins.testing.host import MINIATURE as HOST
-from fragprune_plugins.testing.host import Running
+from fragprune_plugins.testing.host import Running, imported
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
-__all__ = [
-    *("HOST", "InterruptAt", "Notes", "Running", "expect_ancestors", "identity", "imported"),
-    *("joint", "label", "run_script", "running", "tensors"),
-]
+__all__ = ["HOST", "Running", "imported"]  # as the kit has them
 
 
 class Notes:

@@ -166,6 +166,29 @@ def check_gradients(
             assert (found - expected).abs().max().item() < tolerance * scale, name
 
 
+def check_scores(truth: RasterOutputs, ours: RasterOutputs, same: torch.Tensor) -> None:
+    """Weights and winners where rounding does not decide."""
+    agree = truth.winners == ours.winners
+    assert (~agree & same).sum() <= 1 + same.numel() // 500
+    assert torch.equal(ours.winners >= 0, ours.fragments > 0)
+    wins = ours.winners[ours.winners >= 0].bincount(minlength=len(ours.radii))
+    assert torch.equal(wins.int(), ours.wins_per_gaussian)
+    away = (truth.weights_per_gaussian - ours.weights_per_gaussian).abs()
+    assert (away <= 1e-5 * truth.weights_per_gaussian + 1.0 * (~same).sum() + 1e-6).all()
+    light = ours.alpha.double().sum().item()
+    assert ours.weights_per_gaussian.double().sum().item() == pytest.approx(light, rel=1e-5)
+
+
+def expect_oracle(engine: CpuEngine, inputs: RasterInputs, thresholds: torch.Tensor | None) -> None:
+    """Radii, images, counts and gradients, and scores where they are asked for."""
+    truth, ours, same = draw_pair(engine, inputs, thresholds)
+    assert torch.equal(truth.radii, ours.radii)
+    check_images(truth, ours, same)
+    check_gradients(engine, inputs, thresholds, same)
+    if inputs.scores:
+        check_scores(truth, ours, same)
+
+
 @pytest.mark.parametrize("thresholded", [False, True], ids=["untruncated", "truncated"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, 1])
@@ -174,19 +197,14 @@ def test_images_and_gradients_equal_the_oracle(
 ) -> None:
     inputs = scenes.random_scene(seed, **KINDS[kind])
     thresholds = scenes.random_thresholds(seed, len(inputs.splats)) if thresholded else None
-    truth, ours, same = draw_pair(engine, inputs, thresholds)
-    assert torch.equal(truth.radii, ours.radii)
-    check_images(truth, ours, same)
-    check_gradients(engine, inputs, thresholds, same)
+    expect_oracle(engine, inputs, thresholds)
 
 
 @pytest.mark.parametrize("stop", [None, 1e-4, 0.011, 1.0])
 def test_tall_stacks_stop_where_the_oracle_does(engine: CpuEngine, stop: float | None) -> None:
-    inputs = replace(scenes.stack([0.3, 0.9, 0.999, 0.5] * 30), stop=stop)
-    thresholds = torch.linspace(0.01, 0.6, 120)
-    truth, ours, same = draw_pair(engine, inputs, thresholds)
-    check_images(truth, ours, same)
-    check_gradients(engine, inputs, thresholds, same)
+    inputs = replace(scenes.stack([0.3, 0.9, 0.999, 0.5] * 90), stop=stop)
+    thresholds = torch.linspace(0.01, 0.6, 360)  # more than is staged at once
+    expect_oracle(engine, inputs, thresholds)
 
 
 @pytest.mark.parametrize("scene", [scenes.empty(), scenes.behind_camera()])
@@ -196,6 +214,15 @@ def test_nothing_to_draw_leaves_the_background(engine: CpuEngine, scene: RasterI
     assert torch.equal(ours.image, scene.view.background[:, None, None].expand_as(ours.image))
     assert not ours.radii.any()
     check_gradients(engine, scene, None, same)
+
+
+def test_changes_in_place_are_noticed(engine: CpuEngine) -> None:
+    made, leaves = scenes.leaves(scenes.random_scene(0))
+    loss = engine.rasterize(made, None).image.sum()
+    with torch.no_grad():
+        leaves["opacities"].mul_(0.5)
+    with pytest.raises(RuntimeError, match="inplace"):
+        loss.backward()
 
 
 @st.composite

@@ -14,11 +14,18 @@ import torch
 from footprints import footprints_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from native.test_against_oracle import check_gradients, check_images, draw_pair, gradients
+from native.test_against_oracle import (
+    check_gradients,
+    check_images,
+    check_scores,
+    draw_pair,
+    expect_oracle,
+    gradients,
+)
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs, Rim
+from fragprune_plugins.types import Compensation, RasterInputs, Rim
 
 ALONE = {
     "mip": {"compensation": "mip", "dilation": 0.1},
@@ -46,6 +53,7 @@ def dialect(seed: int, n: int = 60, width: int = 41, height: int = 29, **kind) -
         "compensation",
         "colors",
         "cov3d",
+        "flat",
         "sh_degree",
         "stop",
         "rim",
@@ -117,27 +125,18 @@ def test_all_mixed_equal_the_oracle(engine: CpuEngine, case: Case) -> None:
     check_case(engine, case)
 
 
-@pytest.mark.parametrize("kind", ALONE)
+SURFELS = {
+    f"surfels, {name}": {**ALONE[name], "flat": True}
+    for name in ("near", "scores", "low cap", "capped gradient")
+} | {"surfels, stopped, scores": {"flat": True, "stop": 0.2, "scores": True}}
+LARGER = ALONE | SURFELS
+
+
+@pytest.mark.parametrize("kind", LARGER)
 def test_larger_scenes_equal_the_oracle_closely(engine: CpuEngine, kind: str) -> None:
-    inputs, thresholds = dialect(5, **ALONE[kind]), scenes.random_thresholds(5, 60)
-    for case in (inputs, flat(inputs)):
-        truth, ours, same = draw_pair(engine, case, thresholds)
-        assert torch.equal(truth.radii, ours.radii)
-        check_images(truth, ours, same)
-        check_gradients(engine, case, thresholds, same)
-
-
-def check_scores(truth: RasterOutputs, ours: RasterOutputs, same: torch.Tensor) -> None:
-    """Weights and winners where rounding does not decide."""
-    agree = truth.winners == ours.winners
-    assert (~agree & same).sum() <= 1 + same.numel() // 500
-    assert torch.equal(ours.winners >= 0, ours.fragments > 0)
-    wins = ours.winners[ours.winners >= 0].bincount(minlength=len(ours.radii))
-    assert torch.equal(wins.int(), ours.wins_per_gaussian)
-    away = (truth.weights_per_gaussian - ours.weights_per_gaussian).abs()
-    assert (away <= 1e-5 * truth.weights_per_gaussian + 1.0 * (~same).sum() + 1e-6).all()
-    light = ours.alpha.double().sum().item()
-    assert ours.weights_per_gaussian.double().sum().item() == pytest.approx(light, rel=1e-5)
+    inputs, thresholds = dialect(5, **LARGER[kind]), scenes.random_thresholds(5, 60)
+    for case in (inputs,) if kind in SURFELS else (inputs, flat(inputs)):
+        expect_oracle(engine, case, thresholds)
 
 
 @pytest.mark.parametrize("seed", [0])
@@ -263,9 +262,7 @@ def test_offsets_beyond_all_bounds_are_refused(engine: CpuEngine) -> None:
 def test_offsets_may_reach_far(engine: CpuEngine, far: float) -> None:
     inputs = scenes.random_scene(3, 60, 41, 29, offsets=True)
     inputs = replace(inputs, sample_offsets=inputs.sample_offsets * 2 * far)
-    truth, ours, same = draw_pair(engine, inputs, None)
-    check_images(truth, ours, same)
-    check_gradients(engine, inputs, None, same)
+    expect_oracle(engine, inputs, None)
 
 
 @pytest.mark.parametrize(

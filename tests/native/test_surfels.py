@@ -10,11 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from native.test_against_oracle import (
     GRADIENT_TOLERANCE,
-    check_gradients,
     check_images,
     draw_pair,
 )
-from native.test_dialects import check_scores
 from native.test_inputs import draw
 
 from fragprune_plugins.engines.cpu import binding
@@ -22,26 +20,6 @@ from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.inputs import native_arrays, native_inputs
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.types import RasterInputs, RasterOutputs
-
-DIALECTS = {
-    "near": {"near": 2.5},
-    "scores": {"scores": True},
-    "stopped": {"stop": 0.2, "scores": True},
-    "low cap": {"alpha_max": 0.5},
-    "capped gradient": {"alpha_max": 0.6, "cap_gradient": False},
-}
-
-
-@pytest.mark.parametrize("kind", DIALECTS)
-def test_dialects_equal_the_oracle(engine: CpuEngine, kind: str) -> None:
-    scene = replace(scenes.random_scene(5, 60, 41, 29, flat=True), **DIALECTS[kind])
-    thresholds = scenes.random_thresholds(5, 60)
-    truth, ours, same = draw_pair(engine, scene, thresholds)
-    check_images(truth, ours, same)
-    check_gradients(engine, scene, thresholds, same)
-    if scene.scores:
-        check_scores(truth, ours, same)
-
 
 MAPS: dict[str, Callable[[RasterOutputs], torch.Tensor]] = {
     "alpha": lambda drawn: drawn.alpha,
