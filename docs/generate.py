@@ -61,6 +61,7 @@ Brackets show the default of a seam without a `how`. Without brackets a `how` is
 
 def adapters() -> str:
     """What an adapter may say."""
+    import fragprune_graphdeco
     from fragprune_plugins import adapting
 
     head, names, *rest = (inspect.getdoc(adapting) or "").split("\n\n")
@@ -76,9 +77,10 @@ def adapters() -> str:
 {" ".join(rest)}"""
     kinds = [
         kind
-        for kind in (getattr(adapting, name) for name in adapting.__all__)
+        for module in (adapting, fragprune_graphdeco)
+        for kind in (getattr(module, name) for name in module.__all__)
         if inspect.isclass(kind)
-        and kind.__module__.startswith("fragprune_plugins.hosts")
+        and kind.__module__.startswith(("fragprune_plugins.hosts", "fragprune_graphdeco"))
         and not kind.__module__.endswith(".seams")
     ]
     kinds.sort(key=lambda kind: (kind.__module__, inspect.getsourcelines(kind)[1]))

@@ -1,20 +1,22 @@
 """Everything that an adapter imports: ``from fragprune_plugins.adapting import ...``.
 
 a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo,
-            ParamGroup, Finding
+            ParamGroup and those of 3DGS (GROUPS), Finding
+its source  nodes, imported, is_off, off_by_default of what HostRepo reads; Plain, change_of
 its seams   Seam, Role, SeamCall, RowTrace, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs
-its script  CommandLine, ConfigFile, Photographs
-of 3DGS     GraphdecoAdapter, GraphdecoDialect, RasterizerCall: what descendants of the code of 2023
-            share; ``graphdeco`` has the pieces, ``stand_ins`` modules for their compiled packages;
-            read_plain tells whether a PLY is plain 3DGS, read_selection whether all rows are drawn
-files       Door, for those that a host reads; Model, read_ply
+a proof     Prover, Proof, Place
+its script  CommandLine, ConfigFile, Photographs, Resolution
+files       Door, for those that a host reads; replacing, for those that we write; Model, read_ply,
+            thresholds_of
 settings    parse_goal
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
-Importing this module imports no torch. Model, read_ply and stand_ins load it when they
-are first used: import them inside functions, or under TYPE_CHECKING; so are these two.
+Importing this module imports no torch. Model, read_ply and thresholds_of load it when they are
+first used: import them inside functions, or under TYPE_CHECKING.
+
+What descendants of the 3DGS code of 2023 share is in ``fragprune_graphdeco``.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.constants import ALPHA_MIN
+from fragprune_plugins.constants import ALPHA_MIN, NEAR, TRANSMITTANCE_MIN
 from fragprune_plugins.errors import (
     AlignmentError,
     EngineError,
@@ -34,23 +36,31 @@ from fragprune_plugins.errors import (
     Terminated,
     UsageError,
 )
+from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.columns import change_of
 from fragprune_plugins.files.reading import Door
-from fragprune_plugins.hosts import graphdeco
 from fragprune_plugins.hosts.adapter import (
+    CHECKPOINT_KEY,
+    GROUPS,
     CommandLine,
     ConfigFile,
-    Dialect,
     HostAdapter,
-    HostCall,
     HostInfo,
     ParamGroup,
     ScriptAdapter,
 )
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
-from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.hosts.dialect import Dialect, HostCall, Place, Proof, Prover
+from fragprune_plugins.hosts.findings import Finding, Plain
+from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
 from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall, revised
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.hosts.source import (
+    Function,
+    HostRepo,
+    imported,
+    is_off,
+    nodes,
+    off_by_default,
+)
 from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.types import (
@@ -64,19 +74,17 @@ from fragprune_plugins.types import (
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
     from fragprune_plugins.files.ply import read_ply
-    from fragprune_plugins.hosts.graphdeco import stand_ins
-    from fragprune_plugins.hosts.plain import read_plain, read_selection
+    from fragprune_plugins.files.sidecar import thresholds_of
 
-_LATE = {
-    "Model": "files.model",
-    "read_plain": "hosts.plain",
-    "read_ply": "files.ply",
-    "read_selection": "hosts.plain",
-    "stand_ins": "hosts.graphdeco.stand_ins",
-}
+_LATE = {"Model": "model", "read_ply": "ply", "thresholds_of": "sidecar"}
 
 __all__ = [
     "ALPHA_MIN",
+    "CHECKPOINT_KEY",
+    "GROUPS",
+    "NEAR",
+    "TRANSMITTANCE_MIN",
+    "WIDEST",
     "AlignmentError",
     "CommandLine",
     "ConfigFile",
@@ -85,8 +93,7 @@ __all__ = [
     "EngineError",
     "Finding",
     "Footprints",
-    "GraphdecoAdapter",
-    "GraphdecoDialect",
+    "Function",
     "HostAdapter",
     "HostCall",
     "HostInfo",
@@ -98,9 +105,13 @@ __all__ = [
     "NotComparedError",
     "ParamGroup",
     "Photographs",
+    "Place",
+    "Plain",
+    "Proof",
+    "Prover",
     "RasterInputs",
     "RasterOutputs",
-    "RasterizerCall",
+    "Resolution",
     "Role",
     "RowTrace",
     "ScriptAdapter",
@@ -111,19 +122,21 @@ __all__ = [
     "Terminated",
     "UsageError",
     "View",
-    "graphdeco",
+    "change_of",
     "hookimpl",
+    "imported",
+    "is_off",
+    "nodes",
+    "off_by_default",
     "parse_goal",
-    "read_plain",
     "read_ply",
-    "read_selection",
+    "replacing",
     "revised",
-    "stand_ins",
+    "thresholds_of",
 ]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = import_module(f"fragprune_plugins.{_LATE[name]}")
-    return getattr(home, name, home)  # a module stands for itself
+    return getattr(import_module(f"fragprune_plugins.files.{_LATE[name]}"), name)

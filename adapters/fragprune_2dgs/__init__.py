@@ -12,17 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import fragprune_graphdeco as graphdeco
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
     InputError,
     RasterInputs,
-    RasterizerCall,
     RasterOutputs,
-    graphdeco,
     hookimpl,
     revised,
 )

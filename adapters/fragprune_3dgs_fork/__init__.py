@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn
 
+import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork.fork import (
     CHECKPOINT,
     CLASS,
@@ -26,12 +27,11 @@ from fragprune_3dgs_fork.fork import (
     rests_after_densification,
 )
 from fragprune_3dgs_fork.rasterizer import Output
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
     Finding,
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
@@ -43,7 +43,6 @@ from fragprune_plugins.adapting import (
     Seam,
     Splats,
     UsageError,
-    graphdeco,
     hookimpl,
 )
 
@@ -255,7 +254,7 @@ class ForkDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizers and simple_knn."""
-        from fragprune_plugins.adapting import stand_ins
+        from fragprune_graphdeco import stand_ins
 
         made = super().modules(draw)
         for package, names in self.fields.items():
@@ -286,9 +285,7 @@ class ForkAdapter(GraphdecoAdapter):
         """Whether the model is plain, and what was read of its scripts, rows and calls."""
         if repo.tree(MODEL) is None or repo.package:
             return self.other_host(repo, [f"no {MODEL}"])
-        from fragprune_plugins.adapting import read_plain
-
-        plain = read_plain(repo)
+        plain = graphdeco.read_plain(repo)
         others = [each for each in plain.reasons if each not in plain.moved]
         if others or not plain.model:
             return [Finding("error", "not-plain", MODEL, others[0], "a plain 3DGS model")]
@@ -442,10 +439,8 @@ class ForkAdapter(GraphdecoAdapter):
         Raises:
             NotComparedError: a network moves the Gaussians, or colours them.
         """
-        from fragprune_plugins.adapting import read_plain
-
         by = [f"--{name}" for name in read_fork(repo).colours if f"--{name}" in arguments]
-        for why in (*by, *sorted(read_plain(repo).moved)):
+        for why in (*by, *sorted(graphdeco.read_plain(repo).moved)):
             raise NotComparedError(
                 "the host's command",
                 f"a PLY is not all that it draws: {why}",

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
 
+import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork.rasterizer import (
     Output,
     blended_argument,
     changed_gradients,
     meaning,
-    off_by_default,
 )
-from fragprune_plugins.adapting import Finding, HostRepo, graphdeco
+from fragprune_plugins.adapting import Finding, HostRepo, is_off, nodes, off_by_default
 
 MODEL, CLASS, RENDERER = "scene.gaussian_model", "GaussianModel", "gaussian_renderer"
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
@@ -118,8 +118,9 @@ class Fork:
 
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
-        scripts = (_module(each) for each in self.scripts)
-        return off_by_default(self.repo, ("arguments", MODEL, *scripts), name)
+        modules = ("arguments", MODEL, *map(_module, self.scripts))
+        values = [each for m in modules for each in graphdeco.defaults(self.repo, m, name)]
+        return bool(values) and all(map(is_off, values))
 
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
         """Add an error."""
@@ -206,7 +207,7 @@ def _imported(repo: HostRepo, modules: Iterable[str]) -> dict[str, None]:
         if module in seen or tree is None or module.split(".")[0] == RENDERER:
             continue
         seen[module] = None
-        for node in graphdeco.nodes(tree):
+        for node in nodes(tree):
             if isinstance(node, ast.Import):
                 waiting += [each.name for each in node.names]
             elif isinstance(node, ast.ImportFrom):
@@ -227,7 +228,7 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         networks = _networks(repo, script)
         made = [
             name
-            for node in graphdeco.nodes(tree)
+            for node in nodes(tree)
             if isinstance(node, ast.Call)
             and (name := getattr(node.func, "id", "")).endswith("Model")
             and name not in networks
@@ -272,7 +273,7 @@ def _check_script(fork: Fork, script: str) -> None:
         fork.refuse("script", script, found, "one, by which steps are counted")
     phases = [
         node.name
-        for node in graphdeco.nodes(tree)
+        for node in nodes(tree)
         if isinstance(node, ast.FunctionDef)
         and any(name == "backward" for _, name in _method_calls(node))
         and len(fork.repo.calls(_module(script), node.name)) > 1
@@ -290,7 +291,7 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
         return f"{script} has no {' and no '.join(dict.fromkeys(missing))}"
     if _EMPTIES.search(ast.unparse(tree)):
         return f"{script} removes its output folder"
-    names = (each.value for each in graphdeco.nodes(tree) if isinstance(each, ast.Constant))
+    names = (each.value for each in nodes(tree) if isinstance(each, ast.Constant))
     texts = (each for each in names if isinstance(each, str))
     if not any(re.search(rf"(^|/){CHECKPOINT}($|[{{%])", each) for each in texts):
         return f"{script} has checkpoints of another name"
@@ -314,10 +315,10 @@ def rests_after_densification(fork: Fork) -> bool:
         tree = fork.repo.tree(_module(script))
         inside = {
             id(inner)
-            for node in graphdeco.nodes(tree)
+            for node in nodes(tree)
             if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
             for each in node.body
-            for inner in graphdeco.nodes(each)
+            for inner in nodes(each)
         }
         for node, name in _method_calls(tree) if tree else ():
             if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
@@ -339,14 +340,14 @@ def _mentioned(tree: ast.AST) -> frozenset[str]:
     """Names, attributes and imports in a tree."""
     return frozenset(
         getattr(node, kind)
-        for node in graphdeco.nodes(tree)
+        for node in nodes(tree)
         for kind in ("id", "attr", "name")
         if isinstance(getattr(node, kind, None), str)
     )
 
 
 def _method_calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
-    for node in graphdeco.nodes(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             yield node, node.func.attr
 
@@ -380,15 +381,12 @@ def _read_methods(fork: Fork) -> None:
     fork.setups = tuple(
         name
         for name, body in methods.items()
-        if any(_target(node) == "optimizer" for node in graphdeco.nodes(body))
-        and name != "__init__"
+        if any(_target(node) == "optimizer" for node in nodes(body)) and name != "__init__"
     )
     called: dict[str, None] = {}
     for module, tree in fork.trees():
         owners = _owners(tree)
-        statements = {
-            id(each.value) for each in graphdeco.nodes(tree) if isinstance(each, ast.Expr)
-        }
+        statements = {id(each.value) for each in nodes(tree) if isinstance(each, ast.Expr)}
         for node, name in _method_calls(tree):
             if name in changing:
                 called[name] = None
@@ -408,7 +406,7 @@ def _read_methods(fork: Fork) -> None:
 def _owners(tree: ast.AST) -> set[str]:
     """Variables, and lists and dicts, that hold models which a script makes."""
     owners: set[str] = set()
-    for node in graphdeco.nodes(tree):  # in order of depth, so not of the source
+    for node in nodes(tree):  # in order of depth, so not of the source
         if isinstance(node, ast.Assign) and f"{CLASS}(" in ast.unparse(node.value):
             owners |= {ast.unparse(each).split("[")[0] for each in node.targets}
     return owners
@@ -417,7 +415,7 @@ def _owners(tree: ast.AST) -> set[str]:
 def plain_distances(repo: HostRepo) -> bool:
     """Whether ``distCUDA2`` gives one tensor, as that of 3DGS does; forks also get neighbours."""
     tree = repo.tree(MODEL)
-    for node in graphdeco.nodes(tree):
+    for node in nodes(tree):
         several = isinstance(node, ast.Subscript) or (
             isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple)
         )
@@ -432,7 +430,7 @@ def _returns_state(capture: Function) -> bool:
         isinstance(node, ast.Return)
         and isinstance(node.value, ast.Tuple | ast.List)
         and any("optimizer.state_dict()" in ast.unparse(each) for each in node.value.elts)
-        for node in graphdeco.nodes(capture)
+        for node in nodes(capture)
     )
 
 
@@ -446,7 +444,7 @@ def _target(node: ast.AST) -> str:
 
 def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
     """Lines that assign a parameter of a model, or change its values in place."""
-    for node in graphdeco.nodes(body):
+    for node in nodes(body):
         targets: list[ast.expr] = []
         if isinstance(node, ast.Assign):
             targets = node.targets
@@ -476,7 +474,7 @@ def _read_changes(fork: Fork) -> None:
     for script in fork.scripts:
         trained = fork.repo.tree(_module(script))
         owners = _owners(trained) if trained else set()
-        for node in graphdeco.nodes(trained):
+        for node in nodes(trained):
             if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
                 name = ast.unparse(node.targets[0])
             elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("optimizer.step"):
@@ -506,8 +504,8 @@ def read_getters(fork: Fork) -> list[Finding]:
     made = {
         _target(node)
         for name in (reached & methods.keys()) - {"__init__"}
-        for node in graphdeco.nodes(methods[name])
-        if isinstance(node, ast.Assign) and not graphdeco.is_off(node.value)
+        for node in nodes(methods[name])
+        if isinstance(node, ast.Assign) and not is_off(node.value)
     }
     unset = {each for each in _guards(methods) if fork.is_off(each)} - made
     found = graphdeco.read_getters(fork.repo, MODEL)
@@ -523,7 +521,7 @@ def _guards(methods: dict[str, Function]) -> set[str]:
         ast.unparse(node.test)
         for name, body in methods.items()
         if name.startswith("get_")
-        for node in graphdeco.nodes(body)
+        for node in nodes(body)
         if isinstance(node, ast.If)
     ]
     return {name for test in tests for name in re.findall(r"self\.(\w+) is not None", test)}
@@ -550,8 +548,6 @@ def _positions(body: list[ast.stmt], unset: set[str]) -> bool:
 
 def _read_draws(fork: Fork) -> None:
     """The drawing functions that a script names, and their calls."""
-    from fragprune_plugins.adapting import read_selection
-
     named = {name for _, tree in fork.trees() for name in _reached(fork, tree)}
     functions = graphdeco.drawing_functions(fork.repo, RENDERER)
     while True:
@@ -580,11 +576,11 @@ def _read_draws(fork: Fork) -> None:
         fork.draws += (Draw(RENDERER, name, camera, model, calls),)
         for call in calls:
             _check_call(fork, at, name, call)
-        if selected := read_selection(fork.repo, RENDERER, name):
+        if selected := graphdeco.read_selection(fork.repo, RENDERER, name):
             fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
         fork.colours |= {
             node.test.attr
-            for node in graphdeco.nodes(body)
+            for node in nodes(body)
             if isinstance(node, ast.If)
             and isinstance(node.test, ast.Attribute)
             and node.test.attr not in ("convert_SHs_python", "compute_cov3D_python")
@@ -645,9 +641,9 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
     if isinstance(value, ast.Attribute):
         return fork.is_off(value.attr)
     if not isinstance(value, ast.Name) or body is None:
-        return graphdeco.is_off(value)
+        return is_off(value)
     names = fork.repo.parameters(RENDERER, function) or ()
-    if value.id not in graphdeco.off_by_default(body):
+    if value.id not in off_by_default(body):
         return False
     number = names.index(value.id) if value.id in names else len(names)
     for _, tree in fork.trees():

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
-from fragprune_plugins.adapting import HostRepo, graphdeco
+import fragprune_graphdeco as graphdeco
+from fragprune_plugins.adapting import HostRepo, is_off
 
 Role = Literal[
     "image",
@@ -123,12 +124,6 @@ def _sum_for_gaussians(text: str, name: str) -> Literal["count", "weight"] | Non
 # -- settings --------------------------------------------------------------------------------------
 
 
-def off_by_default(repo: HostRepo, modules: Iterable[str], name: str) -> bool:
-    """Whether all that modules assign to ``self.name`` first, or an option's default, is off."""
-    values = [each for module in modules for each in graphdeco.defaults(repo, module, name)]
-    return bool(values) and all(map(graphdeco.is_off, values))
-
-
 def changed_gradients(repo: HostRepo, package: str, setting: str) -> frozenset[str] | None:
     """The arguments whose gradients a setting changes, if the forward pass never gets it.
 
@@ -187,5 +182,5 @@ def _changed(forward: ast.FunctionDef, backward: ast.FunctionDef) -> frozenset[s
     return frozenset(
         name
         for name, each in zip(names, returned.elts, strict=False)
-        if not graphdeco.is_off(each) and getattr(each, "id", "") not in given
+        if not is_off(each) and getattr(each, "id", "") not in given
     )

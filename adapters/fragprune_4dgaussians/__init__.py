@@ -19,12 +19,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
 
+import fragprune_graphdeco as graphdeco
 from fragprune_4dgaussians.config import PythonFile
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
     Door,
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
@@ -33,13 +33,11 @@ from fragprune_plugins.adapting import (
     NotComparedError,
     ParamGroup,
     RasterInputs,
-    RasterizerCall,
     RasterOutputs,
     Role,
     Seam,
     SeamCall,
     UsageError,
-    graphdeco,
     hookimpl,
     revised,
 )

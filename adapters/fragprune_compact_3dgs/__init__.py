@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
+from fragprune_graphdeco import GraphdecoAdapter
 from fragprune_plugins.adapting import (
-    GraphdecoAdapter,
     HostAdapter,
     HostInfo,
     HostRepo,

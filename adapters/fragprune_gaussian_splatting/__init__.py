@@ -15,19 +15,17 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     AlignmentError,
     CommandLine,
     EngineError,
     Finding,
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
     NotComparedError,
-    RasterizerCall,
     Role,
     RowTrace,
     Seam,
@@ -69,7 +67,7 @@ class PackageDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizer, the neighbour distances and the relocation."""
-        from fragprune_plugins.adapting import stand_ins
+        from fragprune_graphdeco import stand_ins
 
         relocation = ModuleType(RELOCATION, "Stand-in of fragprune.")
         vars(relocation)["compute_relocation"] = stand_ins.compute_relocation

@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fragprune_graphdeco import stand_ins
 from fragprune_gsplat.projection import covariances
-from fragprune_plugins.adapting import EngineError, InputError, SeamCall, stand_ins
+from fragprune_plugins.adapting import EngineError, InputError, SeamCall
 
 EPSILON = torch.finfo(torch.float32).eps
 

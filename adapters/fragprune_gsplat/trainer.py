@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from fragprune_graphdeco import stand_ins
 from fragprune_gsplat import DEFAULT, MCMC, Gsplat
 from fragprune_gsplat.dialect import GsplatDialect
 from fragprune_plugins.adapting import (
@@ -26,7 +27,6 @@ from fragprune_plugins.adapting import (
     ScriptAdapter,
     Seam,
     UsageError,
-    stand_ins,
 )
 
 LISTS = {"eval_steps", "save_steps", "ply_steps"}

@@ -13,17 +13,15 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     AlignmentError,
     CommandLine,
     ConfigFile,
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
-    RasterizerCall,
     RasterOutputs,
     Role,
     RowTrace,
@@ -53,7 +51,7 @@ class MCMCDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Vanilla's stand-ins, with the relocation formula in the rasterizer's module."""
-        from fragprune_plugins.adapting import stand_ins
+        from fragprune_graphdeco import stand_ins
 
         modules = super().modules(draw)
         vars(modules[self.package])["compute_relocation"] = stand_ins.compute_relocation

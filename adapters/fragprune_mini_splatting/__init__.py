@@ -14,19 +14,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import fragprune_graphdeco as graphdeco
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
     RasterInputs,
-    RasterizerCall,
     RasterOutputs,
     Role,
     Seam,
     SeamCall,
-    graphdeco,
     hookimpl,
 )
 
@@ -81,7 +79,7 @@ class MiniSplattingDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for vanilla's packages and for the scoring rasterizer."""
-        from fragprune_plugins.adapting import stand_ins
+        from fragprune_graphdeco import stand_ins
 
         scoring = stand_ins.rasterizer(SCORING, self.settings, False, draw, also=("render_depth",))
         return {**super().modules(draw), SCORING: scoring}

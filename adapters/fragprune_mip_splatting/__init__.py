@@ -16,19 +16,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import fragprune_graphdeco as graphdeco
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
     NotComparedError,
     RasterInputs,
-    RasterizerCall,
     Role,
     Seam,
-    graphdeco,
     hookimpl,
     revised,
 )

@@ -14,20 +14,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+import fragprune_graphdeco as graphdeco
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
     Photographs,
     RasterInputs,
-    RasterizerCall,
     RasterOutputs,
     SeamCall,
-    graphdeco,
     hookimpl,
     revised,
 )

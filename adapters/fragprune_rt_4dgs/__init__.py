@@ -14,16 +14,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
-    GraphdecoAdapter,
     HostAdapter,
     HostInfo,
     HostRepo,
     ModelFileError,
     NotComparedError,
     ParamGroup,
-    RasterizerCall,
     SeamCall,
     UsageError,
     hookimpl,

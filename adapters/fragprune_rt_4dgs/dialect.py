@@ -7,14 +7,8 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.adapting import (
-    AlignmentError,
-    GraphdecoDialect,
-    HostCall,
-    RasterInputs,
-    RasterOutputs,
-    Splats,
-)
+from fragprune_graphdeco import GraphdecoDialect
+from fragprune_plugins.adapting import AlignmentError, HostCall, RasterInputs, RasterOutputs, Splats
 from fragprune_plugins.slicing.splats import MARGINAL_MIN, Moment, Sliced, SpacetimeSplats
 
 if TYPE_CHECKING:

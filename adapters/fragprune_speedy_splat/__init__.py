@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     EngineError,
-    GraphdecoAdapter,
-    GraphdecoDialect,
     HostAdapter,
     HostCall,
     HostInfo,
     RasterInputs,
-    RasterizerCall,
     RasterOutputs,
     Role,
     Seam,

@@ -12,16 +12,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import fragprune_graphdeco as graphdeco
+from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
     Door,
     Finding,
-    GraphdecoAdapter,
     HostAdapter,
     HostInfo,
     HostRepo,
     ModelFileError,
-    RasterizerCall,
-    graphdeco,
     hookimpl,
 )
 

@@ -2,5 +2,5 @@
 
 source    reads a checkout              findings  what reading brings to light
 seams     where a host is entered       adapter   what every adapter says of its host
-choosing  which adapter fits            graphdeco what all descendants of 3DGS share
+choosing  which adapter fits            dialect   how a host calls its rasterizer
 """

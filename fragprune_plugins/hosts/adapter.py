@@ -8,11 +8,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from fragprune_plugins.errors import ModelFileError, NotComparedError, UsageError
 from fragprune_plugins.files.reading import MEBIBYTE, Door, parse_json
+from fragprune_plugins.hosts.dialect import Dialect
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.seams import Seam, SeamCall
@@ -20,9 +20,6 @@ from fragprune_plugins.hosts.source import HostRepo, check_seams
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from fragprune_plugins.engines import Engine
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 CHECKPOINT_KEY = "fragprune"
 """Under which a host's checkpoint carries thresholds, in the state of the optimizer."""
@@ -109,97 +106,6 @@ class HostInfo:
     states: str = ""
     limits: tuple[str, ...] = ()
     usage: str = ""
-
-
-@dataclass(frozen=True)
-class HostCall:
-    """The host's call of its rasterizer as data, with all arguments by name.
-
-    Attributes:
-        settings: the host's rasterizer settings.
-        arguments: of the call, by name.
-        entry: the function called, "module:attribute" as seams spell it.
-        engine: draws the call; dialects may compute with it first.
-        still: stage 2 has begun, in which no strategy of the host reads gradients.
-    """
-
-    settings: Any
-    arguments: Mapping[str, Any]
-    entry: str = ""
-    engine: str | Engine = "auto"
-    still: bool = False
-
-    @classmethod
-    def of(cls, call: SeamCall) -> HostCall:
-        """Build from a call at a RASTERIZE seam; arguments in ``**more`` are kept by name."""
-        settings = getattr(call.instance, "raster_settings", None)
-        named = call.arguments
-        return cls(settings, named | named.get("more", {}), str(call.seam))
-
-    def get(self, name: str) -> Tensor | None:
-        """A tensor argument, or None if it is absent, None or empty (hosts pass all three)."""
-        value: Tensor | None = self.arguments.get(name)
-        return None if value is None or value.numel() == 0 else value
-
-    def __getitem__(self, name: str) -> Tensor:
-        value: Tensor = self.arguments[name]
-        return value
-
-
-class Dialect(ABC):
-    """Translates one revision's rasterizer call into ``RasterInputs``, and the outputs back."""
-
-    means: ClassVar[str] = "means3D"
-    """What the call names the (N, 3) means."""
-
-    own_kernels: ClassVar[Literal["", "gpu", "compiler"]] = ""
-    """What compiled modules inside the host's own package need: a "gpu"; or also CUDA's "compiler",
-    because they are compiled when they are imported. "" if there are none."""
-
-    @abstractmethod
-    def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the host's call into ``RasterInputs``."""
-
-    def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
-        """Rows (M,) int64 of the model that a call draws, in its order; None for all.
-
-        Raises:
-            AlignmentError: the call's Gaussians cannot be matched to rows of the model.
-        """
-        return None
-
-    @abstractmethod
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
-        """Translate outputs into the tuple that the host expects, None where it reads none."""
-
-    def answer(
-        self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
-    ) -> Any:
-        """Draw and pack. A dialect may draw several times for one call.
-
-        Args:
-            call: the host's call.
-            inputs: the result of ``unpack``.
-            draw: rasterizes inputs with the thresholds of this call. If one call has several
-                cameras, a second argument numbers them from 0.
-        """
-        return self.pack(draw(inputs), call)
-
-    @abstractmethod
-    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """Stand-ins for the host's compiled packages, by import name.
-
-        Args:
-            draw: answers a host call without thresholds.
-        """
-
-    def names(self) -> frozenset[str]:
-        """The import names in ``modules``; these packages need not be installed."""
-        return frozenset(self.modules(lambda call: None))
-
-    def spares(self) -> dict[str, ModuleType]:
-        """Stand-ins for packages that the host imports but does not need, for a CPU."""
-        return {}
 
 
 @dataclass(frozen=True)

@@ -35,3 +35,26 @@ class Match:
     adapter: str
     fits: bool
     findings: tuple[Finding, ...] = ()
+
+
+@dataclass(frozen=True)
+class Plain:
+    """Whether the PLY that a codebase saves is a plain 3DGS model.
+
+    Attributes:
+        reasons: what speaks against it, the weightiest first.
+        model: class of the model; "" if there is none that saves a PLY.
+        moved: those of the reasons that only say that the drawing function gets how to move the
+            model's own Gaussians, of which it still draws each one.
+        folder: of the codebase in the checkout; "" for the checkout itself.
+        elsewhere: where the model is, as text, if it is not where such codebases have it.
+    """
+
+    reasons: tuple[str, ...]
+    model: str = ""
+    moved: frozenset[str] = frozenset()
+    folder: str = ""
+    elsewhere: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.model) and not self.reasons

@@ -8,7 +8,7 @@ session      hands each call of one host in one process to the handler of its ro
 stepping     steps and optimizers         rasterizing  views, rasterizations, the pressure
 aligning     rows added and removed       saving       sidecars and checkpoints
 state        the run and its models, shared by all handlers
-proof        draws a call by the host's rasterizer and ours; likeness compares, proofs keeps
+proofs       has calls of the host's own rasterizer proved, and keeps the proofs
 patching     wraps functions and restores them
 similarity   answers the hosts' SSIM on a CPU
 stand_ins    replace the host's compiled packages

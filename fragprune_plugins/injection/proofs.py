@@ -1,41 +1,141 @@
-"""Keeps proofs: what a host's own rasterizer was seen to draw, by a digest of its files."""
+"""Has a host's own rasterizer proved before anything is trained, and keeps what was proved.
+
+The import name of a rasterizer proves nothing. So the first call of each shape, at each place, is
+drawn by the host's rasterizer and by our engine, and the dialect's prover compares the two.
+"""
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
+import logging
+import os
+import sys
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.engines.cuda.kernels import cache_folder
+from fragprune_plugins.constants import VERSION
+from fragprune_plugins.engines.cuda.kernels import cache_folder, digest_of_sources
+from fragprune_plugins.errors import EngineError, InputError, ProofError
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.hosts.dialect import HostCall, Place, Proof, Prover
+from fragprune_plugins.hosts.seams import SeamCall
+from fragprune_plugins.hosts.source import parsed
+
+if TYPE_CHECKING:
+    from fragprune_plugins.injection.state import SessionState
+
+log = logging.getLogger("fragprune")
 
 _ENDINGS = (".py", ".so", ".pyd", ".cu", ".cuh", ".cpp", ".h")
 
 
-@dataclass(frozen=True)
-class Proof:
-    """A call of a host's rasterizer that was drawn by both, the same way or not.
+def proved(
+    session: SessionState, prover: Prover, call: SeamCall, drawn: HostCall, *, strict: bool
+) -> Proof | None:
+    """The proof of a call of the host's own rasterizer, made now if there is none yet.
 
-    Attributes:
-        call: the rasterizer, and the place of the call in the host's source.
-        outputs: what each returned value is, in order.
-        made: by the number of an output, its meaning (``likeness.MEANINGS``), where the proof found
-            another than the adapter answers.
-        failed: how it draws otherwise; "" if it does not.
+    None where it failed and may fail, and where our engines do not draw such a call.
+
+    Args:
+        session: the state of the session.
+        prover: compares the two rasterizers.
+        call: at the seam.
+        drawn: the same as data.
+        strict: False warns where the proof fails.
+
+    Raises:
+        ProofError: it draws otherwise, or returns something that the host uses and we do not know.
     """
+    place, joint = _place(session), session.learn and not session.freeze
+    drawn = replace(drawn, still=not joint)
+    shape = (str(call.seam), place, joint, *prover.shape(drawn))
+    if shape not in session.proofs:
+        session.proofs[shape] = None
+        try:
+            session.proofs[shape] = _read_or_prove(session, prover, call, drawn, shape)
+        except ProofError as error:
+            if strict and not (prover.otherwise or session.trust):
+                del session.proofs[shape]
+                raise
+            known = f"{error.found}; as known: {prover.otherwise}"
+            log.warning("%s", f"not proved: {known}" if prover.otherwise else error)
+        except (EngineError, InputError) as error:  # raised again where ours has to draw
+            log.info("not proved: %s", error)
+    return session.proofs[shape]
 
-    call: str
-    outputs: tuple[str, ...]
-    made: dict[int, str] = field(default_factory=dict)
-    failed: str = ""
 
-    def __str__(self) -> str:
-        returned = f"returns {', '.join(self.outputs)}"
-        return f"{self.call}: {self.failed}" if self.failed else f"{self.call} {returned}"
+def _read_or_prove(
+    session: SessionState,
+    prover: Prover,
+    call: SeamCall,
+    drawn: HostCall,
+    shape: tuple[Any, ...],
+) -> Proof:
+    """A kept proof of a call of this shape, else a new one, which is kept if it fails, too."""
+    means = drawn[session.dialect.means]
+    engine = session.engine(means.device)
+    processor = session.processor(means.device)
+    known = (VERSION, digest_of_sources(), session.adapter.name, engine.name, processor, shape)
+    key = hashlib.sha256(repr(known).encode()).hexdigest()[:16]
+    file = sys.modules[call.seam.module].__file__
+    kept = file_of(digest_of(Path(file)), key) if file else None
+    proof = read(kept) if kept else None
+    if proof is None:
+        proof = prover.prove(call, replace(drawn, engine=engine), shape[1])
+        if kept:
+            keep(proof, kept)
+    if proof.failed:
+        raise ProofError(
+            proof.call,
+            proof.failed,
+            f"what {session.adapter.name} draws, forward and backward",
+            "Thresholds would learn from other pictures than its own. fragprune check says whether "
+            "its PLY is plain 3DGS, which fragprune finetune prunes; --stage off trains without "
+            "thresholds, and --trust with them all the same.",
+        )
+    log.info("proved: %s", proof)
+    return proof
+
+
+# ---- the place of a call -----------------------------------------------------------------------
+
+
+def _place(session: SessionState) -> Place:
+    """The innermost place in the host's own files that this call comes from."""
+    root = session.repo.root
+    inside, frame = f"{root / session.repo.package}{os.sep}", sys._getframe(1)
+    while frame.f_back is not None:
+        file = frame.f_code.co_filename
+        if file.startswith(inside) and "site-packages" not in file[len(inside) :]:
+            at = f"{frame.f_code.co_name} ({os.path.relpath(file, root)}:{frame.f_lineno})"
+            return _read_place(Path(file), frame.f_lineno, at)
+        frame = frame.f_back
+    return Place("a call from outside the host")
+
+
+@cache
+def _read_place(file: Path, line: int, at: str) -> Place:
+    around: dict[type, Any] = {}  # the innermost of each kind, because it is walked to last
+    for node in ast.walk(parsed(file.read_text(errors="replace")) or ast.Module([], [])):
+        if getattr(node, "lineno", line + 1) <= line <= (getattr(node, "end_lineno", 0) or 0):
+            around[type(node)] = node
+    assigned, function = around.get(ast.Assign), around.get(ast.FunctionDef)
+    target = assigned.targets[0] if assigned else None
+    if function is None or not isinstance(target, ast.Tuple):
+        return Place(at)
+    names = tuple(ast.unparse(each) for each in target.elts)
+    nodes = (node for node in ast.walk(function) if isinstance(node, ast.Name))
+    read = {node.id for node in nodes if isinstance(node.ctx, ast.Load)}
+    unread = {k for k, name in enumerate(names) if name.isidentifier() and name not in read}
+    return Place(at, names, frozenset(unread))
+
+
+# ---- kept proofs -------------------------------------------------------------------------------
 
 
 def digest_of(file: Path) -> str:

@@ -16,10 +16,9 @@ from torch import Tensor
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
-from fragprune_plugins.hosts.adapter import HostCall
+from fragprune_plugins.hosts.dialect import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
-from fragprune_plugins.injection.proof import answer, proved
-from fragprune_plugins.injection.proofs import Proof
+from fragprune_plugins.injection.proofs import proved
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.injection.stepping import (
@@ -151,7 +150,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     by_host = call.run if runs else partial(draw, session, drawn)
     if rendering is None or session.pausing.get():
         return by_host()
-    proof = prove(session, call, drawn, state) if runs else None
+    answer = proved_answer(session, call, drawn, state) if runs else session.dialect.answer
     if state is None:
         return by_host()
     rows = session.dialect.rows_drawn(rendering[0], drawn)
@@ -186,7 +185,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
                     return engine.rasterize(each, covering(thresholds, each))
                 return rasterize(engine, state, view, thresholds, each, part)
 
-            return answer(session.dialect, drawn, inputs, truncated, proof)
+            return answer(drawn, inputs, truncated)
     return by_host()
 
 
@@ -211,28 +210,29 @@ def further_picture(state: ModelState, view: int, part: int) -> bool:
     return picture in drawn
 
 
-def prove(
+def proved_answer(
     session: SessionState, call: SeamCall, drawn: HostCall, state: ModelState | None
-) -> Proof | None:
-    """The proof of a call of the host's own rasterizer; None if it needs none, or cannot have one.
+) -> Callable[..., Any]:
+    """What answers a call, once the host's own rasterizer is proved, if it needs and can be.
 
     A later call of a stage in which nothing of ours draws may fail: stage 2 would refuse it.
 
     Raises:
         ProofError: it draws otherwise than our engine.
     """
-    ours = state is not None and state.store.cuts
+    ours, prover = state is not None and state.store.cuts, session.prover
     if not session.prove and not ours:
-        return None
-    why_not = "" if hasattr(call.instance, "raster_settings") else "its calls have another form"
-    if session.stand_ins.answers(call.seam.module):
-        why_not = "a stand-in of ours draws here"
-    if not why_not:
-        return proved(session, call, drawn, strict=ours or session.learn or not session.proofs)
-    if call.seam not in session.unproved:
-        session.unproved.add(call.seam)
-        log.info("%s: nothing is proved, because %s", call.seam.module, why_not)
-    return None
+        return session.dialect.answer
+    stands_in = session.stand_ins.answers(call.seam.module)
+    if prover is None or stands_in:
+        why = "a stand-in of ours draws here" if stands_in else "its calls have another form"
+        if call.seam not in session.unproved:
+            session.unproved.add(call.seam)
+            log.info("%s: nothing is proved, because %s", call.seam.module, why)
+        return session.dialect.answer
+    strict = ours or session.learn or not session.proofs
+    proof = proved(session, prover, call, drawn, strict=strict)
+    return session.dialect.answer if proof is None else partial(prover.answer, proof=proof)
 
 
 def draw(session: SessionState, call: HostCall) -> Any:

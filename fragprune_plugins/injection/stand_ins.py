@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from fragprune_plugins.errors import LateImportError
-from fragprune_plugins.hosts.adapter import Dialect, HostCall
+from fragprune_plugins.hosts.dialect import Dialect, HostCall
 
 log = logging.getLogger("fragprune")
 

@@ -22,9 +22,9 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import HostAdapter, trained_groups
+from fragprune_plugins.hosts.dialect import Proof
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection.proofs import Proof
 from fragprune_plugins.injection.stand_ins import StandIns
 from fragprune_plugins.learning.events import PopulationChange
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -135,6 +135,7 @@ class SessionState:
         self.prove, self.trust = learn if prove is None else prove, trust
         self.proofs: dict[tuple[Any, ...], Proof | None] = {}  # by the shape of the call
         self.dialect = adapter.dialect(repo)
+        self.prover = self.dialect.prover
         self.trained = trained_groups(adapter.groups, self.settings.train)  # names; None for all
         self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # waits for its model
         self.similar: bool | None = None  # compiled similarity agrees with the host's own
@@ -168,6 +169,10 @@ class SessionState:
                 )
             self.engines[device] = engine
         return self.engines[device]
+
+    def processor(self, device: torch.device) -> str:
+        """The name of a GPU, or the kind of another device."""
+        return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
     def model_of(self, call: SeamCall) -> Any:
         """The model that a call concerns, or None; means from the adapter identify a model too."""

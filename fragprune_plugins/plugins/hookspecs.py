@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from fragprune_plugins.engines import Engine
     from fragprune_plugins.hosts.adapter import HostAdapter
-    from fragprune_plugins.hosts.findings import Match
+    from fragprune_plugins.hosts.findings import Match, Plain
     from fragprune_plugins.hosts.source import HostRepo
     from fragprune_plugins.learning.events import PopulationChange, StepStats, Summary
     from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -40,6 +40,16 @@ def fragprune_select_adapter(repo: HostRepo, matches: Sequence[Match]) -> str | 
 
     :param repo: the checkout.
     :param matches: the adapters that fit, with reasons.
+    """
+
+
+@hookspec
+def fragprune_read_models(repo: HostRepo) -> Sequence[Plain] | None:
+    """Tell which PLYs a codebase saves, and what speaks against each being plain 3DGS.
+
+    Asked by ``fragprune check`` where no adapter fits: ``fragprune finetune`` prunes plain PLYs.
+
+    :param repo: the checkout. Its own model comes first, then those of codebases in its folders.
     """
 
 

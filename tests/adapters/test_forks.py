@@ -9,10 +9,10 @@ import torch
 
 from fragprune_3dgs_fork import ForkDialect
 from fragprune_3dgs_fork.fork import Output
+from fragprune_graphdeco import proof
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.hosts.adapter import HostCall
-from fragprune_plugins.injection import proof
+from fragprune_plugins.hosts.dialect import HostCall
 from fragprune_plugins.injection.rasterizing import further_picture
 from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.learning.thresholds import ThresholdStore

@@ -6,7 +6,7 @@ import pytest
 import torch
 from miniatures.vanilla_3dgs import Notes, joint, running
 
-from fragprune_plugins.hosts.graphdeco import GraphdecoDialect
+from fragprune_graphdeco import GraphdecoDialect
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.goals import Fewer, Portable, Pressure
 from fragprune_plugins.learning.pressure import ELASTICITY, LEAST_PRESSURE, MOST_PRESSURE

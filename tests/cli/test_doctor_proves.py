@@ -8,11 +8,10 @@ import pytest
 import torch
 from cli.commands import run
 
-from fragprune_plugins.adapting import GraphdecoDialect
+from fragprune_graphdeco import GraphdecoDialect, stand_ins
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.hosts.graphdeco import stand_ins
 from fragprune_plugins.workbench.doctor import peers, prove
 from fragprune_plugins.workbench.doctor.prove import Contestant
 

@@ -16,8 +16,8 @@ from fragprune_plugins.adapting import (
 )
 from fragprune_plugins.hosts.choosing import attempt, choose
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.hosts.verdict import judge
 from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.workbench.check.verdict import judge
 
 
 def errors(repo):
@@ -47,9 +47,10 @@ SERVED = {
 def test_a_plain_fork_fits_and_is_to_be_proved(tmp_path, what):
     repo = fork(tmp_path, **SERVED[what])
     assert errors(repo) == []
-    adapters = load_plugins().adapters
+    plugins = load_plugins()
+    adapters = plugins.adapters
     assert choose(repo, adapters).name == "3dgs-fork"
-    verdict = judge(repo, attempt(repo, adapters), adapters)
+    verdict = judge(repo, attempt(repo, adapters), adapters, plugins)
     assert verdict.kind == "fits"
     assert "Not proved" in verdict.sentence
 

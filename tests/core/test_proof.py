@@ -13,9 +13,10 @@ from cli.commands import run_json
 from miniatures import compiled, vanilla_3dgs
 from miniatures.compiled import DIFFERENCES
 
+from fragprune_graphdeco.prover import RasterizerProver
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError, ProofError
-from fragprune_plugins.injection import proof, rasterizing
+from fragprune_plugins.injection import rasterizing
 from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.invariants.case import FixedThresholds, open_all
@@ -242,8 +243,9 @@ def test_a_call_that_no_engine_of_ours_draws_is_left_to_the_host(host):
 
 def test_a_proof_is_kept_until_the_rasterizer_changes(host, monkeypatch):
     folder, made = host("none"), []
-    prove = proof._Trial.prove
-    monkeypatch.setattr(proof._Trial, "prove", lambda trial: made.append(1) or prove(trial))
+    prove = RasterizerProver.prove
+    counted = lambda *call: made.append(1) or prove(*call)  # noqa: E731
+    monkeypatch.setattr(RasterizerProver, "prove", counted)
     first, second = draw(folder), draw(folder)
     assert first == second
     assert len(made) == 1
@@ -259,8 +261,9 @@ def test_a_proof_is_kept_until_the_rasterizer_changes(host, monkeypatch):
 
 def test_a_failed_proof_is_kept_and_not_repeated(host, monkeypatch):
     folder, made = host("dilation"), []
-    prove = proof._Trial.prove
-    monkeypatch.setattr(proof._Trial, "prove", lambda trial: made.append(1) or prove(trial))
+    prove = RasterizerProver.prove
+    counted = lambda *call: made.append(1) or prove(*call)  # noqa: E731
+    monkeypatch.setattr(RasterizerProver, "prove", counted)
     said = set()
     for _ in range(2):
         with pytest.raises(ProofError) as refused:
@@ -290,7 +293,7 @@ def test_a_session_that_never_draws_by_ours_proves_nothing(host):
 
 def test_the_proof_leaves_no_trace_in_a_training(host, monkeypatch):
     folder, after = host("none"), []
-    for way in (proof.proved, lambda *_, **__: None):
+    for way in (rasterizing.proved, lambda *_, **__: None):
         monkeypatch.setattr(rasterizing, "proved", way)
         torch.manual_seed(3)
         with running(folder, learn=True) as session:

@@ -3,7 +3,7 @@
 import pytest
 from miniatures.skeletons import SETTINGS, skeleton
 
-from fragprune_plugins.hosts.graphdeco.call import drawing_functions, read_calls
+from fragprune_graphdeco.call import drawing_functions, read_calls
 from fragprune_plugins.hosts.source import HostRepo
 
 RENDERER = "gaussian_renderer"

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fragprune_plugins.hosts.graphdeco import stand_ins
-from fragprune_plugins.hosts.graphdeco.stand_ins import (
+from fragprune_graphdeco import stand_ins
+from fragprune_graphdeco.stand_ins import (
     SparseGaussianAdam,
     compute_relocation,
     mean_squared_neighbour_distance,

@@ -3,11 +3,11 @@
 import pytest
 from miniatures.skeletons import GROUPS, skeleton
 
+from fragprune_graphdeco.plain import read_plain
 from fragprune_plugins.hosts.choosing import attempt
-from fragprune_plugins.hosts.plain import read_plain
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.hosts.verdict import judge
 from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.workbench.check.verdict import judge
 
 MODEL = """
     def setup_functions(self):
@@ -79,8 +79,8 @@ def fork(tmp_path):
 
 
 def judged(repo):
-    adapters = load_plugins().adapters
-    return judge(repo, attempt(repo, adapters), adapters)
+    plugins = load_plugins()
+    return judge(repo, attempt(repo, plugins.adapters), plugins.adapters, plugins)
 
 
 def test_a_host_fits_and_what_reading_cannot_show_is_named(tmp_path):

@@ -12,6 +12,7 @@ from miniatures.vanilla_3dgs import HOST, joint, running
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.hosts.choosing import choose
+from fragprune_plugins.hosts.findings import Plain
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.goals import Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -20,6 +21,7 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import select_adapter, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins, load_plugins
+from fragprune_plugins.workbench.check.verdict import judge, models_of
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("fragprune_")]
@@ -107,6 +109,20 @@ def test_hook_fragprune_select_adapter():
     select = partial(select_adapter, plugins=plugins)
     chosen = choose(HostRepo(HOST), [Vanilla3DGS(), Fork()], select=select)
     assert chosen.name == "a-fork"
+
+
+def test_hook_fragprune_read_models(tmp_path):
+    class Reader:
+        @hookimpl
+        def fragprune_read_models(self, repo):
+            return [Plain((), "Model")] if repo.root == tmp_path else None
+
+    plugins = Plugins()
+    assert not any(models_of(HostRepo(tmp_path), plugins))
+    plugins.register(Reader(), "mine")
+    assert all(models_of(HostRepo(tmp_path), plugins))
+    told = judge(HostRepo(tmp_path), [], [], plugins)
+    assert told.kind == "finetune"
 
 
 def test_hook_fragprune_truncate():

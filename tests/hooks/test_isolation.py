@@ -15,9 +15,15 @@ from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
-from fragprune_plugins.plugins.hooks import engine_for, schedule_for, select_adapter, thresholds_for
+from fragprune_plugins.plugins.hooks import (
+    engine_for,
+    schedule_for,
+    select_adapter,
+    thresholds_for,
+)
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
+from fragprune_plugins.workbench.check.verdict import models_of
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = pytest.mark.usefixtures("single_thread")
@@ -37,6 +43,7 @@ ASK = {
     "fragprune_create_engine": lambda p: engine_for("auto", "cpu", p),
     "fragprune_create_schedule": lambda p: schedule_for(Settings(), p),
     "fragprune_select_adapter": lambda p: select_adapter(HostRepo(HOST), MATCHES, p),
+    "fragprune_read_models": lambda p: models_of(HostRepo(HOST), p),
 }
 """What makes the core ask."""
 
@@ -56,6 +63,7 @@ def plugin(hook, act):
         "fragprune_create_engine": lambda name, device: act(),
         "fragprune_create_schedule": lambda settings: act(),
         "fragprune_select_adapter": lambda repo, matches: act(),
+        "fragprune_read_models": lambda repo: act(),
         "fragprune_attached": lambda model, store: act(),
         "fragprune_population_changed": lambda store, change: act(),
         "fragprune_step": lambda stats: act(),

@@ -9,7 +9,7 @@ from unittest import mock
 import torch
 from torch import Tensor, nn
 
-from fragprune_plugins.hosts.graphdeco.call import SHARED
+from fragprune_graphdeco.call import SHARED
 from reference_renderer import Camera, Gaussians, Options, Rendering, project, render
 from reference_renderer import covariance as covariances
 from reference_renderer import fragment as fragments

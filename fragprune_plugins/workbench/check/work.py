@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.errors import UnknownHostError
-from fragprune_plugins.hosts.adapter import Dialect, HostAdapter, ScriptAdapter
+from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import Tried, attempt, closest, locate, usage
+from fragprune_plugins.hosts.dialect import Dialect, Proof
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.hosts.verdict import judge
 from fragprune_plugins.injection import proofs
-from fragprune_plugins.injection.proofs import Proof
-from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.plugins.loading import Plugins, load_plugins
+from fragprune_plugins.workbench.check.verdict import judge
 from fragprune_plugins.workbench.commands.command import Report
 
 
@@ -31,24 +31,29 @@ def check(*, hosts: tuple[Path, ...], adapter: str | None) -> Report:
                 "a host's checkout, or the import name of an installed host",
                 "Name the folder of train.py.",
             )
-    adapters = load_plugins().adapters
+    plugins = load_plugins()
+    adapters = plugins.adapters
     if adapter is not None:
         adapters = [a for a in adapters if a.name == adapter.replace("_", "-")]
         if not adapters:
             raise UnknownHostError(
                 "--adapter", repr(adapter), "an installed adapter", "Run fragprune adapters."
             )
-    return _table(hosts, adapters) if len(hosts) > 1 else _single(hosts[0], adapters, adapter)
+    if len(hosts) > 1:
+        return _table(hosts, adapters, plugins)
+    return _single(hosts[0], adapters, adapter, plugins)
 
 
-def _single(host: Path, adapters: list[HostAdapter], adapter: str | None) -> Report:
+def _single(
+    host: Path, adapters: list[HostAdapter], adapter: str | None, plugins: Plugins
+) -> Report:
     """Everything about one checkout; the exit code is 0 if one adapter fits."""
     repo = _repository(host, adapters, adapter)
     tried = attempt(repo, adapters)
     closer = closest([each.adapter for each in tried if each.match.fits], adapters)
     fitting = [each for each in tried if each.adapter in closer]
     verdict = fitting[0] if len(fitting) == 1 else None
-    judged = judge(repo, tried, adapters)
+    judged = judge(repo, tried, adapters, plugins)
     kept = _kept(repo, verdict.adapter.dialect(repo)) if verdict else []
     proved = [str(proof) for proof in kept if not proof.failed]
     failed = [str(proof) for proof in kept if proof.failed]
@@ -87,12 +92,12 @@ def _single(host: Path, adapters: list[HostAdapter], adapter: str | None) -> Rep
     return Report(data, "\n".join(lines), exit_code=0 if verdict and not failed else 1)
 
 
-def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter]) -> Report:
+def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter], plugins: Plugins) -> Report:
     """A row for each checkout."""
     rows = []
     for each in hosts:
         repo = _repository(each, adapters, None)
-        judged = judge(repo, attempt(repo, adapters), adapters)
+        judged = judge(repo, attempt(repo, adapters), adapters, plugins)
         rows.append({"host": each.name, "commit": repo.commit, **judged.as_dict()})
     titles = ("checkout", "verdict", "nearest", "reason", "differs")
     lines = [f"| {' | '.join(titles)} |", "|---|---|---|---|---|"]
@@ -203,6 +208,7 @@ def _kept(repo: HostRepo, dialect: Dialect) -> list[Proof]:
     None that failed for a host that is known to draw otherwise.
     """
     found: dict[str, Proof] = {}
+    excused = dialect.prover is not None and dialect.prover.otherwise
     for name in sorted(dialect.names()):
         file = repo.path(name)
         if file is None and "." not in name and name not in sys.modules:
@@ -211,7 +217,7 @@ def _kept(repo: HostRepo, dialect: Dialect) -> list[Proof]:
         pattern = proofs.file_of(proofs.digest_of(file), "*") if file else None
         for path in sorted(pattern.parent.glob(pattern.name)) if pattern else ():
             proof = proofs.read(path)
-            if proof is not None and not (proof.failed and getattr(dialect, "otherwise", "")):
+            if proof is not None and not (proof.failed and excused):
                 found[str(proof)] = proof
     return list(found.values())
 

@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from fragprune_plugins.hosts.source import Function, HostRepo, nodes
+from fragprune_plugins.adapting import Function, HostRepo, nodes
 
 SETTINGS, RASTERIZER = "GaussianRasterizationSettings", "GaussianRasterizer"
 

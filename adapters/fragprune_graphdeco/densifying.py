@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.hosts.seams import SeamCall
+from fragprune_plugins.adapting import SeamCall
 
 if TYPE_CHECKING:
     from torch import Tensor

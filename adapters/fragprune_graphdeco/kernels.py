@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.adapting import Finding, HostRepo
 
 _DEEPEST = 6
 """Folders below the checkout in which a rasterizer is looked for."""

@@ -9,13 +9,14 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 
-from fragprune_plugins.files.columns import change_of
-from fragprune_plugins.hosts.graphdeco.call import RASTERIZER
-from fragprune_plugins.hosts.kernels import SPLAT, read_kernels
-from fragprune_plugins.hosts.source import Function, HostRepo, nodes, off_by_default
+from fragprune_graphdeco.call import RASTERIZER
+from fragprune_graphdeco.kernels import SPLAT, read_kernels
+from fragprune_plugins.adapting import Function, HostRepo, Plain, change_of, nodes, off_by_default
 
+_DEEPEST = 3
+"""Folders below a checkout in which codebases are looked for."""
 _COLUMNS = ("f_dc", "f_rest", "opacity", "scale", "rot")
 _PLAIN = {"x", "y", "z", "nx", "ny", "nz", "l", *_COLUMNS}
 _OF_MODEL = re.compile(
@@ -37,31 +38,23 @@ _ACTIVATIONS = {
 }
 
 
-@dataclass(frozen=True)
-class Plain:
-    """Whether a codebase's PLY is a plain 3DGS model.
-
-    Attributes:
-        reasons: what speaks against it, the weightiest first.
-        model: "module:class" of the model; "" if there is none that saves a PLY.
-        moved: those of the reasons that only say that the drawing function gets how to move the
-            model's own Gaussians, of which it still draws each one.
-    """
-
-    reasons: tuple[str, ...]
-    model: str = ""
-    moved: frozenset[str] = frozenset()
-
-    def __bool__(self) -> bool:
-        return bool(self.model) and not self.reasons
+def read_models(repo: HostRepo) -> list[Plain]:
+    """``read_plain`` of a checkout, and of the codebases of this family in its folders."""
+    patterns = ("*/" * deep + "gaussian_renderer" for deep in range(1, _DEEPEST + 1))
+    found = (path.parent for each in patterns for path in repo.root.glob(each) if path.is_dir())
+    names = (each.relative_to(repo.root).as_posix() for each in sorted(found))
+    inside = [each for each in names if "/." not in f"/{each}"]
+    return [
+        read_plain(repo),
+        *(replace(read_plain(HostRepo(repo.root / each)), folder=each) for each in inside),
+    ]
 
 
 def read_plain(repo: HostRepo) -> Plain:
     """Read a checkout's model, its save function, its drawing function and its kernel."""
-    found = find_model(repo)
-    if found is None:
+    module, name = next(_models(repo), ("", ""))
+    if not module:
         return Plain(("no model of this family that saves a PLY was found",))
-    module, name = found
     flat = list(_flat(repo, module, name))
     moving = dict(_of_drawing(repo))
     drawn = list(moving)
@@ -76,16 +69,12 @@ def read_plain(repo: HostRepo) -> Plain:
         *_of_others(repo, module),
     ]
     moved = frozenset(each for each, moves in moving.items() if moves)
-    return Plain(tuple(dict.fromkeys(reasons)), f"{module}:{name}", moved)
-
-
-def find_model(repo: HostRepo) -> tuple[str, str] | None:
-    """Module and class of the model that saves a PLY, ``scene.gaussian_model`` first."""
-    return next(_models(repo), None)
+    elsewhere = "" if repo.path("scene.gaussian_model") else f"{name} is in {module}"
+    return Plain(tuple(dict.fromkeys(reasons)), name, moved, elsewhere=elsewhere)
 
 
 def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
-    """Module and class of each model in ``scene`` that saves a PLY."""
+    """Module and class of each model in ``scene`` that saves a PLY, ``gaussian_model`` first."""
     files = sorted(each.stem for each in (repo.root / "scene").glob("*.py"))
     files.sort(key=lambda stem: (stem != "gaussian_model", "gaussian" not in stem, len(stem)))
     for stem in files:

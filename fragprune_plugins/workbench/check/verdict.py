@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.hosts.choosing import Tried, attempt, closest
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.kernels import vendored
-from fragprune_plugins.hosts.plain import Plain, find_model, read_plain
+from fragprune_plugins.hosts.findings import Finding, Plain
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.plugins import hookspecs
+from fragprune_plugins.plugins.loading import Plugins, Wrong
 
-_MODEL = "scene.gaussian_model"
 _PLY = "OUTPUT/point_cloud/iteration_30000/point_cloud.ply"
 _SHOWN = 8
-_DEEPEST = 3
-"""Folders below a checkout in which a host is looked for."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +50,19 @@ class Verdict:
         }
 
 
-def judge(repo: HostRepo, tried: Sequence[Tried], adapters: Sequence[HostAdapter]) -> Verdict:
+def judge(
+    repo: HostRepo,
+    tried: Sequence[Tried],
+    adapters: Sequence[HostAdapter],
+    plugins: Plugins,
+) -> Verdict:
     """Judge a checkout.
 
     Args:
         repo: the checkout, or an installed package.
         tried: the result of each adapter on it, the nearest first.
         adapters: all adapters.
+        plugins: tell which models it saves, where no adapter fits.
     """
     nearer = closest([each.adapter for each in tried if each.match.fits], adapters)
     fitting = [each for each in tried if each.adapter in nearer]
@@ -71,17 +73,14 @@ def judge(repo: HostRepo, tried: Sequence[Tried], adapters: Sequence[HostAdapter
     if fitting:
         names = ", ".join(each.adapter.name for each in fitting)
         return Verdict("several", f"Several adapters fit: {names}. Name one with --adapter.")
-    inside = _inside(repo, adapters)
+    own, *others = models_of(repo, plugins)
+    inside = _inside(repo, others, adapters)
     nearest = next((each for each in tried if each.held), None)
-    name, differs = (nearest.adapter.name, differences(repo, nearest)) if nearest else ("", ())
-    plain = read_plain(repo)
-    if not plain.model and not inside:
-        within = (_within(each) for each in _hosts(repo.root))
-        plain = next((found for found in within if found is not None), plain)
-    fitting_inside = " ".join(
-        f"Its folder {folder}/ fits {fits}: fragprune check {repo.root / folder}"
-        for folder, fits in inside
-    )
+    name = nearest.adapter.name if nearest else ""
+    differs = differences(repo, nearest, own.elsewhere) if nearest else ()
+    plain = own
+    if not own.model and not inside:
+        plain = next((each for each in others if each.model), own)
     if plain:
         sentence = (
             "No adapter fits, but its PLY is plain 3DGS, and this prunes it: "
@@ -89,31 +88,51 @@ def judge(repo: HostRepo, tried: Sequence[Tried], adapters: Sequence[HostAdapter
         )
         return Verdict("finetune", sentence, "", name, differs, inside)
     if inside:
-        return Verdict("inside", fitting_inside, plain.reasons[0], name, differs, inside)
-    reason = plain.reasons[0]
+        sentence = " ".join(
+            f"Its folder {folder}/ fits {fits}: fragprune check {repo.root / folder}"
+            for folder, fits in inside
+        )
+        return Verdict("inside", sentence, own.reasons[0], name, differs, inside)
+    reason = f"{plain.folder}/: {plain.reasons[0]}" if plain.folder else plain.reasons[0]
     if nearest and not plain.model:  # what the nearest adapter misses tells more
         reason += f"; {nearest.verdict()}"
     return Verdict("never", f"Not possible: {reason}.", reason, name, differs)
 
 
+def models_of(repo: HostRepo, plugins: Plugins) -> Sequence[Plain]:
+    """The models that a codebase saves as PLYs, its own first; one without a name if none is known.
+
+    Raises:
+        PluginError: a plugin raised, or answered something else.
+    """
+
+    def wrong(answer: Any) -> Wrong | None:
+        fits = isinstance(answer, list | tuple) and all(isinstance(p, Plain) for p in answer)
+        return None if answer and fits else (repr(answer), "a list of at least one Plain")
+
+    found = plugins.ask(hookspecs.fragprune_read_models, wrong, repo=repo)
+    return found or [Plain(("no plugin reads what it saves",))]
+
+
 def _unproved(repo: HostRepo, fitting: Tried) -> str:
     """What reading cannot show about a host that fits."""
     warned = [each.found for each in fitting.match.findings if each.level == "warning"]
-    if repo.package or not hasattr(fitting.adapter, "package"):
+    prover = None if repo.package else fitting.adapter.dialect(repo).prover
+    if prover is None:
         return "; ".join(warned) or "the picture, until it is compared on the first run"
-    package: str = getattr(fitting.adapter.dialect(repo), "package", "")
-    if not vendored(repo, package):
-        warned.append(f"its picture; the sources of {package} are not in the checkout")
-    return "; ".join(warned) or "its picture; the rule in its vendored rasterizer is the known one"
+    told = "; ".join(filter(None, [*warned, prover.unproved(repo)]))
+    return told or "its picture; the rule in its vendored rasterizer is the known one"
 
 
-def differences(repo: HostRepo, tried: Tried) -> tuple[str, ...]:
-    """How a checkout differs from an adapter's host, in short lines."""
-    lines: dict[str, None] = {}
-    model = find_model(repo)
-    elsewhere = model is not None and model[0] != _MODEL and repo.path(_MODEL) is None
-    if elsewhere and model:
-        lines[f"{model[1]} is in {model[0]}"] = None
+def differences(repo: HostRepo, tried: Tried, elsewhere: str) -> tuple[str, ...]:
+    """How a checkout differs from an adapter's host, in short lines.
+
+    Args:
+        repo: the checkout.
+        tried: the adapter's result.
+        elsewhere: where the model is, as text; "" if it is where the adapter looks.
+    """
+    lines: dict[str, None] = {elsewhere: None} if elsewhere else {}
     missing: list[str] = []
     for finding in tried.errors:
         if finding.code == "seam-missing":
@@ -141,28 +160,13 @@ def _line(repo: HostRepo, finding: Finding) -> str:
     return f"{finding.where}: {finding.found}"
 
 
-def _inside(repo: HostRepo, adapters: Sequence[HostAdapter]) -> tuple[tuple[str, str], ...]:
+def _inside(
+    repo: HostRepo, others: Sequence[Plain], adapters: Sequence[HostAdapter]
+) -> tuple[tuple[str, str], ...]:
     """Folders in a checkout that fit an adapter."""
     found = []
-    for folder in _hosts(repo.root):
-        inner = HostRepo(folder)
-        nearer = closest(
-            [each.adapter for each in attempt(inner, adapters) if each.match.fits], adapters
-        )
-        name = folder.relative_to(repo.root).as_posix()
-        found += [(name, each.name) for each in nearer[:1]]
+    for each in others:
+        tried = attempt(HostRepo(repo.root / each.folder), adapters)
+        nearer = closest([one.adapter for one in tried if one.match.fits], adapters)
+        found += [(each.folder, adapter.name) for adapter in nearer[:1]]
     return tuple(found)
-
-
-def _within(folder: Path) -> Plain | None:
-    """The reasons of a host in a folder of a checkout."""
-    plain = read_plain(HostRepo(folder))
-    reasons = tuple(f"{folder.name}/: {each}" for each in plain.reasons)
-    return Plain(reasons, plain.model) if plain.model else None
-
-
-def _hosts(root: Path) -> list[Path]:
-    """Folders in a checkout that have a renderer of this family."""
-    patterns = ("*/" * deep + "gaussian_renderer" for deep in range(1, _DEEPEST + 1))
-    found = (path.parent for each in patterns for path in root.glob(each) if path.is_dir())
-    return sorted(each for each in found if "/." not in f"/{each.relative_to(root).as_posix()}")

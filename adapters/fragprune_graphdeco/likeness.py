@@ -10,8 +10,14 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import TRANSMITTANCE_MIN
-from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats, View
+from fragprune_plugins.adapting import (
+    TRANSMITTANCE_MIN,
+    Footprints,
+    RasterInputs,
+    RasterOutputs,
+    Splats,
+    View,
+)
 
 SHARE: Final = 200
 """One pixel or row of so many may differ: a fragment on a cut falls either way by rounding."""

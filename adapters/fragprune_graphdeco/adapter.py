@@ -11,36 +11,40 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from fragprune_plugins.errors import NotComparedError
-from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.hosts.adapter import (
+from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
+from fragprune_graphdeco.densifying import clones, splits
+from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels
+from fragprune_graphdeco.prover import RasterizerProver
+from fragprune_graphdeco.reading import defaults, read_flags, read_getters, training_scripts
+from fragprune_plugins.adapting import (
     CHECKPOINT_KEY,
     GROUPS,
+    WIDEST,
     CommandLine,
     Dialect,
+    Finding,
+    Function,
     HostCall,
+    HostRepo,
+    NotComparedError,
+    Photographs,
+    Prover,
+    RasterInputs,
+    Resolution,
+    Role,
     ScriptAdapter,
+    Seam,
+    SeamCall,
+    Splats,
+    View,
+    nodes,
+    replacing,
 )
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.graphdeco.call import RasterizerCall, drawing_functions, read_calls
-from fragprune_plugins.hosts.graphdeco.densifying import clones, splits
-from fragprune_plugins.hosts.graphdeco.reading import (
-    defaults,
-    read_flags,
-    read_getters,
-    training_scripts,
-)
-from fragprune_plugins.hosts.kernels import SPLAT, Kernel, read_kernels
-from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
-from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
-from fragprune_plugins.hosts.source import Function, HostRepo, nodes
-from fragprune_plugins.types import RasterInputs, Splats, View
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.files.model import Model
-    from fragprune_plugins.types import RasterOutputs
+    from fragprune_plugins.adapting import Model, RasterOutputs
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 CAMERAS = "utils.camera_utils"
@@ -108,6 +112,11 @@ class GraphdecoDialect(Dialect):
     outputs: int
     sparse_adam: bool = False
 
+    @property
+    def prover(self) -> Prover:
+        """Compares any rasterizer that takes these calls."""
+        return RasterizerProver(self, self.package, self.otherwise)
+
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call. The host's matrices are already transposed for row vectors."""
         import torch
@@ -153,7 +162,7 @@ class GraphdecoDialect(Dialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizer and simple_knn."""
-        from fragprune_plugins.hosts.graphdeco import stand_ins
+        from fragprune_graphdeco import stand_ins
 
         rasterizer = stand_ins.rasterizer(self.package, self.settings, self.sparse_adam, draw)
         return {self.package: rasterizer, **stand_ins.simple_knn()}
@@ -337,7 +346,7 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def read_model(self, ply: Path) -> Model:
         """The host's own PLY."""
-        from fragprune_plugins.files.ply import read_ply
+        from fragprune_plugins.adapting import read_ply
 
         return read_ply(ply)
 
@@ -353,7 +362,7 @@ class GraphdecoAdapter(ScriptAdapter):
         """The host's ``capture`` of a PLY: fresh moments, and the file's thresholds."""
         import torch
 
-        from fragprune_plugins.files import sidecar
+        from fragprune_plugins.adapting import thresholds_of
 
         m = self.read_model(ply)
         rows = len(m.xyz)
@@ -371,7 +380,7 @@ class GraphdecoAdapter(ScriptAdapter):
             eps=1e-15,
         )
         state: dict[str, Any] = optimizer.state_dict()
-        if (store := sidecar.thresholds_of(ply, rows)) is not None:
+        if (store := thresholds_of(ply, rows)) is not None:
             state[CHECKPOINT_KEY] = store.state_dict()
         return (
             m.sh_degree,

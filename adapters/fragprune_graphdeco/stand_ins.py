@@ -16,9 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fragprune_plugins.constants import NEAR
-from fragprune_plugins.hosts.adapter import HostCall
-from fragprune_plugins.hosts.graphdeco.call import ARGUMENTS
+from fragprune_graphdeco.call import ARGUMENTS
+from fragprune_plugins.adapting import NEAR, HostCall
 from fragprune_plugins.learning.losses import WINDOW, ssim_map
 
 _TAKEN = (*ARGUMENTS, "dc")

@@ -1,41 +1,31 @@
-"""Proves that a host's own rasterizer and our engine draw the same, before anything is trained.
+"""Proves that a rasterizer of these hosts and our engine draw the same.
 
-The import name of a rasterizer proves nothing. So the first call at each place is drawn by both,
-with the host's own arguments and again with a chart of Gaussians that shows every rule.
+A call is drawn by both, with the host's own arguments and again with a chart of Gaussians that
+shows every rule.
 """
 
 from __future__ import annotations
 
-import ast
-import hashlib
-import logging
-import os
-import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import VERSION
-from fragprune_plugins.engines.cuda.kernels import digest_of_sources
-from fragprune_plugins.errors import EngineError, InputError, ProofError
-from fragprune_plugins.hosts.adapter import Dialect, HostCall
-from fragprune_plugins.hosts.graphdeco.call import ARGUMENTS
-from fragprune_plugins.hosts.seams import SeamCall
-from fragprune_plugins.hosts.source import parsed
-from fragprune_plugins.injection import likeness, proofs
-from fragprune_plugins.injection.likeness import Seen
-from fragprune_plugins.injection.proofs import Proof
-
-if TYPE_CHECKING:
-    from fragprune_plugins.injection.state import SessionState
-    from fragprune_plugins.types import RasterInputs, RasterOutputs
-
-log = logging.getLogger("fragprune")
+from fragprune_graphdeco import likeness
+from fragprune_graphdeco.call import ARGUMENTS
+from fragprune_graphdeco.likeness import Seen
+from fragprune_plugins.adapting import (
+    Dialect,
+    HostCall,
+    Place,
+    Proof,
+    RasterInputs,
+    RasterOutputs,
+    SeamCall,
+)
 
 OF_A_VIEW = frozenset(
     {
@@ -53,69 +43,26 @@ _SHAPE = ("means3D", "scales", "rotations", "cov3D_precomp")
 once more. Ours is the derivative, so antialiased calls are not compared in them."""
 
 
-def proved(session: SessionState, call: SeamCall, drawn: HostCall, *, strict: bool) -> Proof | None:
-    """The proof of a call of the host's own rasterizer, made now if there is none yet.
-
-    None where it failed and may fail, and where our engines do not draw such a call.
-
-    Args:
-        session: the state of the session.
-        call: at the seam.
-        drawn: the same as data.
-        strict: False warns where the proof fails.
-
-    Raises:
-        ProofError: it draws otherwise, or returns something that the host uses and we do not know.
-    """
-    place, joint = _place(session), session.learn and not session.freeze
-    drawn = replace(drawn, still=not joint)
-    shape = (str(call.seam), place, joint, *_shape(drawn))
-    if shape not in session.proofs:
-        session.proofs[shape] = None
-        try:
-            session.proofs[shape] = _read_or_prove(session, call, drawn, place, shape)
-        except ProofError as error:
-            known = getattr(session.dialect, "otherwise", "")
-            if strict and not (known or session.trust):
-                del session.proofs[shape]
-                raise
-            log.warning("%s", f"not proved: {error.found}; as known: {known}" if known else error)
-        except (EngineError, InputError) as error:  # raised again where ours has to draw
-            log.info("not proved: %s", error)
-    return session.proofs[shape]
+def shape(call: HostCall) -> Iterator[tuple[str, str]]:
+    """Which arguments a call has, and every rule that it sets."""
+    settings = call.settings._asdict() if hasattr(call.settings, "_asdict") else {}
+    for name, value in settings.items():
+        if name not in OF_A_VIEW:
+            yield name, _rule(value)
+    for name, value in call.arguments.items():
+        if isinstance(value, Tensor) and name in (*ARGUMENTS, "dc"):
+            yield name, str(value.numel() and (*value.shape[1:], value.dtype))
+        elif value is not None:
+            yield name, _rule(value)
 
 
-def _read_or_prove(
-    session: SessionState, call: SeamCall, drawn: HostCall, place: _Place, shape: tuple[Any, ...]
-) -> Proof:
-    """A kept proof of a call of this shape, else a new one, which is kept if it fails, too."""
-    means = drawn[session.dialect.means]
-    engine = session.engine(means.device)
-    where = torch.cuda.get_device_name(means.device) if means.is_cuda else "cpu"
-    known = (VERSION, digest_of_sources(), session.adapter.name, engine.name, where, shape)
-    key = hashlib.sha256(repr(known).encode()).hexdigest()[:16]
-    file = sys.modules[call.seam.module].__file__
-    kept = proofs.file_of(proofs.digest_of(Path(file)), key) if file else None
-    proof = proofs.read(kept) if kept else None
-    if proof is None:
-        trial = _Trial(session, call, drawn, place)
-        try:
-            proof = trial.prove()
-        except _OtherwiseError as error:
-            proof = Proof(trial.where, (), failed=str(error))
-        if kept:
-            proofs.keep(proof, kept)
-    if proof.failed:
-        raise ProofError(
-            proof.call,
-            proof.failed,
-            f"what {session.adapter.name} draws, forward and backward",
-            "Thresholds would learn from other pictures than its own. fragprune check says whether "
-            "its PLY is plain 3DGS, which fragprune finetune prunes; --stage off trains without "
-            "thresholds, and --trust with them all the same.",
-        )
-    log.info("proved: %s", proof)
-    return proof
+def prove(dialect: Dialect, call: SeamCall, drawn: HostCall, place: Place) -> Proof:
+    """Compare every output and every gradient; see ``Prover``."""
+    trial = _Trial(dialect, call, drawn, place)
+    try:
+        return trial.prove()
+    except _OtherwiseError as error:
+        return Proof(trial.where, (), failed=str(error))
 
 
 def answer(
@@ -123,14 +70,12 @@ def answer(
     call: HostCall,
     inputs: RasterInputs,
     draw: Callable[..., RasterOutputs],
-    proof: Proof | None,
+    proof: Proof,
 ) -> Any:
-    """Answer a host's call by the dialect, and by what the proof found beyond it.
+    """Answer a call by the dialect, and by what the proof found beyond it; see ``Prover``.
 
     An output that is unknown and that the host does not read is the dialect's, or None.
     """
-    if proof is None:
-        return dialect.answer(call, inputs, draw)
     if not proof.made:
         packed: tuple[Any, ...] = _tuple(dialect.answer(call, inputs, draw))
     else:
@@ -142,7 +87,10 @@ def answer(
 
 
 def _packed(
-    dialect: Dialect, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
+    dialect: Dialect,
+    call: HostCall,
+    inputs: RasterInputs,
+    draw: Callable[..., RasterOutputs],
 ) -> tuple[tuple[Any, ...], Seen]:
     """The dialect's answer, and what the engine draws with all meanings."""
     seen: list[Seen] = []
@@ -164,22 +112,6 @@ def _tuple(answered: Any) -> tuple[Any, ...]:
     return tuple(answered) if isinstance(answered, tuple | list) else (answered,)
 
 
-# ---- the shape of a call -----------------------------------------------------------------------
-
-
-def _shape(call: HostCall) -> Iterator[tuple[str, str]]:
-    """Which arguments a call has, and every rule that it sets."""
-    settings = call.settings._asdict() if hasattr(call.settings, "_asdict") else {}
-    for name, value in settings.items():
-        if name not in OF_A_VIEW:
-            yield name, _rule(value)
-    for name, value in call.arguments.items():
-        if isinstance(value, Tensor) and name in (*ARGUMENTS, "dc"):
-            yield name, str(value.numel() and (*value.shape[1:], value.dtype))
-        elif value is not None:
-            yield name, _rule(value)
-
-
 def _rule(value: Any) -> str:
     """A setting's value; of a tensor the number that all its elements are, if there is one."""
     if not isinstance(value, Tensor):
@@ -188,51 +120,6 @@ def _rule(value: Any) -> str:
         return "empty"
     low, high = (float(each) for each in value.detach().float().aminmax())
     return f"all {low:g}" if low == high else f"{value.ndim} dimensions"
-
-
-@dataclass(frozen=True)
-class _Place:
-    """A call in the host's source.
-
-    Attributes:
-        name: function, file and line, for people.
-        values: what the host names the values that come back; () if it keeps them together.
-        unread: numbers of those that its function never reads again.
-    """
-
-    name: str
-    values: tuple[str, ...] = ()
-    unread: frozenset[int] = frozenset()
-
-
-def _place(session: SessionState) -> _Place:
-    """The innermost place in the host's own files that this call comes from."""
-    root = session.repo.root
-    inside, frame = f"{root / session.repo.package}{os.sep}", sys._getframe(1)
-    while frame.f_back is not None:
-        file = frame.f_code.co_filename
-        if file.startswith(inside) and "site-packages" not in file[len(inside) :]:
-            at = f"{frame.f_code.co_name} ({os.path.relpath(file, root)}:{frame.f_lineno})"
-            return _read_place(Path(file), frame.f_lineno, at)
-        frame = frame.f_back
-    return _Place("a call from outside the host")
-
-
-@cache
-def _read_place(file: Path, line: int, at: str) -> _Place:
-    around: dict[type, Any] = {}  # the innermost of each kind, because it is walked to last
-    for node in ast.walk(parsed(file.read_text(errors="replace")) or ast.Module([], [])):
-        if getattr(node, "lineno", line + 1) <= line <= (getattr(node, "end_lineno", 0) or 0):
-            around[type(node)] = node
-    assigned, function = around.get(ast.Assign), around.get(ast.FunctionDef)
-    target = assigned.targets[0] if assigned else None
-    if function is None or not isinstance(target, ast.Tuple):
-        return _Place(at)
-    names = tuple(ast.unparse(each) for each in target.elts)
-    nodes = (node for node in ast.walk(function) if isinstance(node, ast.Name))
-    read = {node.id for node in nodes if isinstance(node.ctx, ast.Load)}
-    unread = {k for k, name in enumerate(names) if name.isidentifier() and name not in read}
-    return _Place(at, names, frozenset(unread))
 
 
 class _OtherwiseError(Exception):
@@ -264,12 +151,8 @@ class _Both:
 class _Trial:
     """Draws one call of the host by both rasterizers and compares them."""
 
-    def __init__(
-        self, session: SessionState, call: SeamCall, drawn: HostCall, place: _Place
-    ) -> None:
-        self.session, self.call, self.drawn, self.place = session, call, drawn, place
-        self.dialect = session.dialect
-        self.engine = session.engine(drawn[self.dialect.means].device)
+    def __init__(self, dialect: Dialect, call: SeamCall, drawn: HostCall, place: Place) -> None:
+        self.dialect, self.call, self.drawn, self.place = dialect, call, drawn, place
         self.where = f"{call.seam} in {place.name}"
         screens = {name for name in drawn.arguments if name.startswith("means2D")}
         self.unfelt = screens if drawn.still else set()  # only densification reads them
@@ -322,9 +205,9 @@ class _Trial:
         finally:
             rasterizer.raster_settings = self.drawn.settings
         named = {**self.drawn.arguments, **given}
-        call = replace(self.drawn, settings=settings, arguments=named, engine=self.engine)
-        with torch._C.DisableTorchFunction():  # see ``rasterizing.directly``
-            draw = partial(self.engine.rasterize, thresholds=None)
+        call = replace(self.drawn, settings=settings, arguments=named)
+        with torch._C.DisableTorchFunction():  # a CPU's detour of the host's calls
+            draw = partial(self.drawn.engine.rasterize, thresholds=None)  # type: ignore[union-attr]
             ours, seen = _packed(
                 self.dialect, call, self.dialect.unpack(call), lambda each, _=0: draw(each)
             )

@@ -5,9 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 
-from fragprune_plugins.hosts.adapter import CommandLine
-from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.hosts.source import Function, HostRepo, imported, nodes
+from fragprune_plugins.adapting import CommandLine, Finding, Function, HostRepo, imported, nodes
 
 GETTERS = ("get_xyz", "get_opacity")
 """Properties of the model that every adapter of this family reads."""

@@ -1,0 +1,73 @@
+"""graphdeco-inria/gaussian-splatting: what adapters of this code of 2023 and its descendants share.
+
+adapter       the base of their adapters: seams, names, files
+call          the rasterizer's call in their source
+densifying    the rows that their densify methods copy
+reading       the getters and the flags that every adapter needs
+kernels       the rule in the CUDA sources of a vendored rasterizer
+plain         whether the PLY that a codebase saves is plain 3DGS
+prover        proves their rasterizers: ``proof`` draws by both, ``likeness`` compares
+stand_ins     modules of ours for their compiled packages
+
+Importing this package imports no torch; ``proof``, ``likeness`` and ``stand_ins`` do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fragprune_graphdeco.adapter import (
+    CLONE,
+    MODEL,
+    SPLIT,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    default,
+    group_names,
+    optimizers,
+)
+from fragprune_graphdeco.call import (
+    CallInSource,
+    RasterizerCall,
+    drawing_functions,
+    read_calls,
+)
+from fragprune_graphdeco.densifying import clones, needy, reaches, splits
+from fragprune_graphdeco.kernels import SURFEL, normal_sources, vendored
+from fragprune_graphdeco.plain import read_models, read_plain, read_selection
+from fragprune_graphdeco.reading import defaults, read_flags, read_getters, training_scripts
+from fragprune_plugins.adapting import HostRepo, Plain, hookimpl
+
+__all__ = [
+    "CLONE",
+    "MODEL",
+    "SPLIT",
+    "SURFEL",
+    "CallInSource",
+    "GraphdecoAdapter",
+    "GraphdecoDialect",
+    "RasterizerCall",
+    "clones",
+    "default",
+    "defaults",
+    "drawing_functions",
+    "group_names",
+    "needy",
+    "normal_sources",
+    "optimizers",
+    "reaches",
+    "read_calls",
+    "read_flags",
+    "read_getters",
+    "read_plain",
+    "read_selection",
+    "splits",
+    "training_scripts",
+    "vendored",
+]
+
+
+@hookimpl
+def fragprune_read_models(repo: HostRepo) -> Sequence[Plain]:
+    """The models of codebases of this family."""
+    return read_models(repo)
