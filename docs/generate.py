@@ -17,11 +17,11 @@ def hooks() -> str:
     """What plugins may answer or be told."""
     from fragprune_plugins.plugins import hookspecs
 
-    intro = """A plugin is a module or an object under the entry-point group `fragprune`. It
-marks functions with `hookimpl` and takes only the arguments it wants. Argument names are checked
-when it is registered, and an unknown hook name is an error. A plugin that fails is named and left
-out, and the others go on. `FRAGPRUNE_BLOCK` and `FRAGPRUNE_ONLY` take comma-separated entry-point
-names.
+    intro = """A plugin is the class of an adapter, or a module or an object with hooks, under the
+entry-point group `fragprune`. It marks functions with `hookimpl` and takes only the arguments it
+wants. Argument names are checked when it is registered, and an unknown hook name is an error. A
+plugin that fails is named and left out, and the others go on. `FRAGPRUNE_BLOCK` and
+`FRAGPRUNE_ONLY` take comma-separated entry-point names.
 
 Every command asks these hooks, and so does a host under `fragprune run`. If a hook says that
 the first answer counts, `None` leaves the answer to the next plugin. Our own answer comes last."""

@@ -7,7 +7,6 @@ which the host regularises.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,13 +14,11 @@ from typing import TYPE_CHECKING
 import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    HostAdapter,
     HostCall,
     HostInfo,
     InputError,
     RasterInputs,
     RasterOutputs,
-    hookimpl,
     revised,
 )
 
@@ -95,9 +92,3 @@ class SurfelSplatting(GraphdecoAdapter):
         from fragprune_plugins.adapting import read_ply
 
         return read_ply(ply, filtered=True)
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of 2D Gaussian Splatting."""
-    register(SurfelSplatting())

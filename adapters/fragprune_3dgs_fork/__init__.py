@@ -32,7 +32,6 @@ from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
     Finding,
-    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -43,7 +42,6 @@ from fragprune_plugins.adapting import (
     Seam,
     Splats,
     UsageError,
-    hookimpl,
 )
 
 if TYPE_CHECKING:
@@ -473,9 +471,3 @@ class ForkAdapter(GraphdecoAdapter):
             "a checkpoint of its own training",
             "Name one with --start_checkpoint, or prune the PLY: fragprune finetune.",
         )
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of forks."""
-    register(ForkAdapter())

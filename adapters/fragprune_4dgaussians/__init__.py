@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -25,7 +24,6 @@ from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCa
 from fragprune_plugins.adapting import (
     CommandLine,
     Door,
-    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -38,7 +36,6 @@ from fragprune_plugins.adapting import (
     Seam,
     SeamCall,
     UsageError,
-    hookimpl,
     revised,
 )
 
@@ -233,9 +230,3 @@ def _part(ply: Path, name: str) -> Any:
 
     with _NETWORK.reading(ply.with_name(f"{name}.pth")) as reading:
         return torch.load(reading.file, map_location="cpu", weights_only=True)
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of 4DGaussians."""
-    register(MovingGaussians())

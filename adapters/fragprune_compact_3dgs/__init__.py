@@ -7,7 +7,7 @@ outside the PLY. Our readers refuse them; the host's own scripts draw them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,6 @@ from typing import Any, NoReturn
 
 from fragprune_graphdeco import GraphdecoAdapter
 from fragprune_plugins.adapting import (
-    HostAdapter,
     HostInfo,
     HostRepo,
     NotComparedError,
@@ -25,7 +24,6 @@ from fragprune_plugins.adapting import (
     Seam,
     SeamCall,
     UsageError,
-    hookimpl,
     revised,
 )
 
@@ -137,9 +135,3 @@ class Compact3DGS(GraphdecoAdapter):
             for layer in codebooks.layers:
                 if bool(layer._codebook.initted):
                     layer.training = False
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of Compact-3DGS."""
-    register(Compact3DGS())

@@ -21,7 +21,6 @@ from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
     Finding,
-    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -31,7 +30,6 @@ from fragprune_plugins.adapting import (
     Seam,
     SeamCall,
     SessionError,
-    hookimpl,
 )
 
 if TYPE_CHECKING:
@@ -294,9 +292,3 @@ def _follow(instruct: Any, numbers: Tensor) -> tuple[Tensor, Tensor]:
         origins = torch.cat([origins, added])
         fresh = torch.cat([fresh, torch.ones_like(added, dtype=torch.bool)])
     return origins.long(), fresh
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of the pip package."""
-    register(GaussianSplatting())

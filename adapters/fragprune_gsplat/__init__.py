@@ -25,7 +25,6 @@ from fragprune_plugins.adapting import (
     Seam,
     SeamCall,
     SessionError,
-    hookimpl,
     revised,
 )
 
@@ -261,9 +260,3 @@ class Gsplat(HostAdapter):
     def view(self, camera: Any) -> int:
         """A key from the camera's numbers, because loaders make a new tensor for every step."""
         return hash(camera.detach().cpu().numpy().tobytes())
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of gsplat."""
-    register(Gsplat())

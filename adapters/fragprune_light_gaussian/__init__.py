@@ -8,7 +8,6 @@ thresholds they count only fragments that remain after truncation, as in the sho
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
-    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -24,7 +22,6 @@ from fragprune_plugins.adapting import (
     RasterOutputs,
     Role,
     Seam,
-    hookimpl,
 )
 
 if TYPE_CHECKING:
@@ -113,9 +110,3 @@ class LightGaussian(GraphdecoAdapter):
     def view(self, camera: Any) -> int:
         """The camera's number, because distillation draws through copies of its cameras."""
         return int(getattr(camera, "uid", id(camera)))
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of LightGaussian."""
-    register(LightGaussian())

@@ -7,7 +7,6 @@ four values, the last two None unless a setting asks for a score.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -16,7 +15,6 @@ from typing import Any
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     EngineError,
-    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -26,7 +24,6 @@ from fragprune_plugins.adapting import (
     Seam,
     SeamCall,
     UsageError,
-    hookimpl,
 )
 
 SCORES = ("f_count", "bw_score", "mw_score", "top_K_dT")
@@ -139,9 +136,3 @@ class LP3DGS(GraphdecoAdapter):
     def model_of(self, call: SeamCall) -> Any:
         """The model; None for the functions that the script calls at its end."""
         return self if call.instance is None else call.instance
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of LP-3DGS."""
-    register(LP3DGS())

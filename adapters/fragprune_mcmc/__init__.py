@@ -18,7 +18,6 @@ from fragprune_plugins.adapting import (
     AlignmentError,
     CommandLine,
     ConfigFile,
-    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -27,7 +26,6 @@ from fragprune_plugins.adapting import (
     RowTrace,
     Seam,
     SeamCall,
-    hookimpl,
     revised,
 )
 
@@ -133,9 +131,3 @@ class MCMC(GraphdecoAdapter):
     def command_line(self, repo: HostRepo) -> CommandLine:
         """Vanilla's flags, and a configuration file whose values override them."""
         return replace(super().command_line(repo), config=ConfigFile("--config"))
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of 3DGS-MCMC."""
-    register(MCMC())

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    HostAdapter,
     HostCall,
     HostInfo,
     RasterInputs,
@@ -25,7 +24,6 @@ from fragprune_plugins.adapting import (
     Role,
     Seam,
     SeamCall,
-    hookimpl,
 )
 
 if TYPE_CHECKING:
@@ -147,9 +145,3 @@ class MiniSplatting(GraphdecoAdapter):
         Seam(Role.PACK, "numpy", "savez_compressed", ("file", "args"), external=True, how=packed),
         Seam(Role.UNPACK, "numpy", "load", ("file",), external=True, how=packed),
     )
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of Mini-Splatting."""
-    register(MiniSplatting())

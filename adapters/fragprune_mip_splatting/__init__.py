@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -27,7 +26,6 @@ from fragprune_plugins.adapting import (
     RasterInputs,
     Role,
     Seam,
-    hookimpl,
     revised,
 )
 
@@ -136,9 +134,3 @@ class MipSplatting(GraphdecoAdapter):
             "dilation": flags.kernel_size,
             "compensation": "mip",
         }
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of Mip-Splatting."""
-    register(MipSplatting())

@@ -26,7 +26,6 @@ from fragprune_plugins.adapting import (
     Role,
     Seam,
     SeamCall,
-    hookimpl,
 )
 
 if TYPE_CHECKING:
@@ -184,9 +183,3 @@ class Nerfstudio(HostAdapter):
         """
         pose = camera.camera_to_worlds.detach().cpu().numpy().tobytes()
         return int.from_bytes(hashlib.blake2b(pose, digest_size=7).digest(), "big")
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of nerfstudio."""
-    register(Nerfstudio())

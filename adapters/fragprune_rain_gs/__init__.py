@@ -8,7 +8,6 @@ no learning rate before iteration 10,000, and an offset one afterwards.
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -18,7 +17,6 @@ import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
-    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -26,7 +24,6 @@ from fragprune_plugins.adapting import (
     RasterInputs,
     RasterOutputs,
     SeamCall,
-    hookimpl,
     revised,
 )
 
@@ -142,9 +139,3 @@ class RainGS(GraphdecoAdapter):
         read = super().photographs(repo, arguments)
         folders = [folder for name, folder in SMALLER.items() if name in str(read.folder)]
         return replace(read, images=folders[-1]) if folders else read
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of RAIN-GS."""
-    register(RainGS())

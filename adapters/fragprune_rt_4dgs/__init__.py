@@ -9,7 +9,6 @@ thresholds.
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
-    HostAdapter,
     HostInfo,
     HostRepo,
     ModelFileError,
@@ -25,7 +23,6 @@ from fragprune_plugins.adapting import (
     ParamGroup,
     SeamCall,
     UsageError,
-    hookimpl,
     revised,
 )
 from fragprune_rt_4dgs.config import YAMLFile
@@ -160,9 +157,3 @@ class RT4DGS(GraphdecoAdapter):
             "chkpnt*.pth, as RT-4DGS saves",
             "Name one with --start_checkpoint.",
         )
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of RT-4DGS."""
-    register(RT4DGS())

@@ -16,14 +16,12 @@ from typing import Any
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     EngineError,
-    HostAdapter,
     HostCall,
     HostInfo,
     RasterInputs,
     RasterOutputs,
     Role,
     Seam,
-    hookimpl,
 )
 
 UNTIL = "--prune_until_iter"
@@ -94,9 +92,3 @@ class SpeedySplat(GraphdecoAdapter):
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The same script without pruning, so that it computes no scores."""
         return script, [*arguments, UNTIL, "0"]
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of Speedy-Splat."""
-    register(SpeedySplat())

@@ -8,7 +8,6 @@ before mid-July 2023 have no checkpoints, so stage 2 is not possible.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,9 @@ from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
     Door,
     Finding,
-    HostAdapter,
     HostInfo,
     HostRepo,
     ModelFileError,
-    hookimpl,
 )
 
 _EXPOSURES = Door(
@@ -96,9 +93,3 @@ class Vanilla3DGS(GraphdecoAdapter):
                 if image in saved:
                     reading.place = image
                     model._exposure[row] = torch.tensor(saved[image]).to(model._exposure)
-
-
-@hookimpl
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Register the adapter of vanilla 3DGS."""
-    register(Vanilla3DGS())

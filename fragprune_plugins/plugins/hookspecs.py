@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from fragprune_plugins.engines import Engine
-    from fragprune_plugins.hosts.adapter import HostAdapter
     from fragprune_plugins.hosts.findings import Match, Plain
     from fragprune_plugins.hosts.source import HostRepo
     from fragprune_plugins.learning.events import PopulationChange, StepStats, Summary
@@ -24,14 +23,6 @@ if TYPE_CHECKING:
 PROJECT = "fragprune"
 hookspec = pluggy.HookspecMarker(PROJECT)
 hookimpl = pluggy.HookimplMarker(PROJECT)
-
-
-@hookspec
-def fragprune_register_adapters(register: Callable[[HostAdapter], None]) -> None:
-    """Offer adapters; called once in a process.
-
-    :param register: the function to call with each adapter.
-    """
 
 
 @hookspec

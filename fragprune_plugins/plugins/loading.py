@@ -75,25 +75,22 @@ class Plugins:
         self.register(ours, ours.NAME)
 
     def register(self, plugin: object, name: str) -> None:
-        """Register a plugin and its adapters; if it fails, register nothing of it.
+        """Register a plugin; if it fails, register nothing of it.
 
         Args:
-            plugin: a module or an object with hooks.
+            plugin: an adapter or its class; or a module or an object with hooks.
             name: unique among the plugins.
 
         Raises:
-            PluginError: the plugin has an unknown hook or argument, or it raised.
+            PluginError: the plugin has an unknown hook or argument.
+            TypeError: an adapter lacks what every adapter has.
         """
-        offered: list[HostAdapter] = []
-
-        def offer(adapter: HostAdapter) -> None:
-            if not isinstance(adapter, HostAdapter):
-                raise TypeError(f"register() takes a HostAdapter, not {adapter!r}")
+        if isinstance(plugin, type) and issubclass(plugin, HostAdapter):
+            plugin = plugin()
+        if isinstance(plugin, HostAdapter):
             for attribute, kind in (("name", str), ("info", HostInfo), ("seams", tuple)):
-                if not isinstance(getattr(adapter, attribute, None), kind):
-                    raise TypeError(f"{adapter!r} has no {attribute} ({kind.__name__})")
-            offered.append(adapter)
-
+                if not isinstance(getattr(plugin, attribute, None), kind):
+                    raise TypeError(f"{type(plugin)!r} has no {attribute} ({kind.__name__})")
         if self._manager.has_plugin(name):
             raise _broken(name, "", "two plugins of this name", "one")
         try:
@@ -103,18 +100,13 @@ class Plugins:
                 for each in hook.get_hookimpls():
                     if each.plugin is plugin and (each.wrapper or each.hookwrapper):
                         raise ValueError(f"{hook.name} is a wrapper")
-            for each in self._implementations(hookspecs.fragprune_register_adapters):
-                if each.plugin is plugin:
-                    _call(each, hookspecs.fragprune_register_adapters, {"register": offer})
-        except BaseException as error:
+        except (pluggy.PluginValidationError, ValueError) as error:
             self._manager.unregister(name=name)
-            if not isinstance(error, pluggy.PluginValidationError | ValueError):
-                raise
             expected = "plain functions for hooks of fragprune, with their arguments"
             raise _broken(name, "", str(error), expected) from error
-        for adapter in offered:
-            _take(self, adapter)
-        self.adapters.sort(key=lambda adapter: adapter.name)
+        if isinstance(plugin, HostAdapter):
+            _take(self, plugin)
+            self.adapters.sort(key=lambda each: each.name)
 
     def remove(self, name: str) -> None:
         """Take back a plugin that was registered under a name."""

@@ -8,7 +8,7 @@ import pytest
 from cli import commands
 
 from fragprune_nerfstudio import running
-from fragprune_plugins.adapting import Finding, HostAdapter, HostInfo, hookimpl
+from fragprune_plugins.adapting import Finding, HostAdapter, HostInfo
 from fragprune_plugins.errors import HostFailed, UsageError
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
@@ -68,12 +68,6 @@ class Studio(HostAdapter):
     means = opacities = dialect
 
 
-class Plugin:
-    @hookimpl
-    def fragprune_register_adapters(self, register):
-        register(Studio())
-
-
 @pytest.fixture(autouse=True)
 def _studio(tmp_path, monkeypatch, plug):
     folder = tmp_path / PACKAGE
@@ -82,7 +76,7 @@ def _studio(tmp_path, monkeypatch, plug):
     (folder / "train.py").write_text(TRAIN)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(Path(__file__).parent)
-    plug(Plugin(), "studio")
+    plug(Studio, "studio")
     yield
     for name in [name for name in sys.modules if name.split(".")[0] == PACKAGE]:
         del sys.modules[name]

@@ -20,7 +20,7 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import select_adapter, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import Plugins, load_plugins
+from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.workbench.check.verdict import judge, models_of
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -74,24 +74,6 @@ def test_the_plugin_on_the_page_works(plug):
     store = ThresholdStore(60)
     store.open(torch.full((60,), 0.5))
     assert torch.equal(thresholds_for(scenes.random_scene(0), store), torch.full((60,), 0.05))
-
-
-def test_hook_fragprune_register_adapters():
-    class Fork(Vanilla3DGS):
-        name = "a-fork"
-
-    class Plugin:
-        @hookimpl
-        def fragprune_register_adapters(self, register):
-            register(Fork())
-
-    class Entry:
-        name, value = "a_fork", "somewhere"
-
-        def load(self):
-            return Plugin()
-
-    assert [a.name for a in load_plugins([Entry()]).adapters] == ["a-fork"]
 
 
 def test_hook_fragprune_select_adapter():

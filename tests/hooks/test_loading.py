@@ -30,24 +30,7 @@ def adapter(name):
     return type("Fork", (Vanilla3DGS,), {"name": name})()
 
 
-def registering(*adapters):
-    """A plugin that offers these."""
-
-    class Plugin:
-        @hookimpl
-        def fragprune_register_adapters(self, register):
-            for each in adapters:
-                register(each)
-
-    return Plugin()
-
-
-def offering(*names):
-    """A plugin that offers adapters of these names."""
-    return registering(*map(adapter, names))
-
-
-GOOD = Entry("good", offering("good-host"))
+GOOD = Entry("good", adapter("good-host"))
 
 
 def codes(plugins):
@@ -70,9 +53,8 @@ class WrongArgument:
         """The hook has no such argument."""
 
 
-class Broken:
-    @hookimpl
-    def fragprune_register_adapters(self, register):
+class Broken(Vanilla3DGS):
+    def __init__(self):
         raise RuntimeError("my table is missing")
 
 
@@ -94,23 +76,21 @@ class Nameless(Vanilla3DGS):
         (ZeroDivisionError("at import"), "ZeroDivisionError"),
         (Misspelt(), "fragprune_trunkate"),
         (WrongArgument(), "tau"),
-        (Broken(), "RuntimeError: my table is missing (test_loading.py:"),
+        (Broken, "RuntimeError: my table is missing"),
+        (HostAdapter, "abstract class HostAdapter"),
         (SystemExit(7), "SystemExit: 7"),
         (Wrapper(), "fragprune_truncate is a wrapper"),
-        (registering("not an adapter"), "takes a HostAdapter, not 'not an adapter'"),
-        (registering(adapter("one"), Vanilla3DGS), "takes a HostAdapter, not <class"),
-        (registering(Nameless()), "has no name (str)"),
+        (Nameless, "has no name (str)"),
     ],
     ids=[
         "import fails",
         "import raises",
         "misspelt hook",
         "unknown argument",
-        "hook raises",
+        "adapter raises",
+        "adapter is abstract",
         "import exits",
         "wrapper",
-        "no adapter",
-        "a class",
         "no name",
     ],
 )
@@ -137,7 +117,7 @@ def test_one_bad_plugin_is_reported_and_stops_no_other(plugin, words, order):
 def test_plugins_are_blocked_by_name_before_they_are_loaded(monkeypatch, variable, value, expected):
     monkeypatch.setenv(variable, value)
     loaded = []
-    entries = [GOOD, Entry("other", offering("other-host"))]
+    entries = [GOOD, Entry("other", adapter("other-host"))]
     for entry in entries:
         load = entry.load
         entry.load = lambda entry=entry, load=load: loaded.append(entry.name) or load()
@@ -150,7 +130,7 @@ def test_plugins_are_blocked_by_name_before_they_are_loaded(monkeypatch, variabl
 
 
 def test_a_second_distribution_under_the_same_name_is_reported():
-    twin = Entry("good", offering("twin-host"), value="twin_module")
+    twin = Entry("good", adapter("twin-host"), value="twin_module")
     plugins = load_plugins([GOOD, twin])
     assert names(plugins) == ["good-host"]
     assert codes(plugins) == [("warning", "plugin-shadowed")]
@@ -163,7 +143,8 @@ def test_the_same_entry_point_listed_twice_is_not_a_conflict():
 
 
 def test_an_adapter_offered_twice_is_reported():
-    plugins = load_plugins([GOOD, Entry("more", offering("good-host", "a-host"))])
+    more = Entry("more", adapter("good-host")), Entry("other", adapter("a-host"))
+    plugins = load_plugins([GOOD, *more])
     assert names(plugins) == ["a-host", "good-host"]
     assert codes(plugins) == [("warning", "adapter-shadowed")]
 
@@ -172,16 +153,29 @@ def test_a_plugin_that_is_refused_leaves_its_name_free():
     loaded = Plugins()
     with pytest.raises(PluginError, match="fragprune_trunkate"):
         loaded.register(Misspelt(), "mine")
-    first = offering("a-host")
+    first = adapter("a-host")
     loaded.register(first, "mine")
     assert names(loaded) == ["a-host"]
-    for second in (offering("b-host"), first):
+    for second in (adapter("b-host"), first):
         with pytest.raises(PluginError, match="plugin mine: two plugins of this name"):
             loaded.register(second, "mine")
     with pytest.raises(PluginError, match="already registered under a different name"):
         loaded.register(first, "yours")
     assert names(loaded) == ["a-host"]
-    assert loaded.answering(hookspecs.fragprune_register_adapters) == ["mine"]
+
+
+def test_an_adapter_may_have_hooks_too():
+    class Chosen(Vanilla3DGS):
+        name = "chosen"
+
+        @hookimpl
+        def fragprune_select_adapter(self, repo, matches):
+            return self.name
+
+    loaded = Plugins()
+    loaded.register(Chosen, "mine")
+    assert names(loaded) == ["chosen"]
+    assert loaded.answering(hookspecs.fragprune_select_adapter) == ["mine"]
 
 
 def test_plugins_are_found_once_in_a_process_and_faults_are_said(monkeypatch, caplog):
