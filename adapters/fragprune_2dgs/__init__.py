@@ -8,7 +8,6 @@ which the host regularises.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import fragprune_graphdeco as graphdeco
@@ -24,8 +23,6 @@ from fragprune_plugins.adapting import (
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from fragprune_plugins.adapting import Model
 
 PACKAGE = "diff_surfel_rasterization"
 
@@ -82,13 +79,8 @@ class SurfelSplatting(GraphdecoAdapter):
     package = PACKAGE
     kernel = graphdeco.SURFEL
     on_gpu = False
+    filtered = True
     calls = (RasterizerCall(outputs=3),)
     own_names = ("utils.point_utils:depth_to_normal", "gaussian_renderer:allmap")
     dialect_type = SurfelDialect
     seams = revised(GraphdecoAdapter.seams, {"GaussianRasterizer.forward": {"module": PACKAGE}})
-
-    def read_model(self, ply: Path) -> Model:
-        """The host's own PLY, with two scales."""
-        from fragprune_plugins.adapting import read_ply
-
-        return read_ply(ply, filtered=True)

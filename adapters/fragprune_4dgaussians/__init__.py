@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 
 import fragprune_graphdeco as graphdeco
 from fragprune_4dgaussians.config import PythonFile
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import DepthDialect, GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
     Door,
@@ -31,7 +31,6 @@ from fragprune_plugins.adapting import (
     NotComparedError,
     ParamGroup,
     RasterInputs,
-    RasterOutputs,
     Role,
     Seam,
     SeamCall,
@@ -54,33 +53,23 @@ _NETWORK = Door(
 
 
 @dataclass(frozen=True)
-class MovingDialect(GraphdecoDialect):
-    """Vanilla's call of 2023 with depth as third output."""
+class MovingDialect(DepthDialect):
+    """Vanilla's call of 2023 with depth."""
+
+    unused = ("open3d", "lpips", "tkinter")
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call; depth is drawn as a feature.
+        """Translate the call.
 
         Matrices of PanopticSports scenes have one more dimension, of size 1.
         """
         s = call.settings
         flat = {name: getattr(s, name).reshape(4, 4) for name in ("viewmatrix", "projmatrix")}
-        inputs = super().unpack(replace(call, settings=s._replace(**flat)))
-        view = flat["viewmatrix"]
-        depth = call["means3D"].detach() @ view[:3, 2:3] + view[3, 2]
-        return replace(inputs, splats=replace(inputs.splats, features=depth), planes=())
-
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
-        """(colour (3, H, W), radii (P,) int32, depth (1, H, W): the sum of z alpha T).
-
-        The host's rasterizer does not differentiate depth.
-        """
-        assert outputs.features is not None  # unpack asked for it
-        return outputs.image, outputs.radii, outputs.features.detach()
+        return super().unpack(replace(call, settings=s._replace(**flat)))
 
     def spares(self) -> dict[str, ModuleType]:
         """Stand-ins for packages that the host imports and does not use to train or draw."""
-        names = ("open3d", "lpips", "tkinter")
-        spares = {name: ModuleType(name, "Stand-in of fragprune: empty.") for name in names}
+        spares = super().spares()
         vars(spares["tkinter"])["W"] = "w"  # imported by name
         return spares
 

@@ -168,6 +168,22 @@ class GraphdecoDialect(Dialect):
         return {self.package: rasterizer, **stand_ins.simple_knn()}
 
 
+@dataclass(frozen=True)
+class DepthDialect(GraphdecoDialect):
+    """A call with depth as third output, the sum of z alpha T; it is not differentiated."""
+
+    def unpack(self, call: HostCall) -> RasterInputs:
+        """Translate the call; depth is one more channel."""
+        inputs, view = super().unpack(call), call.settings.viewmatrix
+        depth = call["means3D"].detach() @ view[:3, 2:3] + view[3, 2]
+        return replace(inputs, splats=replace(inputs.splats, features=depth), planes=())
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
+        """(colour (3, H, W), radii (P,) int32, depth (1, H, W))."""
+        assert outputs.features is not None  # unpack asked for it
+        return outputs.image, outputs.radii, outputs.features.detach()
+
+
 class GraphdecoAdapter(ScriptAdapter):
     """Base of these adapters; a subclass adds its name and the differences of its host.
 
@@ -182,6 +198,7 @@ class GraphdecoAdapter(ScriptAdapter):
         checkpoints: how names of checkpoints begin, before the iteration; a regular expression.
         densifies_until: arguments with the iterations after which the host adds, relocates, prunes
             and resets no Gaussian; () if it does so to its end.
+        filtered: its PLYs have a 3D filter, or flat Gaussians, by whose rules it draws them.
     """
 
     package = "diff_gaussian_rasterization"
@@ -193,6 +210,7 @@ class GraphdecoAdapter(ScriptAdapter):
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
     densifies_until: tuple[str, ...] = ("densify_until_iter",)
+    filtered = False
     checkpoints = "chkpnt"
     seams = (
         *MODEL_SEAMS,
@@ -348,7 +366,7 @@ class GraphdecoAdapter(ScriptAdapter):
         """The host's own PLY."""
         from fragprune_plugins.adapting import read_ply
 
-        return read_ply(ply)
+        return read_ply(ply, filtered=self.filtered)
 
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
         """Write the tuple of ``captured``."""

@@ -12,8 +12,6 @@ from argparse import ArgumentParser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
@@ -32,8 +30,6 @@ from fragprune_plugins.adapting import (
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from fragprune_plugins.adapting import Model
-
 MODEL = "scene.gaussian_model"
 KERNEL_SIZE = 0.1
 
@@ -41,6 +37,8 @@ KERNEL_SIZE = 0.1
 @dataclass(frozen=True)
 class MipDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with the 2D filter's size and a sampling offset for each pixel."""
+
+    unused = ("open3d", "cv2")
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call; densification reads an absolute third column of the gradient."""
@@ -51,12 +49,6 @@ class MipDialect(GraphdecoDialect):
             sample_offsets=call.settings.subpixel_offset,
             absolute_gradient=True,
         )
-
-    def spares(self) -> dict[str, ModuleType]:
-        """Stand-ins for two packages that ``train.py`` imports and does not use."""
-        return {
-            name: ModuleType(name, "Stand-in of fragprune: empty.") for name in ("open3d", "cv2")
-        }
 
 
 ABSOLUTE = ("grads_abs", "grad_abs_threshold")
@@ -89,6 +81,7 @@ class MipSplatting(GraphdecoAdapter):
         for name in ("compute_3D_filter", "get_opacity_with_3D_filter", "filter_3D")
     )
     dialect_type = MipDialect
+    filtered = True
     seams = (
         *revised(
             GraphdecoAdapter.seams,
@@ -110,12 +103,6 @@ class MipSplatting(GraphdecoAdapter):
         """(N,) as they are drawn: dimmed by the 3D filter."""
         opacities: Tensor = model.get_opacity_with_3D_filter
         return opacities.detach().reshape(-1)
-
-    def read_model(self, ply: Path) -> Model:
-        """Read the host's PLY, including its 3D filter."""
-        from fragprune_plugins.adapting import read_ply
-
-        return read_ply(ply, filtered=True)
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """The command's 2D filter, or the default; ``--load_allres`` is refused."""

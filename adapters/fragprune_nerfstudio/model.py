@@ -40,6 +40,7 @@ from fragprune_plugins.learning.interruption import (
     between_steps,
     sigterm_interrupts,
 )
+from fragprune_plugins.learning.stage2 import stored_thresholds
 
 PLAIN = 0.25
 """gsplat's threshold of plain gradients over that of absolute ones, 0.0002 over 0.0008."""
@@ -306,8 +307,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
 
 def thresholds_of(saved: dict[str, Any]) -> dict[str, Any]:
     """The state of the store in what a checkpoint holds."""
-    adam_step, steps = json.loads(saved["plain"])["store"]
-    return {**saved["tensors"], "adam_step": adam_step, "steps": steps}
+    return stored_thresholds(saved["tensors"], json.loads(saved["plain"]))
 
 
 def expect_no_script() -> None:

@@ -10,11 +10,10 @@ from __future__ import annotations
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import DepthDialect, GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
     HostCall,
@@ -22,7 +21,6 @@ from fragprune_plugins.adapting import (
     HostRepo,
     Photographs,
     RasterInputs,
-    RasterOutputs,
     SeamCall,
     revised,
 )
@@ -47,27 +45,15 @@ where it holds several, that of the last."""
 
 
 @dataclass(frozen=True)
-class RainDialect(GraphdecoDialect):
-    """Vanilla's call of 2023 with a dilation of its own, and depth as third output."""
+class RainDialect(DepthDialect):
+    """Vanilla's call of 2023 with a dilation of its own, and depth."""
 
     own_kernels = "compiler"
+    unused = ("wandb",)
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call; depth is one more channel, without gradient."""
-        inputs = super().unpack(call)
-        view = inputs.view.viewmatrix
-        depth = call["means3D"].detach() @ view[:3, 2:3] + view[3, 2]
-        splats = replace(inputs.splats, features=depth)
-        return replace(inputs, splats=splats, dilation=float(call.settings.low_pass))
-
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
-        """(colour (3, H, W), radii (P,) int32, depth (1, H, W): the sum of z alpha T)."""
-        assert outputs.features is not None  # unpack asked for it
-        return outputs.image, outputs.radii, outputs.features.detach()
-
-    def spares(self) -> dict[str, ModuleType]:
-        """A stand-in for wandb, which ``train.py`` imports and does not use."""
-        return {"wandb": ModuleType("wandb", "Stand-in of fragprune: empty.")}
+        """Translate the call."""
+        return replace(super().unpack(call), dilation=float(call.settings.low_pass))
 
 
 def far_splits(call: SeamCall) -> Tensor:

@@ -139,6 +139,9 @@ class Dialect(ABC):
     """What compiled modules inside the host's own package need: a "gpu"; or also CUDA's "compiler",
     because they are compiled when they are imported. "" if there are none."""
 
+    unused: ClassVar[tuple[str, ...]] = ()
+    """Packages that the host imports and never uses, by import name."""
+
     @property
     def prover(self) -> Prover | None:
         """Compares the host's own rasterizer with our engines; None if nothing does."""
@@ -186,5 +189,5 @@ class Dialect(ABC):
         return frozenset(self.modules(lambda call: None))
 
     def spares(self) -> dict[str, ModuleType]:
-        """Stand-ins for packages that the host imports but does not need, for a CPU."""
-        return {}
+        """Stand-ins for packages that the host can do without, for a CPU: those ``unused``."""
+        return {name: ModuleType(name, "Stand-in of fragprune: empty.") for name in self.unused}

@@ -444,9 +444,7 @@ class Stage2:
             SidecarError: the thresholds' parts do not fit together, or are not finite.
             ValueError: a plain value is none that ``state_dict`` gives.
         """
-        state = dict(zip(_STORED, plain["store"], strict=True))
-        state["rim"] = state["rim"] or "hard"
-        self.store.load_state_dict({**tensors, **state})
+        self.store.load_state_dict(stored_thresholds(tensors, plain))
         views = self._ordered(order)
         for name, figures in (("before", self._before), ("after", self._after)):
             for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):
@@ -489,6 +487,12 @@ class Stage2:
             self._held = True
         else:
             target.look(progress, ratio, views)
+
+
+def stored_thresholds(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> dict[str, Any]:
+    """The state of the thresholds in what ``Stage2.state_dict`` gave, for a store of their own."""
+    state = dict(zip(_STORED, plain["store"], strict=True))
+    return {**tensors, **state, "rim": state["rim"] or "hard"}
 
 
 def _fragments_of(outputs: RasterOutputs) -> Tensor:

@@ -163,6 +163,7 @@ KNOWN = {
         "fragprune_plugins.injection.session",
         "fragprune_plugins.learning.events",
         "fragprune_plugins.learning.interruption",
+        "fragprune_plugins.learning.stage2",
         "fragprune_plugins.plugins.loading",
     },
 }

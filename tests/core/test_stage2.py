@@ -12,7 +12,7 @@ from fragprune_plugins.errors import ResetError, UsageError
 from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.pressure import ELASTICITY
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
-from fragprune_plugins.learning.stage2 import Stage2, evenly
+from fragprune_plugins.learning.stage2 import Stage2, evenly, stored_thresholds
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
 from fragprune_plugins.workbench.goals import TIME_FOLLOWS, Faster
@@ -258,6 +258,17 @@ def test_what_the_clock_said_outlives_a_checkpoint():
     assert again.target.timed == it.target.timed == 2
     assert again.progress() == it.progress()
     assert again._ratio([("a", 0)]) == it._ratio([("a", 0)])
+
+
+@pytest.mark.parametrize(("stop", "rim"), [(None, "hard"), (0.01, "soft")])
+def test_what_a_stage_kept_gives_the_thresholds_alone(stop, rim):
+    it = stage(settings=Settings(iterations=9, stop=stop, rim=rim))
+    it.begin(lambda: OPACITIES)
+    tensors, plain = it.state_dict()
+    store = ThresholdStore(0)
+    store.load_state_dict(stored_thresholds(tensors, json.loads(json.dumps(plain))))
+    assert torch.equal(store.values, it.store.values)
+    assert store.rules == {"stop": stop, "rim": rim}
 
 
 def test_no_target_makes_fragments_fewer_than_twentyfold():
