@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError
-from fragprune_plugins.hosts.seams import Role, SeamCall
+from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.state import SessionState
 
 
@@ -122,12 +122,3 @@ def on_still(session: SessionState, call: SeamCall) -> Any:
     if session.standing_still(call.model):
         return call.how()
     return call.run()
-
-
-OF_MODELS: dict[Role, Callable[..., Any]] = {
-    Role.PARENTS: on_parents,
-    Role.KEEP: on_keep,
-    Role.APPEND: on_append,
-    Role.REARRANGE: on_rearrange,
-    Role.STILL: on_still,
-}

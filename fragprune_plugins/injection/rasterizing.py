@@ -17,7 +17,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.dialect import HostCall
-from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
+from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.injection.proofs import proved
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, SessionState
@@ -220,7 +220,7 @@ def proved_answer(
     Raises:
         ProofError: it draws otherwise than our engine.
     """
-    ours, prover = state is not None and state.store.cuts, session.prover
+    ours, prover = state is not None and state.store.cuts, session.dialect.prover
     if not session.prove and not ours:
         return session.dialect.answer
     stands_in = session.stand_ins.answers(call.seam.module)
@@ -315,17 +315,3 @@ def on_metric(session: SessionState, call: SeamCall) -> Any:
             log.warning("%s: cannot load its weights (%s); it is NaN", call.seam, why)
             session.absent.add(call.seam)
     return Unmeasured() if isinstance(call.function, type) else Unmeasured()()
-
-
-def on_answer(session: SessionState, call: SeamCall) -> Any:
-    """Let the adapter answer."""
-    return call.how()
-
-
-OF_CALLS: dict[Role, Callable[..., Any]] = {
-    Role.VIEW: on_view,
-    Role.RASTERIZE: on_rasterize,
-    Role.LOSS: on_loss,
-    Role.METRIC: on_metric,
-    Role.ANSWER: on_answer,
-}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import staging
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, optimizer_state
-from fragprune_plugins.hosts.seams import Role, SeamCall
+from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
@@ -186,17 +185,3 @@ def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
             "Report this with the host's commit: it packs another model.",
         )
     return torch.from_numpy(rows)
-
-
-OF_CALLS: dict[Role, Callable[..., Any]] = {
-    Role.PACK: on_pack,
-    Role.UNPACK: on_unpack,
-}
-
-
-OF_MODELS: dict[Role, Callable[..., Any]] = {
-    Role.SAVE: on_save,
-    Role.LOAD: on_load,
-    Role.CAPTURE: on_capture,
-    Role.RESTORE: on_restore,
-}

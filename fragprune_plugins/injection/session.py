@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,31 @@ from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 
-_OF_CALLS = stepping.OF_CALLS | rasterizing.OF_CALLS | saving.OF_CALLS
-_OF_CALLS |= {Role.SIMILARITY: similarity.on_similarity}
-_OF_MODELS = stepping.OF_MODELS | aligning.OF_MODELS | saving.OF_MODELS
+OF_CALLS: dict[Role, Callable[[SessionState, SeamCall], Any]] = {
+    Role.SCENE: stepping.on_scene,
+    Role.VIEW: rasterizing.on_view,
+    Role.RASTERIZE: rasterizing.on_rasterize,
+    Role.LOSS: rasterizing.on_loss,
+    Role.SIMILARITY: similarity.on_similarity,
+    Role.METRIC: rasterizing.on_metric,
+    Role.ANSWER: lambda session, call: call.how(),
+    Role.PACK: saving.on_pack,
+    Role.UNPACK: saving.on_unpack,
+}
+OF_MODELS: dict[Role, Callable[[SessionState, SeamCall], Any]] = {
+    Role.ATTACH: stepping.on_attach,
+    Role.STEP: stepping.on_step,
+    Role.PARENTS: aligning.on_parents,
+    Role.KEEP: aligning.on_keep,
+    Role.APPEND: aligning.on_append,
+    Role.REARRANGE: aligning.on_rearrange,
+    Role.STILL: aligning.on_still,
+    Role.SAVE: saving.on_save,
+    Role.LOAD: saving.on_load,
+    Role.CAPTURE: saving.on_capture,
+    Role.RESTORE: saving.on_restore,
+}
+"""Handlers of calls that concern a model, which they get."""
 
 _active: Session | None = None
 
@@ -70,7 +92,7 @@ class Session(SessionState):
         # It imports dynamo, which takes a second, and which an optimizer imports anyway.
         enter = disable(self._enter) if self.learn else self._enter
         try:
-            self.install_stand_ins()
+            self.stand_ins.place()
             for seam in self.adapter.seams_for(self.repo):
                 self._ledger.wrap(seam, partial(enter, seam))
             extra = similarity.seam_of(self.repo)
@@ -174,20 +196,10 @@ class Session(SessionState):
             return None
         return self.adapter.save_model(model, self.output, self.start + state.steps)
 
-    def install_stand_ins(self) -> None:
-        """Replace the host's compiled packages by stand-ins, and wrap nothing.
-
-        ``activate`` does this too. ``deactivate`` removes the stand-ins.
-
-        Raises:
-            LateImportError: the host has already imported one of these packages.
-        """
-        self.stand_ins.place()
-
     def _enter(self, seam: Seam, function: Any, instance: Any, args: Any, kwargs: Any) -> Any:
-        """Hand a call to the handler of its role; ``_OF_MODELS`` handlers also get its model."""
+        """Hand a call to the handler of its role."""
         call = SeamCall(seam, function, instance, args, kwargs)
-        if seam.role in _OF_CALLS:
-            return _OF_CALLS[seam.role](self, call)
+        if seam.role in OF_CALLS:
+            return OF_CALLS[seam.role](self, call)
         call.model = self.model_of(call)
-        return call.run() if call.model is None else _OF_MODELS[seam.role](self, call)
+        return call.run() if call.model is None else OF_MODELS[seam.role](self, call)

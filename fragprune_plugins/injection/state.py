@@ -135,7 +135,6 @@ class SessionState:
         self.prove, self.trust = learn if prove is None else prove, trust
         self.proofs: dict[tuple[Any, ...], Proof | None] = {}  # by the shape of the call
         self.dialect = adapter.dialect(repo)
-        self.prover = self.dialect.prover
         self.trained = trained_groups(adapter.groups, self.settings.train)  # names; None for all
         self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # waits for its model
         self.similar: bool | None = None  # compiled similarity agrees with the host's own
@@ -281,11 +280,7 @@ class SessionState:
         store = sidecar.thresholds_of(path, len(means), means.device)
         if store is None:
             return False
-        state = ModelState(store, loaded=weakref.ref(means))
-        self.expect_rows(model, state, str(path))
-        self.models[model] = state
-        self.follow(model, state)
-        self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)
+        self._give(model, store, str(path))
         return True
 
     def take_up(self, model: Any, saved: dict[str, Any]) -> None:
@@ -295,11 +290,14 @@ class SessionState:
             SidecarError: the saved parts do not fit together, or are not finite.
             AlignmentError: the model has another number of rows.
         """
-        means = self.adapter.means(model)
-        store = ThresholdStore(0, means.device, self.settings.threshold_lr)
+        store = ThresholdStore(0, self.adapter.means(model).device, self.settings.threshold_lr)
         store.load_state_dict(saved)
-        state = ModelState(store, loaded=weakref.ref(means))
-        self.expect_rows(model, state, "the saved thresholds")
+        self._give(model, store, "the saved thresholds")
+
+    def _give(self, model: Any, store: ThresholdStore, where: str) -> None:
+        """Give a model thresholds that were read; raises AlignmentError as ``expect_rows`` does."""
+        state = ModelState(store, loaded=weakref.ref(self.adapter.means(model)))
+        self.expect_rows(model, state, where)
         self.models[model] = state
         self.follow(model, state)
         self.plugins.tell(hookspecs.fragprune_attached, model=model, store=store)

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.hosts.seams import Role, SeamCall
+from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.adam import can_be_fused
@@ -272,14 +272,3 @@ def fill_gradients_read(session: SessionState, model: Any) -> None:
         if trained is not None and name not in trained and name in read:
             for parameter in group["params"]:
                 parameter.grad = torch.zeros_like(parameter)
-
-
-OF_CALLS: dict[Role, Callable[..., Any]] = {
-    Role.SCENE: on_scene,
-}
-
-
-OF_MODELS: dict[Role, Callable[..., Any]] = {
-    Role.ATTACH: on_attach,
-    Role.STEP: on_step,
-}

@@ -434,7 +434,7 @@ def alone(*, driver: Host, **options: Any) -> Iterator[Running]:
     """
     with running(driver=driver, active=not driver.draws_alone, learn=False, **options) as host:
         if driver.draws_alone:
-            host.session.install_stand_ins()
+            host.session.stand_ins.place()
         yield host
 
 

@@ -8,9 +8,12 @@ from core.sessions import Model, Role, call, follow, state
 
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.seams import RowTrace
-from fragprune_plugins.injection.aligning import OF_MODELS
+from fragprune_plugins.injection.session import OF_MODELS
 
 LOGITS = -3 + torch.arange(6.0) / 8
+
+
+ROWS = (Role.PARENTS, Role.KEEP, Role.APPEND, Role.REARRANGE, Role.STILL)
 
 
 @pytest.fixture
@@ -83,7 +86,7 @@ def test_a_row_that_differs_in_one_inherited_group_is_no_copy(session):
         parents(session, model, torch.tensor([2]), body)
 
 
-@pytest.mark.parametrize("role", OF_MODELS)
+@pytest.mark.parametrize("role", ROWS)
 def test_a_model_that_is_not_followed_is_the_hosts_own_business(session, role):
     seam = call(Model(3), role, lambda tensors: f"done with {tensors}", "these")
     assert OF_MODELS[role](session, seam) == "done with these"

@@ -74,7 +74,7 @@ def run_script(words: list[str], session: Session, *, activated: bool) -> None:
     known = set(sys.modules)
     with host_process(Path(words[0]), words[1:], "cpu"):
         try:
-            session.activate() if activated else session.install_stand_ins()
+            session.activate() if activated else session.stand_ins.place()
             runpy.run_path(words[0], run_name="__main__")
         finally:
             session.deactivate()
