@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -181,19 +179,6 @@ def test_a_host_that_raises_leaves_one_json_object_on_stdout(tmp_path):
     assert error["found"] == "ZeroDivisionError: division by zero"
     assert error["where"].startswith("train.py:")
     assert "Traceback (most recent call last)" in result.stderr
-
-
-def test_the_package_runs_as_a_module(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "fragprune_plugins", "adapters", "--json"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["adapters"]
 
 
 def test_two_models_of_nobody_need_their_photographs_named(tmp_path):

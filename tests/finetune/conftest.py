@@ -4,7 +4,7 @@ import pytest
 from finetune import tiny
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def truth():
     return tiny.random_model()
 
@@ -17,3 +17,8 @@ def model(truth):
 @pytest.fixture(scope="module")
 def dataset(truth, tmp_path_factory):
     return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth)
+
+
+@pytest.fixture(scope="session")
+def images(truth):
+    return tiny.photographs(truth)

@@ -7,21 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from finetune import tiny
+from finetune.tiny import NAMES, stems
 from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
-
-NAMES = [f"view{i:02d}" for i in range(9)]
-
-
-@pytest.fixture(scope="module")
-def images():
-    return tiny.photographs(tiny.random_model())
-
-
-def stems(shots):
-    return [Path(shot.name).stem for shot in shots]
 
 
 def check(dataset, images):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from finetune import tiny
+from finetune.tiny import NAMES, stems
 from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
@@ -18,17 +19,6 @@ from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.memory import Pictures, Slot
 from fragprune_plugins.workbench.scenes.posed import Posed, split
-
-NAMES = [f"view{i:02d}" for i in range(9)]
-
-
-@pytest.fixture(scope="module")
-def images():
-    return tiny.photographs(tiny.random_model())
-
-
-def stems(shots):
-    return [Path(shot.name).stem for shot in shots]
 
 
 def write_nerfstudio(folder: Path, images, **more: object) -> Path:

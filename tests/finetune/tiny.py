@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,15 @@ def random_model(count: int = 60, degree: int = 1, seed: int = 0) -> Model:
         scaling=-1.6 + 0.2 * normal(count, 3),
         rotation=normal(count, 4),
     )
+
+
+NAMES = [f"view{i:02d}" for i in range(9)]
+"""Of the photographs that are written."""
+
+
+def stems(shots: Iterable[Any]) -> list[str]:
+    """Names without folder and ending."""
+    return [Path(shot.name).stem for shot in shots]
 
 
 def cameras(count: int = 9) -> list[Camera]:

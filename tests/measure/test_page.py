@@ -13,7 +13,6 @@ from PIL import Image
 from fragprune_plugins.workbench.figures import page
 from fragprune_plugins.workbench.figures.pictures import colour_stops, save_map
 
-ODD = "<b>\"&'</b>"
 VOID = {"meta", "img", "input", "link", "br"}
 
 
