@@ -1,6 +1,5 @@
 """RAIN-GS: far splits, wide dilation, an own clock, on a miniature of the host."""
 
-import subprocess
 import sys
 from dataclasses import replace
 from importlib import import_module
@@ -39,10 +38,6 @@ def test_our_rasterizer_answers_before_anything_is_compiled_and_leaves_again(min
         renderer = import_module("gaussian_renderer")
         assert renderer.GaussianRasterizer is ours.GaussianRasterizer
     assert PACKAGE not in sys.modules
-    done = subprocess.run(
-        [sys.executable, "-c", "import gaussian_renderer"], cwd=mini, capture_output=True, text=True
-    )
-    assert "no compiler here" in done.stderr or "simple_knn" in done.stderr
 
 
 def test_the_hosts_own_rasterizer_is_used_where_it_can_be_compiled(mini, monkeypatch):

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-from fragprune_plugins.workbench.demo.scene import make_scene
-
 HOST = Path(__file__).parents[2] / "fragprune_plugins" / "workbench" / "demo" / "host"
 # scipy is there on the CPU: it stands in for the host's compiled nearest neighbours
 OTHERS = ("matplotlib", "skimage", "backports.zstd", "tomli", "cv2", "jinja2")
@@ -14,7 +12,7 @@ from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 host, scene, out = sys.argv[1:]
 sys.path.insert(0, host)
-words = ["--iterations", "12", "--save_iterations", "12", "--test_iterations", "-1"]
+words = ["--iterations", "4", "--save_iterations", "4", "--test_iterations", "-1"]
 command = [host + "/train.py", "-s", scene, "-m", out, *words]
 summary = run(command, RunOptions(device="cpu", settings=Settings(iterations=4)))
 ours = [name for name in sys.modules if name.startswith("fragprune_plugins.workbench")]
@@ -22,9 +20,8 @@ print(json.dumps([ours, sorted(sys.modules), summary.iterations]))
 """
 
 
-def test_a_host_run_loads_no_module_of_the_workbench(tmp_path, python):
-    make_scene(tmp_path / "scene", views=10, width=64, points=300)
-    ours, loaded, steps = python(PROGRAM, HOST, tmp_path / "scene", tmp_path / "out")
+def test_a_host_run_loads_no_module_of_the_workbench(tmp_path, photographs, python):
+    ours, loaded, steps = python(PROGRAM, HOST, photographs, tmp_path / "out")
     assert steps == 4
     assert ours == []
     assert not [name for name in OTHERS if name in loaded]
