@@ -23,13 +23,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
     from fragprune_plugins.plugins.hooks import engine_for, rasterize
-    from fragprune_plugins.types import (
-        Footprints,
-        RasterInputs,
-        RasterOutputs,
-        Splats,
-        View,
-    )
+    from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats, View
     from fragprune_plugins.workbench.distributed.processes import part_of, whole_of
     from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
     from fragprune_plugins.workbench.figures.evaluate import measure
@@ -42,7 +36,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.ranks import joined
     from fragprune_plugins.workbench.scenes.cameras import load_cameras
     from fragprune_plugins.workbench.scenes.dataset import load_dataset
-    from fragprune_plugins.workbench.scenes.itself import own_pictures
+    from fragprune_plugins.workbench.scenes.itself import own_pictures, with_own_pictures
 
 __version__ = VERSION
 
@@ -66,7 +60,7 @@ _NAMES = {
     "workbench.ranks": "joined",
     "workbench.scenes.cameras": "load_cameras",
     "workbench.scenes.dataset": "load_dataset",
-    "workbench.scenes.itself": "own_pictures",
+    "workbench.scenes.itself": "own_pictures with_own_pictures",
 }
 """By module, the names that it gives this package."""
 
@@ -111,6 +105,7 @@ __all__ = [
     "render_view",
     "save",
     "whole_of",
+    "with_own_pictures",
 ]
 
 

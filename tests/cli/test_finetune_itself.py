@@ -9,6 +9,8 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
+from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.files import records
 from fragprune_plugins.learning.pressure import OWN_PRESSURE
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.types import RasterInputs
@@ -185,3 +187,45 @@ def test_in_python_needs_no_cameras(scene):
     image = dataset.test[0].image
     assert image.shape == (3, 800, 800)
     assert float(image.max()) > 0.1
+
+
+def test_a_share_of_own_pictures_stands_beside_the_photographs(scene, tmp_path):
+    data, path, model = scene
+    photographs = fp.load_dataset(data)
+    mixed = fp.with_own_pictures(photographs, path, 0.5)
+    count = len(photographs.train)
+    assert [shot.target for shot in mixed.train] == ["photographs"] * count + ["itself"] * count
+    assert [shot.name for shot in mixed.test] == [shot.name for shot in photographs.test]
+    own = mixed.train[-1]
+    with torch.no_grad():
+        shown = fp.rasterize(RasterInputs(own.view, model.splats())).image
+    assert torch.equal(own.image, shown)
+
+
+def test_photographs_that_look_apart_have_nothing_beside_them(scene):
+    data, path, _ = scene
+    photographs = fp.load_dataset(data)
+    with pytest.raises(DatasetError, match="no two of which"):
+        fp.with_own_pictures(replace(photographs, train=photographs.train[:1]), path, 0.5)
+
+
+def test_the_command_learns_from_both(scene, tmp_path):
+    data, path, _ = scene
+    out, plain = tmp_path / "out.ply", tmp_path / "plain.ply"
+    arguments = ("finetune", path, "--data", data, "--iters", 20, "--threads", 1)
+    text = run(*arguments, "--out", out, "--self", 0.5, "--keep", "auto").stdout
+    assert "50% of the training views were the model's own pictures" in text
+    run(*arguments, "--out", plain, "--keep", "auto")
+    assert not torch.equal(fp.load(out).xyz, fp.load(plain).xyz)
+    record = records.beside(out).data
+    assert record["target"] == "photographs"
+    assert record["self"] == 0.5
+    assert record["settings"]["itself"] is False
+
+
+@pytest.mark.parametrize("value", ["model.ply", "1.5", "0.95", "0"])
+def test_a_share_is_a_number_below_one(scene, value, tmp_path):
+    _, path, _ = scene
+    result = run("finetune", path, "--out", tmp_path / "out.ply", "--self", value)
+    assert result.exit_code == 2
+    assert "is no share of the views" in result.stderr

@@ -13,6 +13,7 @@ from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.generated import (
     around,
+    beside,
     between,
     bounds,
     hold_out,
@@ -50,7 +51,7 @@ def test_the_ends_of_the_way_are_the_cameras(a, b):
             )
 
 
-@given(POSE, POSE, st.floats(0, 1))
+@given(POSE, POSE, st.floats(-1, 1))
 def test_between_two_cameras_a_rotation_is_one_and_the_centre_on_the_line(a, b, t):
     view = interpolate(a, b, t)
     rotation = view.viewmatrix[:3, :3]
@@ -59,8 +60,9 @@ def test_between_two_cameras_a_rotation_is_one_and_the_centre_on_the_line(a, b, 
     torch.testing.assert_close(view.campos, torch.lerp(a.campos, b.campos, t))
     at_itself = torch.cat([view.campos, torch.ones(1)]) @ view.viewmatrix
     torch.testing.assert_close(at_itself[:3], torch.zeros(3).double(), atol=1e-9, rtol=0)
-    assert angle(a, view) == pytest.approx(t * angle(a, b), abs=1e-6)
-    assert angle(view, b) == pytest.approx((1 - t) * angle(a, b), abs=1e-6)
+    assert angle(a, view) == pytest.approx(abs(t) * angle(a, b), abs=1e-6)
+    if t >= 0:
+        assert angle(view, b) == pytest.approx((1 - t) * angle(a, b), abs=1e-6)
 
 
 def test_the_lens_and_the_background_are_the_first_camera_s():
@@ -96,8 +98,23 @@ def test_a_camera_nearby_that_looks_away_is_not_near():
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_nothing_lies_between_fewer_than_two(count):
-    assert between(ring()[:count]) == []
+def test_nothing_lies_between_or_beside_fewer_than_two(count):
+    assert between(ring()[:count]) == beside(ring()[:count], 3) == []
+
+
+def test_beside_each_camera_lie_others_on_the_way_to_its_neighbours_and_away_from_them():
+    cameras = dict(ring())
+    step = angle(*(cameras[name] for name in ("view0", "view1")))
+    found = beside(ring(), 60)
+    turns = [angle(cameras[name.split("~")[0]], view) for name, view in found]
+    assert len({name for name, _ in found}) == 60
+    assert max(turns) < 0.6 * 2 * step + 1e-6
+    assert max(turns) > 0.6 * step
+    middle = torch.stack([view.campos for view in cameras.values()]).mean(dim=0)
+    radius = float((cameras["view0"].campos - middle).norm())
+    far = [float((view.campos - middle).norm()) > radius for _, view in found]
+    assert any(far)  # beyond a camera, off the ring
+    assert not all(far)
 
 
 def test_two_cameras_have_one_way_each():
@@ -113,7 +130,11 @@ def same(one, other):
 
 def test_a_seed_gives_the_same_cameras_and_another_seed_others():
     model = tiny.random_model()
-    for make in (lambda seed: around(model, seed=seed), lambda seed: between(ring(), seed=seed)):
+    for make in (
+        lambda seed: around(model, seed=seed),
+        lambda seed: between(ring(), seed=seed),
+        lambda seed: beside(ring(), 9, seed=seed),
+    ):
         assert same(make(3), make(3))
         assert not same(make(3), make(4))
 

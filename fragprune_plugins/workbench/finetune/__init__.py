@@ -49,18 +49,34 @@ def _share(
     return share
 
 
+def _own(ctx: click.Context, param: click.Parameter, value: str | float | None) -> float | None:
+    """The share of own pictures: 1 without a number, or 0 to 0.9."""
+    if value is None or value is False:
+        return None
+    try:
+        share = float(value)
+    except ValueError:
+        share = 0.0
+    if share == 1 or 0 < share <= 0.9:
+        return share
+    raise click.BadParameter(
+        f"{value!r} is no share of the views with 0 < X <= 0.9, such as 0.5. For own pictures "
+        "alone write --self behind MODEL, without a number."
+    )
+
+
 _PARTS = "options that each process can follow with a part of the Gaussians"
 
 RULES = (
     *LEARNING_APART,
     Alone(("--data", "--cameras"), "one source of cameras"),
-    Needs("--cameras", ("--self",), "the model's own pictures, which those cameras show"),
+    Needs("--cameras", ("--self 1.0",), "the model's own pictures alone, which those cameras show"),
     Alone(("--self", "--max-drop"), "photographs, and with them a control to lose against"),
     Alone(
         ("--self", "--control"),
         "something to learn: without truncation the model is its own target already",
     ),
-    Alone(("--self", "--keep auto"), "photographs, whose error says what can be spared"),
+    Alone(("--self 1.0", "--keep auto"), "photographs, whose error says what can be spared"),
     *apart("--shard-gaussians", "--self", "--portable", expected=_PARTS),
     *apart("--shard-gaussians", "--max-drop", "--keep", "--drop-invisible", expected=_PARTS),
 )
@@ -78,10 +94,14 @@ RULES = (
 @click.option(
     "--self",
     "itself",
-    is_flag=True,
+    metavar="[SHARE]",
+    is_flag=False,
+    flag_value="1",
+    callback=_own,
     help="Learn from MODEL's own pictures instead of photographs. Cameras: those of --data or "
     "--cameras; else all around MODEL, which suits an object. Indoor scenes "
-    "and streets need --cameras: generated ones stay outside.",
+    "and streets need --cameras: generated ones stay outside. With a SHARE such as 0.5, so many "
+    "views are own pictures beside the photographs: for a MODEL that was trained to its end.",
 )
 @click.option(
     "--cameras",
@@ -140,7 +160,8 @@ def command(**options: Any) -> Report | None:
 
     With --self no photograph is read: MODEL's own pictures are what it must go on showing, also
     between the cameras. PSNR is against those pictures then. The defaults are 1000 iterations at
-    --pressure 1.5e-4.
+    --pressure 1.5e-4. With --self 0.5 half of the views are such pictures, from cameras beside
+    those of the photographs, and the others photographs.
 
     \b
     Examples:
@@ -150,6 +171,7 @@ def command(**options: Any) -> Report | None:
       fragprune finetune point_cloud.ply --data scene --out good.ply --max-drop 0.05
       fragprune finetune point_cloud.ply --data scene --out zero.ply --control
       fragprune finetune point_cloud.ply --data scene --out light.ply --portable
+      fragprune finetune point_cloud.ply --data scene --out whole.ply --self 0.5
       fragprune finetune statue.ply --self --out pruned.ply
       fragprune finetune statue.spz --self --out pruned.spz
       fragprune finetune point_cloud.ply --self --cameras cameras.json --out pruned.ply

@@ -39,6 +39,7 @@ class Finetuned:
         start: the model as it came in.
         result: what was learned.
         saved: the model in ``out``: of all processes, where they divided it.
+        itself: the share of training views that are the model's own pictures; None for none.
         keep: the share of Gaussians to learn with, or how to choose it; None for all.
         removed: Gaussians that went before learning.
         found: what a search for the strongest truncation found; None without one.
@@ -53,6 +54,7 @@ class Finetuned:
     start: Candidate
     result: FinetuneResult
     saved: Model
+    itself: float | None
     keep: float | Literal["auto"] | None
     removed: int
     found: Bounded | None
@@ -121,6 +123,7 @@ class Finetuned:
             "before": before,
             "after": after,
             "untruncated": without[0] if without else None,
+            "self": self.itself,
             "keep": self.keep,
             "dropped": self.dropped,
             "speedup": done.speedup,
@@ -170,6 +173,11 @@ class Finetuned:
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
             lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
+        if self.itself is not None and self.itself < 1:
+            lines.append(
+                f"{self.itself:.0%} of the training views were the model's own pictures, from "
+                "cameras beside those of the photographs."
+            )
         if self.keep is not None:
             lines.append(
                 f"Removed {self.removed:,} of {len(self.start.model):,} Gaussians before learning, "

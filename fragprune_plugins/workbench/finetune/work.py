@@ -39,6 +39,7 @@ from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
 from fragprune_plugins.workbench.pruning.visibility import visible
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
+from fragprune_plugins.workbench.scenes.itself import with_own_pictures
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Asked:
 
     model: Path
     out: Path
-    itself: bool
+    itself: float | None
     cameras: Path | None
     scene: SceneOptions
     settings: Settings
@@ -117,7 +118,7 @@ def finetune(**options: Any) -> Report | None:
 def _open(asked: Asked) -> _Opened:
     """Read the model and its photographs, or draw its pictures."""
     scene, settings, photographs = asked.scene, asked.settings, None
-    if scene.data is not None or not asked.itself:
+    if scene.data is not None or asked.itself != 1:
         remedy = "Pass --data FOLDER with photographs; without any, --self."
         photographs = photographs_for(asked.model, scene, remedy=remedy)
     engine, device = open_engine(asked.engine)
@@ -125,11 +126,16 @@ def _open(asked: Asked) -> _Opened:
     truncation = settings.goal.presses and not asked.no_truncation
     where = "cpu" if asked.shard else device
     whole = models.load(asked.model, truncation=truncation, device=where)
-    if asked.itself:
+    if asked.itself == 1:
         dataset = pictures_of(whole, scene, asked.cameras, engine, seed=asked.seed)
     else:
         assert photographs is not None
         dataset = load_photographs(photographs)
+        if asked.itself:
+            dataset = dataset.to(whole.device)
+            dataset = with_own_pictures(
+                dataset, whole, asked.itself, engine=engine, seed=asked.seed
+            )
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
     configuration |= {"drop_invisible": asked.drop, "keep": asked.keep}
@@ -168,6 +174,7 @@ def _learned(opened: _Opened, ranks: Ranks) -> tuple[Finetuned, Engine]:
         start=start,
         result=result,
         saved=saved.model,
+        itself=asked.itself,
         keep=asked.keep,
         removed=len(whole) - len(kept),
         found=found,
@@ -187,7 +194,7 @@ def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | N
     if asked.drop:
         over = _drop_invisible(over, opened.dataset, opened.engine)
     figures = measured or over.measured(opened.dataset, opened.engine)
-    pictures = asked.scene.as_record(asked.cameras) if asked.itself else None
+    pictures = asked.scene.as_record(asked.cameras) if asked.itself == 1 else None
     report = over.report(
         figures, opened.dataset, opened.photographs, opened.configuration, pictures
     )

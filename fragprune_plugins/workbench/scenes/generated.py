@@ -1,4 +1,4 @@
-"""Cameras that nobody took a photograph with: around a splat, inside of it, and between given ones.
+"""Cameras that nobody took a photograph with: around a splat, inside of it, near given ones.
 
 They are the same for the same seed. Cameras around a splat suit an object. Inside one they need
 free space, which the file does not record: ``audit.placing`` estimates it.
@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import torch
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError
@@ -36,6 +36,7 @@ _FOV, _WIDE = 50.0, 75.0  # degrees; rooms are looked at with wide lenses
 _LEVEL = 0.5  # sine of the steepest look from inside: 30 degrees
 _NEIGHBOURS = 4
 _BETWEEN = (0.1, 0.9)  # of the way; nearer to a camera is its own picture again
+_BESIDE = (-0.6, 0.6)  # of the way; visitors leave the path of the photographs on both sides
 
 
 def bounds(splat: Model) -> tuple[Tensor, float]:
@@ -118,10 +119,40 @@ def between(cameras: Named, *, seed: int = 0) -> Named:
     Returns:
         Up to four for each camera: none towards one that looks more than a quarter turn away.
     """
+    stream = random.Random(seed)
+    return [
+        (f"{name}~{cameras[j][0]}", interpolate(view, cameras[j][1], stream.uniform(*_BETWEEN)))
+        for (name, view), near in zip(cameras, _neighbours(cameras), strict=True)
+        for j in near
+    ]
+
+
+def beside(cameras: Named, count: int, *, seed: int = 0) -> Named:
+    """Cameras next to given ones: on the way to one nearby, or on the way away from it.
+
+    Args:
+        cameras: the given ones, on one device.
+        count: of cameras; they take turns at being next to each given one.
+        seed: of which one is nearby, and how far the way is.
+
+    Returns:
+        So many; none if no two of the given ones look the same way.
+    """
+    stream, found = random.Random(seed), []
+    near = [(i, others) for i, others in enumerate(_neighbours(cameras)) if others]
+    for turn in range(count if near else 0):
+        i, others = near[turn % len(near)]
+        other = cameras[stream.choice(others)][1]
+        view = interpolate(cameras[i][1], other, stream.uniform(*_BESIDE))
+        found.append((f"{cameras[i][0]}~{turn // len(near)}", view))
+    return found
+
+
+def _neighbours(cameras: Named) -> list[list[int]]:
+    """Of each camera those near it, in place and in what they look at, the nearest first."""
     views = [view for _, view in cameras]
     if len(views) < 2:
-        return []
-    stream = random.Random(seed)
+        return [[] for _ in views]
     centres = torch.stack([view.campos for view in views])
     looks = torch.stack([view.viewmatrix[:3, 2] for view in views])
     apart = torch.cdist(centres, centres)
@@ -130,15 +161,7 @@ def between(cameras: Named, *, seed: int = 0) -> Named:
     apart = apart / max(typical, 1e-9) + 1 - agree
     apart[agree < 0] = math.inf  # the way there would look at what neither sees
     nearest = apart.fill_diagonal_(math.inf).argsort(dim=1)[:, :_NEIGHBOURS]
-    return [
-        (
-            f"{cameras[i][0]}~{cameras[j][0]}",
-            interpolate(views[i], views[j], stream.uniform(*_BETWEEN)),
-        )
-        for i, near in enumerate(nearest.tolist())
-        for j in near
-        if apart[i, j] < math.inf
-    ]
+    return [[j for j in near if apart[i, j] < math.inf] for i, near in enumerate(nearest.tolist())]
 
 
 def interpolate(a: View, b: View, t: float) -> View:
@@ -150,11 +173,12 @@ def interpolate(a: View, b: View, t: float) -> View:
     Args:
         a: where ``t`` is 0.
         b: where ``t`` is 1.
-        t: in [0, 1].
+        t: 0 to 1 on the way; outside, straight on and turning on.
     """
     one, other = (view.viewmatrix.detach().double().cpu() for view in (a, b))
     ends = Rotation.from_matrix([one[:3, :3].T.numpy(), other[:3, :3].T.numpy()])
-    rotation = torch.from_numpy(Slerp([0.0, 1.0], ends)(t).as_matrix())
+    turn = Rotation.from_rotvec(t * (ends[0].inv() * ends[1]).as_rotvec())
+    rotation = torch.from_numpy((ends[0] * turn).as_matrix())
     centre = torch.lerp(a.campos.double().cpu(), b.campos.double().cpu(), t)
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3] = rotation.T
