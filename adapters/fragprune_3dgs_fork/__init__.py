@@ -286,7 +286,7 @@ class ForkAdapter(GraphdecoAdapter):
         plain = graphdeco.read_plain(repo)
         others = [each for each in plain.reasons if each not in plain.moved]
         if others or not plain.model:
-            return [Finding("error", "not-plain", MODEL, others[0], "a plain 3DGS model")]
+            return [Finding.error("not-plain", MODEL, others[0], "a plain 3DGS model")]
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
         return [
@@ -302,7 +302,7 @@ class ForkAdapter(GraphdecoAdapter):
         missing = [group.name for group in self.groups if group.name not in found]
         at = repo.place(MODEL, f"{CLASS}.training_setup")
         return [
-            Finding("error", "param-groups", at, f"no group {name}", "the groups of 3DGS")
+            Finding.error("param-groups", at, f"no group {name}", "the groups of 3DGS")
             for name in missing
         ]
 
@@ -330,16 +330,7 @@ class ForkAdapter(GraphdecoAdapter):
                 Seam(Role.VIEW, draw.module, draw.function, (draw.camera, draw.model))
                 for draw in fork.draws
             ),
-            *(
-                Seam(
-                    Role.RASTERIZE,
-                    package,
-                    "GaussianRasterizer.forward",
-                    ("means3D", "means2D", "opacities"),
-                    external=True,
-                )
-                for package in fork.packages
-            ),
+            *map(graphdeco.rasterizer_seam, fork.packages),
         )
 
     def dialect(self, repo: HostRepo) -> ForkDialect:

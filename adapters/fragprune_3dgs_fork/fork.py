@@ -124,7 +124,7 @@ class Fork:
 
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
         """Add an error."""
-        self.findings.append(Finding("error", code, where, found, expected))
+        self.findings.append(Finding.error(code, where, found, expected))
 
     @property
     def errors(self) -> list[Finding]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, rasterizer_seam
 from fragprune_plugins.adapting import (
     AlignmentError,
     CommandLine,
@@ -160,13 +160,7 @@ class GaussianSplatting(GraphdecoAdapter):
         Seam(Role.ATTACH, f"{TRAINER}.base", "BaseTrainer.__init__", ("model",), how=optimizers),
         Seam(Role.STEP, f"{TRAINER}.abc", "AbstractTrainer.update_learning_rate"),
         Seam(Role.VIEW, MODEL, "GaussianModel.render", ("viewpoint_camera",)),
-        Seam(
-            Role.RASTERIZE,
-            RASTERIZER,
-            "GaussianRasterizer.forward",
-            ("means3D", "means2D", "opacities"),
-            external=True,
-        ),
+        rasterizer_seam(RASTERIZER),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(Role.METRIC, f"{PACKAGE}.utils.lpipsPyTorch", "lpips"),
         Seam(
@@ -193,10 +187,9 @@ class GaussianSplatting(GraphdecoAdapter):
             revision = Finding("info", "revision", repo.package, repo.commit)
             return [revision, *super().fingerprint(repo)]
         return [
-            Finding(
-                "error",
+            Finding.error(
                 "other-host",
-                str(repo.root),
+                repo.root,
                 "a folder",
                 f"the installed package {PACKAGE}, as python -m {PACKAGE}.train runs it",
             )

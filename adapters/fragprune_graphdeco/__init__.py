@@ -26,6 +26,7 @@ from fragprune_graphdeco.adapter import (
     default,
     group_names,
     optimizers,
+    rasterizer_seam,
 )
 from fragprune_graphdeco.call import (
     CallInSource,
@@ -57,6 +58,7 @@ __all__ = [
     "needy",
     "normal_sources",
     "optimizers",
+    "rasterizer_seam",
     "reaches",
     "read_calls",
     "read_flags",

@@ -69,6 +69,12 @@ def _model(
     return Seam(role, MODEL, f"GaussianModel.{method}", needs, how=how)
 
 
+def rasterizer_seam(package: str, method: str = "forward") -> Seam:
+    """The seam at a rasterizer of this family, or at another of its methods that draw."""
+    needs = ("means3D", "means2D", "opacities")
+    return Seam(Role.RASTERIZE, package, f"GaussianRasterizer.{method}", needs, external=True)
+
+
 _GIVEN = ("grads", "grad_threshold", "scene_extent")
 CLONE = _model(Role.PARENTS, "densify_and_clone", *_GIVEN, how=clones)
 SPLIT = _model(Role.PARENTS, "densify_and_split", *_GIVEN, "N", how=splits)
@@ -216,13 +222,7 @@ class GraphdecoAdapter(ScriptAdapter):
         *MODEL_SEAMS,
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(Role.VIEW, RENDERER, "render", ("viewpoint_camera", "pc")),
-        Seam(
-            Role.RASTERIZE,
-            package,
-            "GaussianRasterizer.forward",
-            ("means3D", "means2D", "opacities"),
-            external=True,
-        ),
+        rasterizer_seam(package),
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
@@ -255,7 +255,7 @@ class GraphdecoAdapter(ScriptAdapter):
         if found in ((), known):
             return []
         at, expected = f"{MODEL}:{setup} ({repo.place(MODEL, setup)})", ", ".join(known)
-        return [Finding("error", "param-groups", at, ", ".join(found), expected)]
+        return [Finding.error("param-groups", at, ", ".join(found), expected)]
 
     def _calls(self, repo: HostRepo) -> list[Finding]:
         """An error for each call of the rasterizer that is not in ``calls``."""
@@ -275,8 +275,7 @@ class GraphdecoAdapter(ScriptAdapter):
                 nothing = "no settings passed by keyword, or they are made elsewhere"
                 found.append((name, repo.place(renderer, name), nothing, expected))
         return [
-            Finding(
-                "error",
+            Finding.error(
                 "rasterizer-call",
                 f"{renderer}:{name} ({at})",
                 what,
@@ -297,7 +296,7 @@ class GraphdecoAdapter(ScriptAdapter):
     def other_host(self, repo: HostRepo, found: list[str]) -> list[Finding]:
         """One error with all differences from this host, if there are any."""
         at, expected = str(repo.root), f"a {self.info.title} checkout"
-        return [Finding("error", "other-host", at, ", ".join(found), expected)] if found else []
+        return [Finding.error("other-host", at, ", ".join(found), expected)] if found else []
 
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
         """The dialect for the arguments and outputs of the first of ``calls`` in the source."""

@@ -31,8 +31,7 @@ def read_getters(repo: HostRepo, module: str, model: str = "GaussianModel") -> l
         if what:
             found.append((name, what))
     return [
-        Finding(
-            "error",
+        Finding.error(
             "model-getter",
             f"{module}:{model}.{name} ({repo.place(module, f'{model}.{name}')})",
             what,
@@ -118,7 +117,7 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
         if missing:
             found.append((script, f"no {', '.join(missing)}", "the flags that we set"))
     return [
-        Finding("error", "flags", script, what, expected, "Its training cannot be driven.")
+        Finding.error("flags", script, what, expected, "Its training cannot be driven.")
         for script, what, expected in found
     ]
 

@@ -194,10 +194,9 @@ class Gsplat(HostAdapter):
         if repo.package == PACKAGE:
             return [Finding("info", "revision", PACKAGE, repo.commit)]
         return [
-            Finding(
-                "error",
+            Finding.error(
                 "other-host",
-                str(repo.root),
+                repo.root,
                 "a folder",
                 "the installed package gsplat, or a script that imports it",
             )

@@ -202,11 +202,6 @@ class GsplatDialect(Dialect):
         drawn = [draw(each, part) for part, each in enumerate((inputs, *inputs.others))]
         return self._pack(drawn, inputs, call)
 
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
-        """One camera's (colors, alphas, meta)."""
-        inputs = self.unpack(call)
-        return self._pack([outputs], inputs, call)
-
     def _pack(self, drawn: list[RasterOutputs], inputs: Cameras, call: HostCall) -> Any:
         """(colors (C, H, W, X), alphas (C, H, W, 1), meta); X by ``render_mode``."""
         given = call.arguments

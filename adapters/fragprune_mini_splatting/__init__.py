@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
 SCORING = "diff_gaussian_rasterization_ms"
-FORWARD, DEPTH = "GaussianRasterizer.forward", "GaussianRasterizer.render_depth"
+DEPTH = "GaussianRasterizer.render_depth"
 COMPRESSED = "compressed_gs.npz"
 SCRIPTS = ("ms/train.py", "ms_d/train.py", "gs/train.py")
 
@@ -127,10 +127,8 @@ class MiniSplatting(GraphdecoAdapter):
         *GraphdecoAdapter.seams,
         Seam(Role.VIEW, RENDERER, "render_imp", ("viewpoint_camera", "pc")),
         Seam(Role.VIEW, RENDERER, "render_depth", ("viewpoint_camera", "pc")),
-        *(
-            Seam(Role.RASTERIZE, SCORING, name, ("means3D", "means2D", "opacities"), external=True)
-            for name in (FORWARD, DEPTH)
-        ),
+        graphdeco.rasterizer_seam(SCORING),
+        graphdeco.rasterizer_seam(SCORING, "render_depth"),
         Seam(
             Role.PARENTS,
             MODEL,

@@ -134,10 +134,9 @@ class Nerfstudio(HostAdapter):
             return [Finding("info", "revision", PACKAGE, repo.commit)]
         found = "no gsplat beside it" if repo.package == PACKAGE else "a folder"
         return [
-            Finding(
-                "error",
+            Finding.error(
                 "other-host",
-                str(repo.root),
+                repo.root,
                 found,
                 "the installed packages nerfstudio and gsplat",
                 f"Train with: ns-train {METHOD}",

@@ -59,8 +59,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         there = [name for name in names if repo.function(graphdeco.MODEL, f"GaussianModel.{name}")]
         if there != ["training_setup"]:
             return Finding("info", "revision", str(repo.root), self.revision(repo))
-        return Finding(
-            "error",
+        return Finding.error(
             "revision",
             repo.place(graphdeco.MODEL, "GaussianModel"),
             "neither capture nor restore, as vanilla 3DGS was until 14 July 2023",

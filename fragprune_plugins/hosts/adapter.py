@@ -311,8 +311,7 @@ class HostAdapter(ABC):
             findings = [*self.fingerprint(repo), *check_seams(repo, self.seams_for(repo))]
         except Exception as error:  # the adapter's own; others are still tried
             findings = [
-                Finding(
-                    "error",
+                Finding.error(
                     "adapter-failed",
                     f"adapter {self.name}",
                     f"{type(error).__name__}: {error}",

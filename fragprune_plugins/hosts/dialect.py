@@ -159,9 +159,12 @@ class Dialect(ABC):
         """
         return None
 
-    @abstractmethod
     def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
-        """Translate outputs into the tuple that the host expects, None where it reads none."""
+        """Translate outputs into the tuple that the host expects, None where it reads none.
+
+        A dialect has this, or its own ``answer``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} needs pack() or answer()")
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]

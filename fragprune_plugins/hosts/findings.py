@@ -17,6 +17,13 @@ class Finding:
     expected: str = ""
     remedy: str = ""
 
+    @classmethod
+    def error(
+        cls, code: str, where: object, found: str, expected: str = "", remedy: str = ""
+    ) -> Finding:
+        """A finding that speaks against the host."""
+        return cls("error", code, str(where), found, expected, remedy)
+
     def __str__(self) -> str:
         parts = [f"[{self.code}] {self.where}: {self.found}"]
         if self.expected:

@@ -121,9 +121,8 @@ def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterato
             continue
         seen.add(path)
         tree = root.tree(name)
-        package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
         for node in _imports(tree.body if tree else [], main=module == begin):
-            for wanted in _names(node, package):
+            for wanted in _names(node, root, name):
                 if any(wanted == each or wanted.startswith(f"{each}.") for each in provided):
                     continue
                 own = _own(roots, wanted)
@@ -153,13 +152,12 @@ def _is_main(node: ast.stmt) -> TypeGuard[ast.If]:
     )
 
 
-def _names(node: ast.Import | ast.ImportFrom, package: list[str]) -> list[str]:
+def _names(node: ast.Import | ast.ImportFrom, repo: HostRepo, module: str) -> list[str]:
     """Dotted names that a statement may import; a name taken from a module may be a module too."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
-    base = package[: len(package) - node.level + 1] if node.level else []
-    module = ".".join([*base, *([node.module] if node.module else [])])
-    return [module, *(f"{module}.{alias.name}" for alias in node.names)]
+    base = repo.absolute(module, node)
+    return [base, *(f"{base}.{alias.name}" for alias in node.names)]
 
 
 def _own(roots: list[HostRepo], name: str) -> list[Module]:

@@ -273,13 +273,13 @@ def _look_up(repo: HostRepo, seam: Seam) -> SeamState:
     if have is None:
         broken = repo.path(seam.module) is not None and repo.tree(seam.module) is None
         found = "source that is no Python" if broken else f"no {seam.attribute}"
-        gone = Finding("error", "seam-missing", where, found, "one")
+        gone = Finding.error("seam-missing", where, found, "one")
         return SeamState(seam, "missing", at, gone)
     missing = [name for name in seam.needs if name not in have]
     if not missing:
         return SeamState(seam, "found", at)
     found, expected = f"parameters ({', '.join(have)})", f"also {', '.join(missing)}"
-    changed = Finding("error", "seam-signature", where, found, expected)
+    changed = Finding.error("seam-signature", where, found, expected)
     return SeamState(seam, "changed", at, changed)
 
 

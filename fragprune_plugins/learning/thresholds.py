@@ -253,18 +253,6 @@ class ThresholdStore:
             new = self.logits.detach()[parents]
         self._resize(lambda rows: torch.cat([rows, rows.new_zeros(count)]), tail=new)
 
-    def copy(self, source: Tensor, target: Tensor) -> None:
-        """Copy thresholds and moments of rows ``source`` to rows ``target``, both (M,) int64."""
-        target = self._rows(target, len(target), "copy")
-        source = self._rows(source, len(target), "copy")
-
-        def moved(rows: Tensor) -> Tensor:
-            rows = rows.clone()
-            rows[target] = rows[source]
-            return rows
-
-        self._resize(moved)
-
     def rearrange(self, origins: Tensor, fresh: Tensor) -> None:
         """Keep, copy and append rows at once: row i takes the values of row ``origins[i]``.
 
@@ -273,20 +261,10 @@ class ThresholdStore:
             fresh: (M,) bool, True where the row is a new Gaussian: its moments are zero.
         """
         origins = self._rows(origins, len(fresh), "rearrange")
-
-        def placed(rows: Tensor) -> Tensor:
-            return rows[origins]
-
-        self._resize(placed)
-        self.forget(fresh.nonzero()[:, 0])
-
-    def forget(self, rows: Tensor | None = None) -> None:
-        """Zero the moments of rows (M,) int64, repeats allowed, or of all rows if None."""
-        chosen = slice(None) if rows is None else self._rows(rows, len(rows), "forget")
-        state = self.optimizer.state.get(self.logits)
-        if state:
-            state["exp_avg"][chosen] = 0
-            state["exp_avg_sq"][chosen] = 0
+        self._resize(lambda rows: rows[origins])
+        if state := self.optimizer.state.get(self.logits):
+            state["exp_avg"][fresh] = 0
+            state["exp_avg_sq"][fresh] = 0
 
     def replace(self, count: int) -> None:
         """Start over for another population: ``count`` neutral rows with zero moments."""

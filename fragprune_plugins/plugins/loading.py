@@ -202,8 +202,7 @@ def _load(plugins: Plugins, entry: EntryPoint, where: str) -> None:
     except _FAULTS as error:  # whatever a plugin raises is its own; the others go on
         found = error.found if isinstance(error, PluginError) else _said(error)
         plugins.findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "plugin-failed",
                 where,
                 found,

@@ -39,12 +39,12 @@ def stepped(store: ThresholdStore, gradient: list[float], lr: float) -> None:
     store.step(lr)
 
 
+NEW = torch.ones(1, dtype=torch.bool)
+
 operation = st.one_of(
     st.tuples(st.just("keep"), st.integers(0, 2**12 - 1)),
     st.tuples(st.just("append"), st.lists(st.integers(0, 99), max_size=4)),
     st.tuples(st.just("orphans"), st.integers(0, 3)),
-    st.tuples(st.just("copy"), st.tuples(st.integers(0, 99), st.integers(0, 99))),
-    st.tuples(st.just("forget"), st.one_of(st.none(), st.lists(st.integers(0, 99), max_size=4))),
     st.tuples(
         st.just("rearrange"), st.lists(st.tuples(st.integers(0, 99), st.booleans()), max_size=9)
     ),
@@ -67,10 +67,6 @@ def apply(store: ThresholdStore, shadow: Shadow, operation: str, argument) -> No
     elif operation == "orphans":
         store.append(argument)
         shadow.rows += [[-30.0, 0.0, 0.0] for _ in range(argument)]
-    elif operation == "copy" and n:
-        source, target = (i % n for i in argument)
-        store.copy(torch.tensor([source]), torch.tensor([target]))
-        shadow.rows[target] = list(shadow.rows[source])
     elif operation == "rearrange" and n:
         origins, fresh = [i % n for i, _ in argument], [new for _, new in argument]
         store.rearrange(
@@ -81,11 +77,6 @@ def apply(store: ThresholdStore, shadow: Shadow, operation: str, argument) -> No
             [old[i][0], 0.0, 0.0] if new else list(old[i])
             for i, new in zip(origins, fresh, strict=True)
         ]
-    elif operation == "forget":
-        rows = None if argument is None else [i % n for i in argument if n]
-        store.forget(None if rows is None else torch.tensor(rows, dtype=torch.int64))
-        for i in range(n) if rows is None else rows:
-            shadow.rows[i][1:] = [0.0, 0.0]
     elif operation == "replace":
         store.replace(argument)
         shadow.replace(argument)
@@ -267,9 +258,8 @@ def test_state_dict_is_a_copy():
         ("parent beyond the end", lambda s: s.append(1, torch.tensor([3]))),
         ("negative parent", lambda s: s.append(1, torch.tensor([-1]))),
         ("too few parents", lambda s: s.append(2, torch.tensor([0]))),
-        ("source beyond the end", lambda s: s.copy(torch.tensor([9]), torch.tensor([0]))),
-        ("forgetting a row beyond the end", lambda s: s.forget(torch.tensor([3]))),
-        ("unequal copy", lambda s: s.copy(torch.tensor([0, 1]), torch.tensor([0]))),
+        ("origin beyond the end", lambda s: s.rearrange(torch.tensor([9]), NEW)),
+        ("fewer origins than rows", lambda s: s.rearrange(torch.tensor([], dtype=int), NEW)),
         ("opacities of another model", lambda s: s.open(torch.ones(4))),
     ],
 )
