@@ -151,7 +151,6 @@ class Stage2:
         # by picture: fragments per pixel
         self._before: dict[_Picture, Tensor] = {}
         self._after: dict[_Picture, Tensor] = {}
-        self._visited = (0, 0)  # how many of these there were before this step
         self._pictures: list[_Picture] = []  # of this step
         self._views = StepViews(settings.views_per_step)
         self._median = math.nan
@@ -189,7 +188,7 @@ class Stage2:
         self.steps += 1
         self.plan = self.schedule.at(self.steps)
         self._views.begin()
-        self._pictures, self._visited = [], (len(self._before), len(self._after))
+        self._pictures = []
         self._open |= self.plan.learn
         if self.plan.counted:
             self.store.ruled(stop=self.settings.stop_of(self.store.stop), rim=self.settings.rim)
@@ -275,32 +274,6 @@ class Stage2:
     def lost(self, loss: Tensor) -> None:
         """The loss of the view drawn last, without the pressure, went backward."""
         self._views.lose(loss.detach())
-
-    def figures(self) -> list[list[float]]:
-        """Of each view drawn in this step that counts, for ``share``.
-
-        Fragments per pixel now and before, what the pressure acts on, and the loss.
-        """
-        return self._views.rows()
-
-    def share(self, views: Sequence[Hashable], figures: Tensor) -> None:
-        """This step's views were drawn by several processes: take over the figures of all.
-
-        Args:
-            views: all of this step, in the same order in every process.
-            figures: (V, 4), the rows that ``figures`` gave in the processes that drew them.
-        """
-        for known, count in zip((self._before, self._after), self._visited, strict=True):
-            for picture in list(known)[count:]:  # the order of what is new must be the same
-                del known[picture]
-        self._views = StepViews(self._views.expected)
-        self._pictures = [(view, 0) for view in views]
-        for picture, (drawn, before, pressed, loss) in zip(self._pictures, figures, strict=True):
-            self._before.setdefault(picture, before.reshape(1))
-            if self._open:
-                self._after[picture] = drawn.reshape(1)
-            self._views.draw(drawn, before, pressed)
-            self._views.lose(loss)
 
     def rate(self, name: str, base: float) -> float:
         """The learning rate in this step of a parameter group that the driver trains.

@@ -14,6 +14,7 @@ from fragprune_plugins.learning.pressure import ELASTICITY
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2, evenly, stored_thresholds
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.distributed.stage import SharedStage
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
 from fragprune_plugins.workbench.goals import TIME_FOLLOWS, Faster
 
@@ -350,7 +351,7 @@ def test_joint_learning_warns_of_a_reset_and_goes_on_with_the_training(caplog):
     assert it.store.opened
 
 
-def drawn_by_one(it: Stage2, names: str) -> list[list[float]]:
+def drawn_by_one(it: SharedStage, names: str) -> list[list[float]]:
     """A step begins, and these views are drawn; what another process is told of them."""
     it.begin(lambda: OPACITIES)
     for name in names:
@@ -364,7 +365,8 @@ def drawn_by_one(it: Stage2, names: str) -> list[list[float]]:
 def test_what_other_processes_drew_counts_like_ones_own_and_in_the_same_order(own):
     settings, told = Settings(iterations=10, goal=Pressure(1e-2), views_per_step=2), ([], [])
     whole, it = (
-        stage(views={"a": None, "b": None}, settings=settings, watch=each.append) for each in told
+        SharedStage(ThresholdStore(5), settings, views={"a": None, "b": None}, watch=each.append)
+        for each in told
     )
     for _ in range(2):
         rows = drawn_by_one(whole, "ab")

@@ -22,6 +22,7 @@ from fragprune_plugins.learning.interruption import Waiting
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.distributed.stage import SharedStage
 from fragprune_plugins.workbench.finetune.loop import Alone, Training
 from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint
@@ -37,6 +38,8 @@ class Replicas(Alone):
     Args:
         ranks: the processes.
     """
+
+    stage = SharedStage
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks, self.first, self.several = ranks, ranks.first, ranks.several
@@ -73,6 +76,7 @@ class Replicas(Alone):
         if not self.several:
             return
         stage, keeper = training.stage, training.keeper
+        assert isinstance(stage, SharedStage)
         leaves = [*training.parameters().values(), stage.store.logits]
         due = keeper is not None and keeper.due(training.done + 1)
         flags = [*(waiting.number == number for number in _SIGNALS), due]

@@ -60,8 +60,10 @@ class Alone:
         several: there are others.
         divided: other processes hold other Gaussians of the model.
         may_end: a signal may end the training after this step.
+        stage: how thresholds learn.
     """
 
+    stage: type[Stage2] = Stage2
     first = True
     several = False
     divided = False
@@ -152,7 +154,7 @@ class Training:
         self.keeper: Keeper | None = None
         self.started = time.perf_counter()
         known = start.thresholds if settings.goal.presses else None
-        self.stage = Stage2(
+        self.stage = processes.stage(
             ThresholdStore(len(start), start.device) if known is None else known.clone(),
             settings,
             schedule,
