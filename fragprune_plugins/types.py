@@ -11,12 +11,10 @@ from fragprune_plugins.constants import (
     ALPHA_MIN,
     COEFFICIENTS_MAX,
     DILATION,
-    DISTANCE_MAX,
     FEATURES_MAX,
     FOCAL_MAX,
     FOCAL_MIN,
     NEAR,
-    ROTATION_TOLERANCE,
     SIDE_MAX,
     STOPPED_ALPHA_MAX,
     TRANSMITTANCE_MIN,
@@ -134,28 +132,6 @@ def check_lens(
             raise InputError(
                 name, f"{centre:g}", f"a place near {side} pixels", "Check the camera."
             )
-
-
-def check_pose(rotation: Tensor, translation: Tensor) -> None:
-    """Check that tensors are a camera's pose: arguments of ``View.pinhole``. Waits for a GPU.
-
-    Raises:
-        InputError: not a rotation matrix, or the camera is not within ``DISTANCE_MAX``.
-    """
-    import torch
-
-    require_tensor("rotation", rotation, 3, 3)
-    require_tensor("translation", translation, 3)
-    exact = rotation.detach().double()
-    skew = float((exact @ exact.T - torch.eye(3).to(exact)).abs().max())
-    # NaN, too, is not within the tolerance.
-    if not (skew <= ROTATION_TOLERANCE and float(torch.linalg.det(exact)) > 0):
-        found = f"{[[float(f'{value:.4g}') for value in row] for row in exact.tolist()]}"
-        expected = "a rotation: finite, orthonormal, not mirrored"
-        raise InputError("rotation", found, expected, "Check the camera.")
-    if not float(translation.detach().abs().max()) <= DISTANCE_MAX:
-        expected = f"finite, at most {DISTANCE_MAX:g} world units"
-        raise InputError("translation", f"{translation.tolist()}", expected, "Check the camera.")
 
 
 def _check_features(name: str, tensor: Tensor | None, n: int) -> None:

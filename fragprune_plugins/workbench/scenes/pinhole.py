@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fragprune_plugins.types import View, check_lens, check_pose, one_line
+from fragprune_plugins.constants import DISTANCE_MAX, ROTATION_TOLERANCE
+from fragprune_plugins.errors import InputError
+from fragprune_plugins.types import View, check_lens, one_line, require_tensor
 
 
 @dataclass(frozen=True)
@@ -78,3 +80,23 @@ class Camera:
             campos=exact.campos.float(),
             background=torch.zeros(3) if background is None else background,
         )
+
+
+def check_pose(rotation: Tensor, translation: Tensor) -> None:
+    """Check that tensors are a camera's pose: see ``Camera``. Waits for a GPU.
+
+    Raises:
+        InputError: not a rotation matrix, or the camera is not within ``DISTANCE_MAX``.
+    """
+    require_tensor("rotation", rotation, 3, 3)
+    require_tensor("translation", translation, 3)
+    exact = rotation.detach().double()
+    skew = float((exact @ exact.T - torch.eye(3).to(exact)).abs().max())
+    # NaN, too, is not within the tolerance.
+    if not (skew <= ROTATION_TOLERANCE and float(torch.linalg.det(exact)) > 0):
+        found = f"{[[float(f'{value:.4g}') for value in row] for row in exact.tolist()]}"
+        expected = "a rotation: finite, orthonormal, not mirrored"
+        raise InputError("rotation", found, expected, "Check the camera.")
+    if not float(translation.detach().abs().max()) <= DISTANCE_MAX:
+        expected = f"finite, at most {DISTANCE_MAX:g} world units"
+        raise InputError("translation", f"{translation.tolist()}", expected, "Check the camera.")
