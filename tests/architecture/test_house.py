@@ -25,9 +25,9 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (13_251, 12_000),
+    "core lines": (13_184, 12_000),
     "core imports of the workbench": (0, 0),
-    "imports inside functions": (47, 60),
+    "imports inside functions": (46, 60),
     "functions over 60 lines": (6, 10),
     "longest function": (77, 80),
     "members of an adapter": (24, 24),
