@@ -7,7 +7,6 @@ from miniatures.vanilla_3dgs import running, tensors
 from fragprune_plugins.injection.stepping import asking_for_no_gradient
 from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.testing.invariants.case import FixedThresholds
 
 MOVES = {
     "opacity": {"opacity"},
@@ -110,24 +109,6 @@ def test_the_control_trains_the_same_without_thresholds():
         assert host.store(model).neutral
         moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
         assert moved == {"opacity"}
-
-
-ASKS = {
-    "opacity": {"opacities"},
-    "appearance": {"opacities", "sh"},
-    "all": {"opacities", "sh", "means", "scales", "rotations"},
-}
-
-
-@pytest.mark.parametrize("train", MOVES)
-def test_frozen_parameters_ask_the_engine_for_no_gradient_and_stay_as_the_host_made_them(train):
-    """That is a third of the backward pass; and the host pickles its parameters as they are."""
-    fixed = FixedThresholds()
-    with running(Settings(iterations=9, train=train), plugins=[fixed]) as host:
-        model, camera = host.model(20), host.camera()
-        host.step(model, camera, 1)
-        assert fixed.asking == ASKS[train]
-        assert all(g["params"][0].requires_grad for g in model.optimizer.param_groups)
 
 
 def test_a_host_that_fails_to_draw_keeps_its_parameters_as_they_were():

@@ -71,21 +71,6 @@ def test_a_rasterizer_that_was_imported_before_us_is_refused():
         del sys.modules["diff_gaussian_rasterization"]
 
 
-def test_a_render_function_that_a_script_already_holds_is_refused():
-    with imported(HOST):
-        with session():
-            import_module("gaussian_renderer")
-        script = type(sys)("a_training_script")
-        script.render = import_module("gaussian_renderer").render
-        sys.modules["a_training_script"] = script
-        try:
-            with pytest.raises(LateImportError, match="a_training_script"):
-                session().activate()
-            assert import_module("gaussian_renderer").render is script.render
-        finally:
-            del sys.modules["a_training_script"]
-
-
 def test_a_host_that_holds_an_earlier_sessions_rasterizer_is_refused_by_another():
     """It would be drawn by that one's classes, which nothing of ours is wrapped around."""
     with imported(HOST):

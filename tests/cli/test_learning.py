@@ -79,16 +79,20 @@ def test_a_bound_of_loss_needs_photographs():
 
 @pytest.mark.parametrize(
     ("options", "iterations", "warmup"),
-    [((), 5000, 3000), (("--views", 4), 1250, 750), (("--views", 4, "--iters", 900), 900, 400)],
+    [
+        *(((), 5000, 3000), (("--views", 4), 1250, 750), (("--self",), 1000, 0)),
+        (("--views", 4, "--iters", 900), 900, 400),
+    ],
 )
-def test_more_views_a_step_see_as_many_views_in_fewer_steps(options, iterations, warmup):
+def test_steps_are_fewer_where_each_sees_more_views_or_no_photograph(options, iterations, warmup):
     @click.command()
     @click.option("--views", "views_per_step", default=1)
+    @click.option("--self", "itself", is_flag=True)
     @learning_options(every_goal=True)
     def show(settings, **_):
         click.echo(f"{settings.iterations} {settings.warmup} {settings.views_per_step}")
 
-    views = options[1] if options else 1
+    views = options[1] if "--views" in options else 1
     said = CliRunner().invoke(show, list(map(str, options))).stdout.split()
     assert said == [str(iterations), str(warmup), str(views)]
 

@@ -117,13 +117,6 @@ def test_without_photographs(scene, tmp_path):
     assert not sidecar.path_beside(out).exists()
 
 
-def test_still_shapes_cannot_cover_less_area(tmp_path):
-    words = (__file__, "--out", tmp_path / "o.ply", "--portable", "--train", "opacity")
-    result = run("finetune", *words)
-    assert result.exit_code == 2
-    assert "only shapes that move can cover less area" in result.stderr
-
-
 @pytest.mark.parametrize("option", ["--target-time", "--max-drop"])
 def test_run_does_not_offer_what_no_host_can_do(option):
     assert option not in run("run", "--help").stdout
