@@ -99,8 +99,9 @@ def test_without_opencv_a_bent_lens_is_refused_with_what_to_install(monkeypatch)
 
 def write_photographs(folder, of: Lens, size=(WIDTH, HEIGHT)):
     folder.mkdir(parents=True)
+    photograph = Image.fromarray(bent(of)).resize(size)
     for i in range(9):
-        Image.fromarray(bent(of)).resize(size).save(folder / f"view{i}.png")
+        photograph.save(folder / f"view{i}.png")
 
 
 COLMAP = {
