@@ -1,3 +1,4 @@
+from conformance.relatives import RelativeConformance
 from installed.gaussian_splatting_host import GaussianSplattingHost, MCMCHost
 
 from fragprune_plugins.testing import AdapterConformance
@@ -8,6 +9,6 @@ class TestGaussianSplatting(AdapterConformance):
     host = GaussianSplattingHost
 
 
-class TestGaussianSplattingMCMC(AdapterConformance):
+class TestGaussianSplattingMCMC(RelativeConformance):
     adapter = "gaussian-splatting"
     host = MCMCHost
