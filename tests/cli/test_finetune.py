@@ -14,7 +14,7 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.workbench.finetune import faster, loop
-from fragprune_plugins.workbench.finetune.finished import describe_untruncated
+from fragprune_plugins.workbench.finetune.finished import advise_own_pictures, describe_untruncated
 from fragprune_plugins.workbench.goals import parse_goal
 
 
@@ -94,6 +94,25 @@ def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
     plain = {"psnr": 30.0 - drop, "target": "photographs", "fragments_per_pixel": 9.0}
     line = describe_untruncated(before, plain | {"frame_ms": 1.0, "frame_ms_se": 0.1})
     assert ("--portable" in line) == advised
+
+
+@pytest.mark.parametrize(
+    ("drop", "more", "advised"),
+    [
+        (0.04, {}, False),
+        (0.06, {}, True),
+        (0.06, {"self": 0.5}, False),
+        (0.06, {"target": "itself"}, False),
+        (0.06, {"pressure": None}, False),
+        (0.06, {"settings": {"train": "opacity"}}, False),
+    ],
+)
+def test_a_model_that_was_better_as_it_came_can_teach_that(drop, more, advised):
+    data = {"target": "photographs", "self": None, "shards": 1, "pressure": 1e-4}
+    data |= {"before": {"psnr": 30.0}, "after": {"psnr": 30.0 - drop}}
+    line = advise_own_pictures(data | {"settings": {"train": "all"}} | more)
+    assert (line is not None) == advised
+    assert not advised or "--self 0.5" in line
 
 
 def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
