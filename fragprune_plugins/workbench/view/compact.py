@@ -36,6 +36,8 @@ _STEPS = 2048
 _FARTHEST = 1 << 29
 """Steps of a mean whose differences surely fit into 32 bits."""
 
+_LEVEL = 7  # of zlib: 9 takes up to seven times as long for 1.6 % fewer bytes
+
 
 def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int], list[str]]:
     """Tables in few bytes.
@@ -75,15 +77,15 @@ def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int]
     for name, (columns, rounded) in rounding.items():
         values = rounded(columns)
         changed[name] = bool((np.abs(values.astype(np.int32) - columns) > 1).any())
-        book, codes = np.unique(values, return_inverse=True)
-        codes = codes.reshape(columns.shape).astype(np.uint8)
+        seen = np.bincount(values.reshape(-1)) > 0
+        book, codes = np.flatnonzero(seen), (np.cumsum(seen) - 1).astype(np.uint8)[values]
         parts.append(np.pad(book.astype("<u2"), (0, _BOOK - len(book))))
         if name == "harmonics" and codes.size:
             codes, index = _different(codes)
             rows = len(codes)
             parts += [] if rows == count else [_planes(index)]
         parts.append(codes.T)
-    data = zlib.compress(b"".join(np.ascontiguousarray(each).tobytes() for each in parts), 9)
+    data = zlib.compress(b"".join(np.ascontiguousarray(each).tobytes() for each in parts), _LEVEL)
     return data, {"bits": bits, "rows": rows}, [name for name in changed if changed[name]]
 
 
