@@ -129,7 +129,7 @@ def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
     report = run_json("audit", path, "--out", tmp_path / "out", *words)
     assert report["truncated"] is True
     assert re.search(
-        r"has thresholds. With them it draws \d\.\d\dx fewer fragments", report["pruning"]
+        r"has cutoffs. With them it draws \d\.\d\dx fewer fragments", report["pruning"]
     )
     plain = run_json("audit", path, "--out", tmp_path / "out", "--no-truncation", *words)
     assert plain["truncated"] is False

@@ -32,7 +32,7 @@ def test_writes_a_pair_and_a_table(scene, tmp_path):
     assert result.exit_code == 0, result.stderr
     for words in (
         "PSNR, dB",
-        "fragments/pixel",
+        "fragments per pixel",
         "original",
         "pruned",
         "x fewer fragments",
@@ -76,15 +76,15 @@ def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
     plain = report["untruncated"]
     change = plain["psnr"] - report["before"]["psnr"]
     assert (
-        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
+        f"In viewers that know no cutoffs: {plain['psnr']:.2f} dB PSNR "
         f"({change:+.2f}), {plain['fragments_per_pixel']:.1f} fragments per pixel"
     ) in text
-    assert "out.ply, which holds the thresholds." in text
+    assert "out.ply, which holds the cutoffs." in text
     assert not sidecar.path_beside(out).exists()
     control = run_json(*arguments, "--control")
     assert control["untruncated"] is None
     text = run(*arguments, "--control").stdout
-    assert "Without its thresholds" not in text
+    assert "know no cutoffs" not in text
     assert "out.ply." in text
 
 

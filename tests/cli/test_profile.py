@@ -25,4 +25,4 @@ def test_table(tmp_path):
     result = run("profile", path, "--data", data, "--views", "train")
     assert result.exit_code == 0
     assert "7 views" in result.stdout
-    assert "evaluated/pixel" in result.stdout
+    assert "fragments per pixel" in result.stdout

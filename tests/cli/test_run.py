@@ -120,7 +120,7 @@ def test_before_and_after_are_measured_at_the_hosts_resolution(scene, tmp_path, 
     out = tmp_path / "out"
     ran(*WORDS, *command(scene, out, "-r", size))
     text = run("compare", *models(out)).stdout
-    assert f"the first of {read[0]}x{read[1]} pixels" in text
+    assert f", {read[0]}x{read[1]} pixels" in text
 
 
 def models(out):

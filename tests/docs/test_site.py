@@ -84,7 +84,7 @@ def test_no_page_loads_anything_from_elsewhere(site, pages):
 
 def test_the_tutorial_shows_what_it_printed_and_drew(site):
     page = (site / "tutorial.html").read_text(encoding="utf-8")
-    assert re.search(r"fragments/pixel +\d", re.sub("<[^>]+>", "", page))
+    assert re.search(r"fragments per pixel +\d", re.sub("<[^>]+>", "", page))
     assert len(re.findall(r"<img [^>]*tutorial-\d\.png", page)) == 3
     notebook = json.loads((site / "tutorial.ipynb").read_text(encoding="utf-8"))
     assert not any(cell.get("outputs") for cell in notebook["cells"]), "strip the outputs"

@@ -85,7 +85,7 @@ def test_the_file_has_no_thresholds_and_takes_the_sidecar_of_an_earlier_one_away
     assert b"fragprune" not in header
     assert b"trunc" not in header
     assert fp.load(out).thresholds is None  # nothing is missed
-    assert "area/pixel" in result.stdout
+    assert "area per pixel" in result.stdout
     assert "which every viewer draws as it is" in result.stdout
     profile = run_json("profile", out, "--data", data)
     assert set(profile["columns"]) == {"untruncated"}

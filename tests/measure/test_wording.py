@@ -109,7 +109,6 @@ ITSELF = {"target": "itself"}
 def test_against_itself_there_is_no_figure_before_and_no_control(infinite, psnr, warned):
     rows = {
         "ssim": 1.0,
-        "evaluated_per_pixel": 50.0,
         "area_per_pixel": 40.0,
         "gaussians": 9,
         "engine": "cpu",
@@ -123,3 +122,23 @@ def test_against_itself_there_is_no_figure_before_and_no_control(infinite, psnr,
     assert ("Warning: below 35 dB the change can be seen." in line) == warned
     first, *_ = describe({"before": before, "after": after}).splitlines()[1:]
     assert first.split() == ["PSNR", "to", "itself,", "dB", "equal", f"{psnr:.2f}"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "change", "frame"),
+    [
+        (measured(39.0, 3.0, 30.0), measured(26.0, 2.0, 30.5), "1.50x fewer", "1.50x as fast"),
+        (measured(26.0, 2.0, 30.0), measured(39.0, 4.0, 30.5), "1.50x more", "0.50x as fast"),
+        (measured(26.0, 2, 30, 0.1), measured(26.1, 2.1, 30.5, 0.1), "the same", "within noise"),
+    ],
+)
+def test_a_table_says_in_words_what_a_ratio_means(before, after, change, frame):
+    rows = {"ssim": 0.9, "area_per_pixel": 40.0, "gaussians": 9, "engine": "cpu", "device": "cpu"}
+    less = {"area_per_pixel": 32.0}
+    text = describe({"original": before | rows, "pruned": after | rows | less})
+    lines = {line[:31].strip(): line for line in text.splitlines()}
+    assert lines["fragments per pixel"].endswith(f" {change}")
+    assert lines["area per pixel, other viewers"].endswith(" 1.25x less")
+    assert lines["frame, ms"].endswith(f" {frame}")
+    assert lines["PSNR, dB"].endswith(" +0.50")
+    assert text.endswith("Means over 7 views, ± a standard error; cpu engine on cpu")

@@ -69,14 +69,14 @@ def pruning(figures: Mapping[str, Any]) -> str:
     """What learned pruning saves: of this model if it is pruned, else how to find out."""
     if not figures["truncated"]:
         return (
-            "What learned thresholds would save on this model is not known before they are "
+            "What learned cutoffs would save on this model is not known before they are "
             f"learned: fragprune finetune {figures['model']} --self --out pruned.ply, which "
             f"needs no photographs. {MEASURED}"
         )
     with_, without = figures["cuts"][0], figures["cuts"][-1]
     fragments = fewer(without["fragments_per_pixel"], with_["fragments_per_pixel"])
     return (
-        f"This model has thresholds. With them it draws {fragments}, {frames(without, with_)}. All "
+        f"This model has cutoffs. With them it draws {fragments}, {frames(without, with_)}. All "
         "cuts come on top of them. A viewer that ignores them shows another picture: "
         f"{_decibels(without['psnr'])} PSNR against this one."
     )

@@ -58,7 +58,7 @@ RULES = (
 def command(**options: Any) -> Report:
     """Time rasterization, forward and with all gradients, with and without truncation.
 
-    MODEL is drawn with its own thresholds. Without MODEL a scene is generated, the same on every
+    MODEL is drawn with its own cutoffs. Without MODEL a scene is generated, the same on every
     machine. All rows are timed in turns, so that a busy machine slows them alike. Close other
     programs anyway, and read the load below the table.
 

@@ -59,7 +59,7 @@ _OPTIONS = (
         type=click.Choice(["opacity", "appearance", "all"]),
         default="all",
         show_default=True,
-        help="Parameters that learn with the thresholds: opacities alone, as in the paper; "
+        help="Parameters that learn with the cutoffs: opacities alone, as in the paper; "
         "appearance adds SH; all adds shapes and positions, and truncates in the last 2,000 "
         "iterations only.",
     ),
@@ -79,7 +79,7 @@ _OPTIONS = (
     click.option(
         "--portable",
         is_flag=True,
-        help="For viewers that ignore thresholds: learn none, and press on the area that the "
+        help="For viewers that ignore cutoffs: learn none, and press on the area that the "
         "Gaussians cover instead of on drawn fragments. --pressure is its weight then; default: "
         f"{PORTABLE_ELASTICITY:g} of the loss per pixel of area.",
     ),
@@ -89,14 +89,14 @@ _OPTIONS = (
         default="auto",
         show_default=True,
         help="A pixel draws the fragment that leaves less than this share of its light, and ends "
-        f"there. auto: the model's own; else {USUAL_STOP:g} where thresholds learn from "
+        f"there. auto: the model's own; else {USUAL_STOP:g} where cutoffs learn from "
         "photographs. off: add none. A number also works with --control.",
     ),
     click.option(
         "--rim",
         type=click.Choice(get_args(Rim)),
-        help="How thresholds cut: hard between two pixels, or soft across one, without aliasing. "
-        "Without it, as the model has it; else hard. A soft rim is drawn by the cpu engine.",
+        help="How a Gaussian ends at its cutoff: hard between two pixels, or soft across one, "
+        "without aliasing. Default: as the model has it, else hard. Soft rims need the cpu engine.",
     ),
     click.option(
         "--control",

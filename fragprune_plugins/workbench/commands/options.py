@@ -298,7 +298,7 @@ def given() -> frozenset[str]:
 
 
 truncation_option = click.option(
-    "--no-truncation", is_flag=True, help="Ignore the thresholds stored with the model."
+    "--no-truncation", is_flag=True, help="Ignore the cutoffs stored with the model."
 )
 
 views_option = click.option(

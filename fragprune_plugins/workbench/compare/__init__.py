@@ -42,7 +42,7 @@ from fragprune_plugins.workbench.commands.options import (
 def command(**options: Any) -> Report:
     """Measure A and B on the same photographs, or against A's own pictures.
 
-    Each model is drawn with its thresholds, and frames are timed in turns. If a
+    Each model is drawn with its cutoffs, and frames are timed in turns. If a
     run or a fine-tuning wrote one of the models, its record gives the photographs, their size and
     background, and how models are drawn. Options given here override the record.
 

@@ -67,7 +67,7 @@ def compare(
     else:
         assert own is not None
         dataset = own.pictures(models[0], rasterizer)
-        shown = "of A itself"
+        shown = "A's own"
     shots = chosen(dataset, views)
     before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)
     measured = [(str(a), before), (str(b), after)]
@@ -111,7 +111,7 @@ def _lines(
     width, height, enlarge = view.width, view.height, report["enlarge"]
     pictures = "Photographs" if report["scene"] else "Pictures"
     return [
-        f"A: {a}\nB: {b}\n{pictures}: {shown}, the first of {width}x{height} pixels\n",
+        f"A: {a}\nB: {b}\n{pictures}: {shown}, {width}x{height} pixels\n",
         describe({"A": before, "B": after}),
         *([f"Frames of {enlarge * width}x{enlarge * height} pixels."] if enlarge > 1 else []),
         f"\nB against A: {gain(before, after)}.",

@@ -127,12 +127,12 @@ def run_demo(
     ):
         command = host_command(scene.resolve(), model.resolve(), settings)
         say(
-            f"1/4  Training for {settings.iterations} iterations, then with thresholds "
-            f"for {settings.finetune}"
+            f"1/4  Training for {settings.iterations} iterations, then with a cutoff for "
+            f"every Gaussian for {settings.finetune}"
         )
         summary = run(command, _run_options(settings))
     with clock.part("control"):
-        say(f"2/4  The control: the same {settings.finetune} iterations without truncation")
+        say(f"2/4  The control: the same {settings.finetune} iterations without cutoffs")
         control = _control(scene, summary, settings)
     with clock.part("measure"):
         say("3/4  Measuring on the held-out views")

@@ -1,4 +1,4 @@
-"""``fragprune export``: writes a model with its thresholds into one file, of any format."""
+"""``fragprune export``: writes a model with its cutoffs into one file, of any format."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from fragprune_plugins.workbench.models import formats
 )
 @truncation_option
 def command(**options: Any) -> Report:
-    """Write MODEL with its thresholds and its stop into one file.
+    """Write MODEL with its cutoffs and its stop into one file.
 
     A .ply gets a further column, trunc_threshold: a falloff in (0, 1). A renderer gets the same
     picture as fragprune if it draws a fragment only where exp(-q/2) >= trunc_threshold, with q the

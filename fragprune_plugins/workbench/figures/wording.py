@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.files.records import CONTROL
@@ -39,10 +40,8 @@ _ROWS = (
     ("PSNR, dB", "psnr", 2),
     ("SSIM", "ssim", 4),
     ("LPIPS", "lpips", 4),
-    ("fragments/pixel", "fragments_per_pixel", 2),
-    ("evaluated/pixel", "evaluated_per_pixel", 2),
-    ("list entries/pixel", "entries_per_pixel", 3),
-    ("area/pixel", "area_per_pixel", 2),
+    ("fragments per pixel", "fragments_per_pixel", 2),
+    ("area per pixel, other viewers", "area_per_pixel", 2),
     ("frame, ms", "frame_ms", 2),
     ("Gaussians", "gaussians", 0),
 )
@@ -50,23 +49,21 @@ _ROWS = (
 _DIFFERENCES = ("psnr", "ssim", "lpips")
 """Figures whose change is a difference; that of others is a ratio."""
 
-_OPTIONAL = ("lpips", "entries_per_pixel")
-"""Figures that an installation or an engine may lack."""
-
 
 def describe(columns: Mapping[str, dict[str, Any]]) -> str:
     """A table with a column for each measurement, and the change between the last two."""
     lines = []
     for first, *cells in tabulate(columns):
-        change = f"{cells.pop():>12}" if len(columns) > 1 else ""
-        lines.append(f"{first:<20}" + "".join(f"{cell:>16}" for cell in cells) + change)
+        change = f"{cells.pop():>15}" if len(columns) > 1 else ""
+        lines.append(f"{first:<31}" + "".join(f"{cell:>16}" for cell in cells) + change)
     return "\n".join([*lines, measured_with(columns)])
 
 
 def measured_with(columns: Mapping[str, dict[str, Any]]) -> str:
     """What the last measurement was made with: views, engine, device."""
     report = list(columns.values())[-1]
-    return f"{report['views']} views, {report['engine']} engine on {report['device']}"
+    made = f"{report['engine']} engine on {report['device']}"
+    return f"Means over {report['views']} views, ± a standard error; {made}"
 
 
 def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
@@ -79,8 +76,8 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
     rows = [["", *columns, *change]]
     itself = reports[-1].get("target") == ITSELF
     for label, key, digits in _ROWS:
-        if key in _OPTIONAL and not all(_known(each.get(key)) for each in reports):
-            continue
+        if key == "lpips" and not all(_known(each.get(key)) for each in reports):
+            continue  # an installation may lack it
         if key == "psnr" and itself:  # before, it is infinite: null in a record
             equal = ["equal" if each is reports[0] else f"{each[key]:.2f}" for each in reports]
             rows.append(["PSNR to itself, dB", *equal, *([""] if change else [])])
@@ -93,11 +90,12 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
             ]
         if change:
             first, last = reports[-2][key], reports[-1][key]
-            cells.append(
-                f"{last - first:+.{digits}f}"
-                if key in _DIFFERENCES
-                else f"/ {first / max(last, 1e-9):.2f}"
-            )
+            if key in _DIFFERENCES:
+                cells.append(f"{last - first:+.{digits}f}")
+            elif key == "frame_ms":
+                cells.append(_fast(*reports[-2:]))
+            else:
+                cells.append(_less(first, last, "less" if key == "area_per_pixel" else "fewer"))
         rows.append([label, *cells])
     return rows
 
@@ -207,6 +205,11 @@ def _by_pruning(before: dict[str, Any], after: dict[str, Any], control: dict[str
     return gained - without
 
 
+def next_steps(model: Path, folder: Path) -> str:
+    """A line on what to do with a model that a command wrote, and with the record in a folder."""
+    return f"Look at it: fragprune view {model}. A page to share: fragprune report {folder}"
+
+
 def missed(data: dict[str, Any]) -> str:
     """That a fine-tuning missed its target, a sentence with a space before it; else nothing."""
     if data.get("target_reached") is not False:
@@ -257,10 +260,22 @@ def strangers(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
 
 def fewer(before: float, after: float) -> str:
     """A phrase for the ratio of fragments per pixel: fewer, as many or more."""
-    ratio = before / max(after, 1e-9)
-    change = f"{ratio:.2f}x fewer" if ratio > 1 else f"{1 / max(ratio, 1e-9):.2f}x more"
-    change = "as many" if abs(ratio - 1) < _EQUAL else change
+    change = _less(before, after).replace("the same", "as many")
     return f"{change} fragments ({before:.1f} -> {after:.1f} per pixel)"
+
+
+def _less(before: float, after: float, word: str = "fewer") -> str:
+    """The ratio of two figures in words."""
+    ratio = before / max(after, 1e-9)
+    if abs(ratio - 1) < _EQUAL:
+        return "the same"
+    return f"{ratio:.2f}x {word}" if ratio > 1 else f"{1 / max(ratio, 1e-9):.2f}x more"
+
+
+def _fast(before: dict[str, Any], after: dict[str, Any]) -> str:
+    """The ratio of two frame times in words, if it exceeds the standard errors."""
+    ratio, error = _faster(before, after)
+    return f"{ratio:.2f}x as fast" if abs(ratio - 1) > CLAIMED * error else "within noise"
 
 
 def frames(before: dict[str, Any], after: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""``fragprune finetune``: learns a trained splat's thresholds from photographs, or from itself."""
+"""``fragprune finetune``: learns a trained splat's cutoffs from photographs, or from itself."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ RULES = (
     "--out",
     type=OutFile(*formats.ENDINGS),
     required=True,
-    help="New model: .ply, .spz, .sog or .glb, which hold its thresholds. .splat and "
+    help="New model: .ply, .spz, .sog or .glb, which hold its cutoffs. .splat and "
     ".compressed.ply cannot hold any.",
 )
 @click.option(
@@ -132,7 +132,7 @@ RULES = (
     "processes under torchrun, which draw them side by side.",
 )
 @shard_option
-@click.option("--no-truncation", is_flag=True, help="Ignore thresholds stored with MODEL.")
+@click.option("--no-truncation", is_flag=True, help="Ignore cutoffs stored with MODEL.")
 @click.option(
     "--drop-invisible",
     "drop",
@@ -145,17 +145,17 @@ RULES = (
 def command(**options: Any) -> Report | None:
     """Learn how far each Gaussian of MODEL must reach.
 
-    Thresholds and all other parameters adapt to each other on the photographs in --data. With
+    Cutoffs and all other parameters adapt to each other on the photographs in --data. With
     --train opacity, positions, shapes and colours stay bit for bit. OUT has the columns of
-    MODEL, and one more for the thresholds, trunc_threshold. The table compares both models on
-    held-out views. A line below it measures OUT without its thresholds, as other viewers draw it.
+    MODEL, and one more for the cutoffs, trunc_threshold. The table compares both models on
+    held-out views. A line below it measures OUT without its cutoffs, as other viewers draw it.
     Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
 
     The same command goes on where it was interrupted or killed. If OUT is finished already, it says
     so and does nothing; --again begins anew.
 
-    With --portable no thresholds are learned: the Gaussians themselves cover less area, and every
-    viewer draws OUT as it is. "area/pixel" in the table is what most web
+    With --portable no cutoffs are learned: the Gaussians themselves cover less area, and every
+    viewer draws OUT as it is. "area per pixel" in the table is what most web
     viewers pay for: the pixels in all ellipses of sqrt(8) standard deviations.
 
     With --self no photograph is read: MODEL's own pictures are what it must go on showing, also

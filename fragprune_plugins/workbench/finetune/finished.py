@@ -19,6 +19,7 @@ from fragprune_plugins.workbench.figures.wording import (
     FELL,
     ITSELF,
     describe,
+    next_steps,
     outcome,
 )
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
@@ -196,12 +197,13 @@ class Finetuned:
         if plain is not None:
             lines.append(describe_untruncated(before, plain))
         form = formats.named(self.out)
-        held = ", which holds the thresholds" if plain else ""
+        held = ", which holds the cutoffs" if plain else ""
         if settings.goal.on_area:
             held = ", which every viewer draws as it is"
         lines.append(describe_written(self.out, held))
         if form.keeps:
             lines.append("The figures above are of the model as it was learned, before rounding.")
+        lines.append(next_steps(self.out, self.out.parent))
         return "\n".join(lines)
 
 
@@ -283,7 +285,7 @@ def advise_own_pictures(data: dict[str, Any]) -> str | None:
 
 
 def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
-    """A line on the fine-tuned model without its thresholds.
+    """A line on the fine-tuned model without its cutoffs.
 
     Args:
         before: measurement of the model before fine-tuning.
@@ -293,9 +295,9 @@ def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
     compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
     advice = ""
     if before["psnr"] is not None and plain["psnr"] < before["psnr"] - FELL:
-        advice = " For viewers that ignore thresholds: --portable."
+        advice = " For such viewers: --portable."
     return (
-        f"Without its thresholds, as other viewers draw it: {plain['psnr']:.2f} dB PSNR "
+        f"In viewers that know no cutoffs: {plain['psnr']:.2f} dB PSNR "
         f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "
         f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
         f"{advice}"

@@ -30,10 +30,10 @@ from fragprune_plugins.workbench.commands.options import (
 def command(**options: Any) -> Report:
     """Measure MODEL: quality, fragments per pixel, time per frame.
 
-    A model with thresholds is measured with and without them, on the same frames in turns.
+    A model with cutoffs is measured with and without them, on the same frames in turns.
 
     Without photographs it is measured against its own pictures: --self, --cameras or --orbit. Then
-    PSNR says what its thresholds change.
+    PSNR says what its cutoffs change.
 
     \b
     Examples:

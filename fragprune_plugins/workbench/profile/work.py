@@ -59,7 +59,9 @@ def profile(
         "columns": measured,
         "warnings": warnings,
     }
-    lines = [describe(measured), *(f"Warning: {each}" for each in warnings)]
+    names = {"untruncated": "without cutoffs", "truncated": "with cutoffs"}
+    columns_named = {names[key]: each for key, each in measured.items()}
+    lines = [describe(columns_named), *(f"Warning: {each}" for each in warnings)]
     if loaded.falloff is not None:
         points = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
         thresholds = loaded.falloff.cpu()
@@ -67,7 +69,7 @@ def profile(
         quantiles = torch.quantile(thresholds[::step], points).tolist()
         report["threshold_quantiles"] = quantiles
         lines.append(
-            "learned thresholds (5, 25, 50, 75, 95 %): "
+            "Cutoffs as falloffs, 1 at a Gaussian's centre, 0 far outside (5, 25, 50, 75, 95 %): "
             + ", ".join(f"{value:.3f}" for value in quantiles)
         )
     if out is not None:

@@ -1,4 +1,4 @@
-"""``fragprune render``: draws pictures of a splat with its thresholds."""
+"""``fragprune render``: draws pictures of a splat with its cutoffs."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ RULES = (
 def command(**options: Any) -> Report | None:
     """Render MODEL from many cameras, with one PNG for each camera, or as a film.
 
-    The thresholds beside MODEL apply, if there are any; --no-truncation ignores them. A film needs
+    The cutoffs beside MODEL apply, if there are any; --no-truncation ignores them. A film needs
     the extra [video].
 
     \b

@@ -1,4 +1,4 @@
-"""``fragprune run``: runs a host's training command and learns thresholds."""
+"""``fragprune run``: runs a host's training command and learns cutoffs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ RULES = (
     default="auto",
     show_default=True,
     help="auto: train, then fine-tune. finetune: only fine-tune the model in the output folder. "
-    "joint: learn inside the training. off: only apply stored thresholds.",
+    "joint: learn inside the training. off: only apply stored cutoffs.",
 )
 @click.option(
     "--from-iter",
@@ -48,7 +48,7 @@ RULES = (
 @log_option
 @config_option
 @engine_options(
-    "Engine that rasterizes with thresholds, or if the host's own rasterizer is missing",
+    "Engine that rasterizes with cutoffs, or if the host's own rasterizer is missing",
     device="Device of the host; cpu runs a CUDA-only host without a GPU.",
 )
 @click.option(
@@ -59,12 +59,12 @@ RULES = (
 )
 @again_option("Train, or learn, anew, though that is finished.")
 def command(**options: Any) -> Report:
-    """Train with a host's own command, then learn truncation thresholds.
+    """Train with a host's own command, then learn a cutoff for every Gaussian.
 
     Put the unmodified command after --. Stage 1 is the host's own training. Stage 2 resumes it for
     a few thousand iterations, in which no Gaussian is added or removed. All parameters learn with
-    the thresholds (but see --train). The host saves its model as usual, and the thresholds go
-    beside it as a sidecar. In stage 2, Ctrl-C (exit code 130) and SIGTERM (143) save the thresholds
+    the cutoffs (but see --train). The host saves its model as usual, and the cutoffs go
+    beside it as a sidecar. In stage 2, Ctrl-C (exit code 130) and SIGTERM (143) save the cutoffs
     learned so far. If stage 2 was interrupted or killed, the same command begins it anew and does
     not repeat stage 1.
 
@@ -74,6 +74,6 @@ def command(**options: Any) -> Report:
       fragprune run --quick --device cpu -- train.py -s scene -m out --iterations 7000
       fragprune run --stage finetune -- train.py -s scene -m out     (already trained)
       fragprune run --stage joint -- python train.py -s scene -m out   (no added iterations)
-      fragprune run -- python render.py -m out                       (renders with thresholds)
+      fragprune run -- python render.py -m out                       (renders with cutoffs)
     """
     return work_of(__name__, **options)

@@ -21,7 +21,13 @@ from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
 from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.wording import describe, fewer, missed, outcome
+from fragprune_plugins.workbench.figures.wording import (
+    describe,
+    fewer,
+    missed,
+    next_steps,
+    outcome,
+)
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
@@ -198,4 +204,6 @@ def _describe(
         f"{summary.train_seconds:.0f} s in all. "
         f"Model: {summary.model_after or _saved(summary)}."
     )
+    if summary.model_after and summary.output:
+        lines.append(next_steps(summary.model_after, summary.output))
     return "\n".join(lines)

@@ -34,8 +34,8 @@ from fragprune_plugins.workbench.commands.options import CAMERAS_APART, CAMERAS_
 def command(**options: Any) -> Report:
     """Look at MODEL in the browser, with fragments, overdraw and frame times.
 
-    A model with thresholds is shown right of a split. Left of it is OTHER, or the original, if a
-    record beside MODEL names it and it lies in the same folder; else MODEL without thresholds.
+    A model with cutoffs is shown right of a split. Left of it is OTHER, or the original, if a
+    record beside MODEL names it and it lies in the same folder; else MODEL without cutoffs.
     The page needs WebGL2 and no network: it is served to this machine only, until Ctrl-C. With
     --out it is a folder that any web server can serve, or one HTML file that a browser opens from
     disk.
