@@ -86,8 +86,8 @@ def find(folder: Path) -> list[Record]:
     if not found:
         what, remedy = f"no file *{SUFFIX} in it or below", "Run one of these first."
         if folder.is_file():
-            look = f"To look at a model: fragprune view {folder}"
-            what, remedy = "a file", f"Name its folder: fragprune report {folder.parent}. {look}"
+            page, look = f"fragprune report {folder.parent}", f"fragprune view {folder}"
+            what, remedy = "a file", f"For the page: {page}; to look at a model: {look}"
         elif not folder.exists():
             what, remedy = "no such folder", f"Check the name. {remedy}"
         expected = "a folder that run or finetune wrote, or compare or profile with --out"

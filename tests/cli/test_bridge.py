@@ -34,6 +34,9 @@ def test_the_module_is_copied_into_a_new_folder(viewer, tmp_path):
     wrote = Path(run_json("bridge", viewer, "--out", tmp_path / "website")["module"])
     assert wrote.parent == tmp_path / "website"
     assert "export async function installCutoffs" in wrote.read_text()
+    said = run("bridge", viewer, "--out", tmp_path).stdout
+    assert "first lines show how a page calls installCutoffs" in said
+    assert "await installCutoffs(" in wrote.read_text().partition("*/")[0]
 
 
 def test_an_unknown_viewer_is_a_usage_error_that_names_the_known():

@@ -81,7 +81,7 @@ def test_a_model_without_thresholds_is_written_as_it_is(tmp_path, name):
     _, path, _ = tiny.scene(tmp_path)
     result = run("export", path, "--out", tmp_path / name)
     assert result.exit_code == 0
-    assert "no thresholds" in result.stdout
+    assert "no cutoffs" in result.stdout
     assert not models.load(tmp_path / name).pruned
 
 

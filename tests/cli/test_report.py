@@ -94,7 +94,7 @@ def test_what_is_no_folder_is_refused_with_the_next_command(folder, name, found,
     error = json.loads(run("report", out / name, "--json").stdout)["error"]
     assert (error["where"], error["found"]) == (str(out / name), found)
     assert remedy in error["remedy"]
-    assert (f"fragprune report {out}." in error["remedy"]) == (name == "pruned.ply")
+    assert (f"fragprune report {out};" in error["remedy"]) == (name == "pruned.ply")
 
 
 def test_comparisons_come_along_with_their_pictures(folder):

@@ -136,7 +136,7 @@ def test_the_same_model_gives_the_same_bytes(suffix, tmp_path):
 @pytest.mark.parametrize("suffix", [".splat", ".compressed.ply"])
 def test_a_format_without_thresholds_refuses_them(suffix, tmp_path):
     path = tmp_path / f"a{suffix}"
-    with pytest.raises(OutputError, match="cannot hold thresholds"):
+    with pytest.raises(OutputError, match="cannot hold cutoffs"):
         save(path, tiny.cut(random_splat(5, 0, 0), 0.4))
     assert list(tmp_path.iterdir()) == []
 
@@ -349,7 +349,7 @@ def test_export_says_why_it_refuses(tmp_path):
     write_ply(path, tiny.cut(model, torch.linspace(0.1, 0.9, len(model))))
     result = run("export", path, "--out", tmp_path / "a.splat")
     assert result.exit_code == 1
-    assert "cannot hold thresholds" in result.stderr
+    assert "cannot hold cutoffs" in result.stderr
     assert "--no-truncation" in result.stderr
     assert not (tmp_path / "a.splat").exists()
 
@@ -368,7 +368,7 @@ def test_finetune_reads_and_writes_spz(tmp_path):
     assert not run_json(*ply)["already_finished"]  # its record has the same name
     refused = run(*words[:-3], tmp_path / "pruned.splat", *words[-2:])
     assert refused.exit_code == 1
-    assert "cannot hold thresholds" in refused.stderr
+    assert "cannot hold cutoffs" in refused.stderr
 
 
 @pytest.mark.parametrize("wrong", ["positions", "no file"])

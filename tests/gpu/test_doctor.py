@@ -80,10 +80,23 @@ def test_a_gpu_is_checked_each_time_and_what_failed_told_from_what_could_not_run
     monkeypatch: pytest.MonkeyPatch, verdict: Verdict, status: int, agrees: bool | None, said: str
 ) -> None:
     monkeypatch.setattr(driver, "missing", lambda: None)
-    monkeypatch.setattr(work, "_cuda_engine", lambda: {"available": True, "reason": None})
+    gpu = {"available": True, "device": "A GPU", "capability": "9.0", "compiler": "nvrtc 13.0"}
+    monkeypatch.setattr(work, "_cuda_engine", lambda: gpu | {"kept": "cache", "reason": None})
     monkeypatch.setattr(self_check, "check_in_subprocess", lambda device: verdict)
     code, report = invoke()
     assert (code, report["gpu"]["agrees"]) == (status, agrees)
     assert verdict.reason in report["gpu"]["check"]
     text = CliRunner().invoke(cli, ["doctor"]).output
     assert said is None or said in text
+    line = "cuda engine: A GPU, compute capability 9.0, kernels by nvrtc 13.0, kept in cache: "
+    assert f"{line}{verdict}\n" in text
+
+
+def test_what_is_missing_is_a_sentence_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.version, "cuda", None)
+    monkeypatch.setenv(kernels.ENVIRONMENT, "off")
+    lines = CliRunner().invoke(cli, ["doctor"]).output.splitlines()
+    (line,) = [each for each in lines if each.startswith("cuda engine: ")]
+    assert "switched off" in line
+    assert line.endswith("For an NVIDIA GPU: Install torch for CUDA.")
+    assert not [each for each in lines if "None" in each or "True" in each or "False" in each]

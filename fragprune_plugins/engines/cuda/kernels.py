@@ -85,7 +85,7 @@ class Nvrtc:
         except Unavailable:
             raise
         except Exception as error:  # of several types, by version: the library cannot be found
-            raise Unavailable(f"no NVRTC library: {error}") from error
+            raise Unavailable(f"no NVRTC library: {str(error).splitlines()[0]}") from error
         self.version = f"{major}.{minor}"
         self.architectures = tuple(sorted(int(a) for a in found if a >= OLDEST))
 

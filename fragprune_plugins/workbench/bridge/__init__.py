@@ -40,7 +40,7 @@ def command(viewer: str | None, out: Path | None) -> Report:
         data = {"bridges": {name: str(module) for name, module in found.items()}}
         return Report(data, "\n".join(lines) or "No bridge is installed.")
     if viewer not in modules:
-        raise UsageError("VIEWER", viewer, " or ".join(modules), "Choose a bridge from the list.")
+        raise UsageError("VIEWER", viewer, " or ".join(modules), "Run fragprune bridge to see all.")
     module = _module(modules[viewer])
     if out is None:
         return Report({"bridge": viewer, "module": str(module)}, str(module.parent))
@@ -48,7 +48,11 @@ def command(viewer: str | None, out: Path | None) -> Report:
     out.mkdir(parents=True, exist_ok=True)
     with replacing(to) as temporary:
         shutil.copyfile(module, temporary)
-    return Report({"bridge": viewer, "module": str(to)}, f"Wrote {to}.")
+    text = (
+        f"Wrote {to}. Its first lines show how a page calls installCutoffs.\n"
+        "If a model has a sidecar: fragprune export MODEL.ply --out for_viewer.ply"
+    )
+    return Report({"bridge": viewer, "module": str(to)}, text)
 
 
 def _module(point: EntryPoint) -> Path:

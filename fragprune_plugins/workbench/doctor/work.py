@@ -51,8 +51,8 @@ def examine() -> Report:
         f"python {data['python']} on {data['platform']}",
         ", ".join(f"{name} {found or 'missing'}" for name, found in packages.items()),
         f"CUDA {'yes' if data['cuda'] else 'no'}; {data['threads']} threads",
-        "native engine: " + ", ".join(f"{key} {value}" for key, value in native.items()),
-        "cuda engine: " + ", ".join(f"{key} {value}" for key, value in gpu.items()),
+        _of_cpu(native),
+        _of_cuda(gpu),
         f"engines: {', '.join(data['engines'])}",
         f"adapters: {', '.join(data['adapters']) or 'none'}",
         *(str(finding) for finding in plugins.findings),
@@ -102,6 +102,21 @@ def build(architectures: str) -> Report:
         for k in built
     ]
     return Report(data, "\n".join(lines))
+
+
+def _of_cpu(native: dict[str, Any]) -> str:
+    if not native["available"]:
+        return f"cpu engine: missing, {native['reason']}"
+    return f"cpu engine: its {native['build']} build, {native['path']}"
+
+
+def _of_cuda(gpu: dict[str, Any]) -> str:
+    if not gpu["available"]:
+        return f"cuda engine: none, {gpu['reason']}. For an NVIDIA GPU: {driver.remedy()}"
+    return (
+        f"cuda engine: {gpu['device']}, compute capability {gpu['capability']}, "
+        f"kernels by {gpu['compiler']}, kept in {gpu['kept']}: {gpu['check']}"
+    )
 
 
 def _version(package: str) -> str | None:

@@ -36,7 +36,8 @@ def export(
         lines.append(describe_dropped(dropped, "too faint for any view"))
     truncated = splat.falloff is not None
     column = THRESHOLD_COLUMN if form.paired and truncated else None
-    held = column or ("thresholds" if truncated else "no thresholds")
+    held = "cutoffs" if truncated else "no cutoffs"
+    held += f" in the column {column}" if column else ""
     held += "" if splat.rim == "hard" else f" and a {splat.rim} rim"
     held += "" if splat.stop is None else f" and a stop at {splat.stop:g}"
     lines.append(

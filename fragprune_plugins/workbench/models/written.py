@@ -48,7 +48,7 @@ def describe_written(out: Path, held: str = "", *, pruned: bool = True) -> str:
         pruned: whether the model has thresholds.
     """
     form = formats.named(out)
-    cut = f", and thresholds {form.thresholds}" if pruned and form.thresholds else ""
+    cut = f", and cutoffs {form.thresholds}" if pruned and form.thresholds else ""
     kept = f" A {form.suffix} file keeps {form.keeps}{cut}." if form.keeps else ""
     return f"Wrote {out}{held}.{kept}"
 

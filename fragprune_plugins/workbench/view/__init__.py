@@ -1,4 +1,4 @@
-"""``fragprune view``: a model in the browser, pruned beside unpruned."""
+"""``fragprune view``: a model in the browser, original beside pruned."""
 
 from __future__ import annotations
 

@@ -176,11 +176,11 @@ def expect_carrier(form: Format, path: Path) -> None:
     if not form.thresholds:
         raise OutputError(
             str(path),
-            f"a {form.name} file, which cannot hold thresholds: its picture would be worse and "
+            f"a {form.name} file, which cannot hold cutoffs: its picture would be worse and "
             "heavier than that of the pruned model",
             "a file that holds them: " + ", ".join(_carriers()),
             "Choose another suffix. fragprune export --no-truncation writes the model without its "
-            "thresholds; fragprune finetune --portable learns a model that needs none.",
+            "cutoffs; fragprune finetune --portable learns a model that needs none.",
         )
 
 

@@ -167,6 +167,6 @@ FORMAT = Format(
     read,
     write,
     keeps="positions and scales to 10 or 11 bits of the range of each 256 Gaussians, rotations to "
-    "10 bits, opacities, colours and SH to 8 bits, and no thresholds",
+    "10 bits, opacities, colours and SH to 8 bits, and no cutoffs",
     claims=lies_at,
 )

@@ -61,5 +61,5 @@ FORMAT = Format(
     read,
     write,
     keeps="positions and scales as they are, opacities, colours and rotations to 8 bits, no SH "
-    "but the base colour, and no thresholds",
+    "but the base colour, and no cutoffs",
 )

@@ -517,13 +517,13 @@ async function start() {
         sides(viewer);
     }
     const counts = scene.models.map(({ gaussians }) => gaussians.toLocaleString("en"));
-    $("#about").textContent = `${counts.join(" and ")} Gaussians`;
+    $("#about").textContent = `${[...new Set(counts)].join(" and ")} Gaussians`;
     const stop = Math.max(...scene.models.map(({ stop }) => stop ?? 0));
     if (stop > 0)  // they are looked at between portions
-        $("#about").textContent += `. Its pixels stop at ${+(100 * stop).toPrecision(3)} % of their light, `
+        $("#about").textContent += `. A pixel ends when ${+(100 * stop).toPrecision(3)} % of its light is left, `
             + "here a few fragments later";
     if (scene.models.some(({ rim }) => rim === "soft"))
-        $("#about").textContent += ". Its rims are soft, across a pixel; here they are hard";
+        $("#about").textContent += ". Rims are soft, across a pixel; here they are hard";
 }
 
 function failed(error) {
