@@ -76,6 +76,8 @@ def test_as_text_the_result_comes_first(model, audited, tmp_path):
     assert "1 generated view from all around" in first
     assert any(line.startswith("PlayCanvas ") for line in others)
     assert "fragprune finetune" in result.stdout
+    titles = [line for line in others if line.endswith(":")]
+    assert [title.split()[0] for title in titles] == ["Simple", "Pixels", "Where", "Shares"]
     assert "audit" in result.stderr  # the bar
 
 
