@@ -36,7 +36,7 @@ def test_writes_a_pair_and_a_table(scene, tmp_path):
         "original",
         "pruned",
         "x fewer fragments",
-        str(out),
+        f"fragprune view {out}. A page to share: fragprune report {tmp_path}",
     ):
         assert words in result.stdout
     assert "fine-tuning" in result.stderr

@@ -43,6 +43,7 @@ def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
     assert report["command"] == "finetune"
     fewer = figures["before"]["fragments_per_pixel"] / figures["after"]["fragments_per_pixel"]
     assert f"{fewer:.2f}x fewer fragments" in report["result"]
+    assert "<title>Pruning of model.ply" in page
     assert report["result"].replace(">", "&gt;") in page
     assert len(report["views"]) > 0
     # every picture is in the page itself: seven a view and the curves

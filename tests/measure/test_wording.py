@@ -48,6 +48,15 @@ def test_frames_are_called_faster_only_beyond_two_standard_errors(ms, error, cla
     assert said.endswith("noise") == ("noise" in claim)
 
 
+@pytest.mark.parametrize(
+    ("now", "figure", "word"),
+    [(10.0, "2.0x", "fewer"), (19.0, "1.05x", "fewer"), (40, "2.0x", "more")],
+)
+def test_a_headline_of_fragments_says_fewer_or_more(now, figure, word):
+    first, *_ = headlines({"before": measured(20, 3, 30), "after": measured(now, 3, 30)}, None)
+    assert first == (figure, f"{word} fragments to draw: 20.0 → {now:.1f} a pixel")
+
+
 def test_more_fragments_are_not_called_fewer():
     assert fewer(10.0, 25.0) == "2.50x more fragments (10.0 -> 25.0 per pixel)"
     assert fewer(25.0, 25.1) == "as many fragments (25.0 -> 25.1 per pixel)"

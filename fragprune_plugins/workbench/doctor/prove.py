@@ -253,7 +253,8 @@ def _text(data: dict[str, Any]) -> str:
 def _table(rows: Sequence[dict[str, Any]]) -> str:
     """Times in turns; a ratio is that to the untruncated row of the same engine."""
     lines = [
-        f"{'engine':<28}{'size':>11}  {'pass':<17}{'cut':<5}{'median ms':>10}{'±se':>7}{'':>8}"
+        f"{'engine':<28}{'size':>11}  {'pass':<17}{'cutoffs':<8}{'median, ms':>11}{'±':>9}"
+        f"{'as fast':>9}"
     ]
     plain: dict[tuple[str, ...], float] = {}
     for row in rows:
@@ -266,7 +267,7 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
         size = f"{row['width']}x{row['height']}"
         lines.append(
             f"{row['engine']:<28}{size:>11}  {row['pass']:<17}"
-            f"{'yes' if row['truncated'] else 'no':<5}{row['ms_median']:>10.2f}{row['ms_se']:>7.2f}"
-            f"{faster and '  ' + faster}"
+            f"{'yes' if row['truncated'] else 'no':<8}{row['ms_median']:>11.2f}{row['ms_se']:>9.2f}"
+            f"{faster:>9}".rstrip()
         )
     return "\n".join(lines)

@@ -193,10 +193,17 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
             "PSNR against the original; more training may be a part of it",
         )
     return [
-        (f"{was / max(now, 1e-9):.1f}x", f"fewer fragments to draw: {was:.1f} → {now:.1f} a pixel"),
+        _drawn(was, now),
         (f"{faster:.2f}x", took),
         picture,
     ]
+
+
+def _drawn(was: float, now: float) -> tuple[str, str]:
+    """The ratio of fragments per pixel, and what it says."""
+    ratio, word = (was / max(now, 1e-9), "fewer") if was >= now else (now / max(was, 1e-9), "more")
+    figure = f"{ratio:.2f}x" if ratio < 1.1 else f"{ratio:.1f}x"
+    return figure, f"{word} fragments to draw: {was:.1f} → {now:.1f} a pixel"
 
 
 def _by_pruning(before: dict[str, Any], after: dict[str, Any], control: dict[str, Any]) -> float:

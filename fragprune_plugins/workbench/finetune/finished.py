@@ -113,6 +113,7 @@ class Finetuned:
                 "drawing": {},
             }
         records.leave(self.out, "finetune", data | more)
+        text += f"\n{next_steps(self.out, self.out.parent)}"  # records name no folders
         return Report(data, text, exit_code=130 if result.interrupted else 0)
 
     def _data(self, figures: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -203,7 +204,6 @@ class Finetuned:
         lines.append(describe_written(self.out, held))
         if form.keeps:
             lines.append("The figures above are of the model as it was learned, before rounding.")
-        lines.append(next_steps(self.out, self.out.parent))
         return "\n".join(lines)
 
 

@@ -80,7 +80,7 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
             report_page.TEMPLATE,
             drawn,
             lambda file: embedded(pictures / file),
-            title=f"{_heading(main)} of {folder.resolve().name}",
+            title=f"{_heading(main)} of {_of(main, folder)}",
             facts=_facts(main, files),
             quote=line,
             notes=filter(None, [_ONLY_CONTROLS if control else "", portable(missing, folder)]),
@@ -189,6 +189,12 @@ def _heading(record: Record) -> str:
     if _goal(record) == CONTROL:
         return "The control: the same training without pruning"
     return "Pruning"
+
+
+def _of(record: Record, folder: Path) -> str:
+    """The name of what was pruned: a model's file, or the folder of a training."""
+    name = Path(str(record.data.get("model", ""))).name if record.command == "finetune" else ""
+    return name or folder.resolve().name
 
 
 def _facts(record: Record, among: Sequence[Path]) -> list[tuple[str, str]]:
