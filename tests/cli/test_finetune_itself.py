@@ -219,3 +219,12 @@ def test_a_share_is_a_number_below_one(scene, value, tmp_path):
     result = run("finetune", path, "--out", tmp_path / "out.ply", "--self", value)
     assert result.exit_code == 2
     assert "is no share of the views" in result.stderr
+
+
+@pytest.mark.parametrize(("line", "target"), [("true", "itself"), ("0.5", "photographs")])
+def test_a_file_of_options_says_it_with_or_without_a_share(scene, line, target, tmp_path):
+    data, path, _ = scene
+    config = tmp_path / "options.toml"
+    config.write_text(f"self = {line}\niters = 2\n")
+    arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply")
+    assert run_json(*arguments, "--config", config)["target"] == target

@@ -57,6 +57,8 @@ def _as_words(option: click.Option, setting: Any) -> Any:
     Raises:
         ValueError: no line can say it.
     """
+    if setting is True and isinstance(option.flag_value, str):  # its value may be left out
+        return option.flag_value
     if isinstance(setting, bool) != option.is_flag or isinstance(setting, list) != option.multiple:
         kind = "true or false" if option.is_flag else "a list" if option.multiple else "one value"
         raise ValueError(f"{setting!r:.80}, where {kind} belongs")
