@@ -69,7 +69,7 @@ REASONS = ("behind what is opaque", "at the rim, beyond 2 sigma", "of faint Gaus
 """Where an idle fragment sits: the first that is true of it."""
 
 AS_IT_IS = "as it is"
-UNTRUNCATED = "without its thresholds and stop"
+UNTRUNCATED = "without its cutoffs and stop"
 
 _COUNTS = ("fragments_per_pixel", "evaluated_per_pixel")
 
@@ -338,7 +338,7 @@ def _amid(count: int) -> list[int]:
     return [(2 * part + 1) * count // (2 * parts) for part in range(parts)]
 
 
-HONOURING = "a viewer that knows its thresholds"
+HONOURING = "a viewer that knows its cutoffs"
 
 
 def _candidates(model: Model, splats: Splats) -> dict[str, Candidate]:
@@ -366,7 +366,7 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 def _viewers(asked: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
     rules = {viewer.names: (viewer.extent.name, viewer.shape) for viewer in VIEWERS}
-    rules[HONOURING] = ("quads by thresholds, 1/255", "quad")
+    rules[HONOURING] = ("quads by cutoffs, 1/255", "quad")
     means = {names: statistics.fmean(pixels) for names, pixels in asked.items()}
     first = means[VIEWERS[0].names]
     return [

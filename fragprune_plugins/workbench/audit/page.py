@@ -156,7 +156,7 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
     viewers.append(
         [
             "fragprune",
-            "tiles by ellipse, 1/255 or threshold; ends where opaque",
+            "tiles by ellipse, 1/255 or cutoff; ends where opaque",
             f"{figures['evaluated_per_pixel']:.1f}",
             f"{figures['evaluated_per_pixel'] / max(quads, 1e-9):.2f}",
         ]
