@@ -102,15 +102,13 @@ def find(model: Path) -> Path | None:
     return path if os.path.exists(path) else None  # also for too long a name
 
 
-def save(
-    model: Path,
-    store: ThresholdStore,
-    *,
-    adapter: str = "",
-    host_commit: str = "",
-    settings: dict[str, Any] | None = None,
-) -> Path:
+def save(model: Path, store: ThresholdStore, **about: Any) -> Path:
     """Write the store beside an existing model file, which stays; returns the sidecar's path.
+
+    Args:
+        model: the file.
+        store: its thresholds.
+        about: adapter, host_commit and settings, as ``SidecarInfo`` has them.
 
     Raises:
         DivergedError: learned values are not finite.
@@ -121,20 +119,11 @@ def save(
         with locked(model):
             _tidy(model)
     with replacing(target, durable=True) as new:
-        info = SidecarInfo(len(store), digest(model), adapter, host_commit, settings or {})
-        _write(new, store, info)
+        _write(new, store, SidecarInfo(len(store), digest(model), **about))
     return target
 
 
-def replace_pair(
-    path: Path,
-    whole: Path,
-    store: ThresholdStore | None,
-    *,
-    adapter: str = "",
-    host_commit: str = "",
-    settings: dict[str, Any] | None = None,
-) -> None:
+def replace_pair(path: Path, whole: Path, store: ThresholdStore | None, **about: Any) -> None:
     """Put a finished model file and its thresholds in the place of a model and its sidecar.
 
     A process that ends in between, or a power cut, leaves the old pair or the new one.
@@ -143,7 +132,7 @@ def replace_pair(
         path: of the model.
         whole: the finished file, in a folder that ``atomic.staging`` gave for ``path``.
         store: its thresholds; None for a model without a sidecar.
-        adapter, host_commit, settings: as ``SidecarInfo`` has them.
+        about: as in ``save``.
 
     Raises:
         DivergedError: learned values are not finite; the old pair stays.
@@ -154,9 +143,8 @@ def replace_pair(
     try:
         if store is not None:
             sha = digest(whole)
-            info = SidecarInfo(len(store), sha, adapter, host_commit, settings or {})
             new = whole.with_name(beside.name)
-            _write(new, store, info)
+            _write(new, store, SidecarInfo(len(store), sha, **about))
             put(new, _address(path, sha))
         elif beside.exists():  # it stays with the old model for as long as that is there
             rename(beside, _address(path, digest(path) if path.is_file() else "none"))

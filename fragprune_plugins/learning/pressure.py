@@ -134,16 +134,12 @@ class StepViews:
     """
 
     expected: int = 1
-    _fragments: list[Figure] = field(default_factory=list)
-    _pressed: list[Figure] = field(default_factory=list)
-    _untruncated: list[Figure] = field(default_factory=list)
-    _losses: list[Figure | None] = field(default_factory=list)
+    _rows: list[list[Figure]] = field(default_factory=list)
 
     def begin(self) -> None:
         """Forget the views of the last step; their number is what the next step expects."""
         self.expected = self.drawn or self.expected
-        self._fragments, self._untruncated, self._losses = [], [], []
-        self._pressed = []
+        self._rows = []
 
     def draw(self, fragments: Figure, untruncated: Figure, pressed: Figure | None = None) -> None:
         """Note a view drawn with gradients: its fragments per pixel now and before learning.
@@ -153,51 +149,46 @@ class StepViews:
             untruncated: before.
             pressed: what the pressure acts on; the fragments when None.
         """
-        self._fragments.append(fragments)
-        self._pressed.append(fragments if pressed is None else pressed)
-        self._untruncated.append(untruncated)
-        self._losses.append(None)
+        pressed = fragments if pressed is None else pressed
+        self._rows.append([fragments, untruncated, pressed])  # the loss comes later
 
     def lose(self, loss: Figure) -> None:
         """Note the loss of the view drawn last."""
-        if self._losses:
-            self._losses[-1] = loss
+        if self._rows:
+            self._rows[-1][3:] = [loss]
 
     def rows(self) -> list[list[float]]:
-        """Of each view so far: fragments, untruncated, pressed, loss."""
-        losses = [math.nan if loss is None else loss for loss in self._losses]
-        columns = (self._fragments, self._untruncated, self._pressed, losses)
-        return [[float(each) for each in row] for row in zip(*columns, strict=True)]
+        """Of each view so far: fragments, untruncated, pressed, loss; NaN for an unknown one."""
+        return [[float(each) for each in (*row, math.nan)[:4]] for row in self._rows]
 
     @property
     def drawn(self) -> int:
         """Number of views so far."""
-        return len(self._fragments)
+        return len(self._rows)
 
     @property
     def fragments(self) -> float:
         """Fragments per pixel, mean over the views so far."""
-        return _mean(self._fragments)
-
-    @property
-    def pressed(self) -> float:
-        """What the pressure acts on, mean over the views so far."""
-        return _mean(self._pressed)
+        return self._mean(0)
 
     @property
     def untruncated(self) -> float:
         """Fragments per pixel before learning, mean over the views so far."""
-        return _mean(self._untruncated)
+        return self._mean(1)
+
+    @property
+    def pressed(self) -> float:
+        """What the pressure acts on, mean over the views so far."""
+        return self._mean(2)
 
     @property
     def loss(self) -> float:
         """Sum of the known losses of the views so far; NaN if none is known."""
-        known = [float(loss) for loss in self._losses if loss is not None]
+        known = [float(row[3]) for row in self._rows if len(row) > 3]
         return sum(known) if known else math.nan
 
-
-def _mean(figures: list[Figure]) -> float:
-    return sum(map(float, figures)) / len(figures)
+    def _mean(self, column: int) -> float:
+        return sum(float(row[column]) for row in self._rows) / len(self._rows)
 
 
 class PressureController:

@@ -321,6 +321,7 @@ class Drawing:
     def __init__(self, device: Device, inputs: RasterInputs, thresholds: Tensor | None) -> None:
         self._device, self._inputs, self._n = device, inputs, len(inputs.splats)
         self.where = inputs.splats.device
+        self._launch = partial(launch, device, self.where)
         view = inputs.view
         self._arrays = native_arrays(inputs, thresholds, self.where)
         offsets = self._arrays.get("sample_offsets")
@@ -510,16 +511,6 @@ class Drawing:
             "wins_per_gaussian": zeros(n) if scores else None,
             "winners": new(*size, dtype=torch.int32) if scores else None,
         }
-
-    def _launch(
-        self,
-        source: str,
-        macros: dict[str, int],
-        kernel: str,
-        blocks: int,
-        arguments: ctypes.Structure,
-    ) -> None:
-        launch(self._device, self.where, source, macros, kernel, blocks, arguments)
 
     # ---- backward ------------------------------------------------------------------------------
 
