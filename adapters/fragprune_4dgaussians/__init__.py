@@ -15,7 +15,6 @@ import os
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NoReturn
 
 import fragprune_graphdeco as graphdeco
@@ -44,6 +43,9 @@ OUTPUTS = 3
 STATE = 12
 """The place of the optimizer's state in a checkpoint."""
 
+UNUSED = {"open3d": {}, "lpips": {}, "tkinter": {"W": "w"}}
+"""What it imports and does not use to train or draw; W by name."""
+
 _NETWORK = Door(
     ModelFileError,
     "not readable as a part of the model",
@@ -56,7 +58,7 @@ _NETWORK = Door(
 class MovingDialect(DepthDialect):
     """Vanilla's call of 2023 with depth."""
 
-    unused = ("open3d", "lpips", "tkinter")
+    spares = UNUSED
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call.
@@ -66,12 +68,6 @@ class MovingDialect(DepthDialect):
         s = call.settings
         flat = {name: getattr(s, name).reshape(4, 4) for name in ("viewmatrix", "projmatrix")}
         return super().unpack(replace(call, settings=s._replace(**flat)))
-
-    def spares(self) -> dict[str, ModuleType]:
-        """Stand-ins for packages that the host imports and does not use to train or draw."""
-        spares = super().spares()
-        vars(spares["tkinter"])["W"] = "w"  # imported by name
-        return spares
 
 
 def completed(call: SeamCall) -> Any:

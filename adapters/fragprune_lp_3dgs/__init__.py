@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
@@ -31,9 +31,20 @@ MINI, RAD = "scene.gaussian_model_mini_splatting", "scene.gaussian_model_rad_spl
 NO_METRICS = dict.fromkeys(("SSIM", "PSNR", "LPIPS"), math.nan)
 
 
+def _nothing(*_: Any, **__: Any) -> None:
+    """Accept any arguments and do nothing."""
+
+
+NO_SWEEP = SimpleNamespace(sweep_id=None)
+SILENT = {"wandb": {"init": lambda **_: NO_SWEEP, "define_metric": _nothing, "log": _nothing}}
+"""A wandb that records nothing."""
+
+
 @dataclass(frozen=True)
 class LP3DGSDialect(GraphdecoDialect):
     """Vanilla's call of 2023, and its form that sums blending weights."""
+
+    spares = SILENT
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call; with scores if the host wants blending weights.
@@ -55,17 +66,6 @@ class LP3DGSDialect(GraphdecoDialect):
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
         """(colour (3, H, W), radii (P,), None, score (P,) sum of alpha T or None)."""
         return outputs.image, outputs.radii, None, outputs.weights_per_gaussian
-
-    def spares(self) -> dict[str, ModuleType]:
-        """A wandb that records nothing and names no sweep."""
-        module = ModuleType("wandb", "Stand-in of fragprune: records nothing.")
-        run = SimpleNamespace(sweep_id=None)
-        vars(module).update(init=lambda **_: run, define_metric=_nothing, log=_nothing)
-        return {"wandb": module}
-
-
-def _nothing(*_: Any, **__: Any) -> None:
-    """Accept any arguments and do nothing."""
 
 
 def nothing_rendered(call: SeamCall) -> dict[str, float]:

@@ -33,6 +33,9 @@ MODEL = "scene.gaussian_model"
 PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 """Inside the checkout, and compiled when it is imported."""
 
+UNUSED: dict[str, dict[str, str]] = {"wandb": {}}
+"""What it imports and never uses."""
+
 WARM_UP = 10_000
 """Iterations that ``--ours_new`` warms up."""
 
@@ -49,7 +52,7 @@ class RainDialect(DepthDialect):
     """Vanilla's call of 2023 with a dilation of its own, and depth."""
 
     own_kernels = "compiler"
-    unused = ("wandb",)
+    spares = UNUSED
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call."""

@@ -18,6 +18,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from unittest import mock
 
@@ -37,9 +38,10 @@ parser.add_argument("--device", default="cuda", help="cpu, or cuda")
 args = parser.parse_args()
 
 session = fragprune_plugins.activate(host=args.checkout, stage="off")  # above the host's imports
-for name, unused in session.dialect.spares().items():
+for name, members in session.dialect.spares.items():
     if find_spec(name) is None:
-        sys.modules[name] = unused
+        sys.modules[name] = ModuleType(name)
+        vars(sys.modules[name]).update(members)
 sys.path.insert(0, str(args.checkout))
 
 

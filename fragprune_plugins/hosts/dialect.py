@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from fragprune_plugins.hosts.seams import SeamCall
@@ -139,8 +139,8 @@ class Dialect(ABC):
     """What compiled modules inside the host's own package need: a "gpu"; or also CUDA's "compiler",
     because they are compiled when they are imported. "" if there are none."""
 
-    unused: ClassVar[tuple[str, ...]] = ()
-    """Packages that the host imports and never uses, by import name."""
+    spares: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
+    """Packages that the host can do without on a CPU, by import name: what it needs of each."""
 
     @property
     def prover(self) -> Prover | None:
@@ -190,7 +190,3 @@ class Dialect(ABC):
     def names(self) -> frozenset[str]:
         """The import names in ``modules``; these packages need not be installed."""
         return frozenset(self.modules(lambda call: None))
-
-    def spares(self) -> dict[str, ModuleType]:
-        """Stand-ins for packages that the host can do without, for a CPU: those ``unused``."""
-        return {name: ModuleType(name, "Stand-in of fragprune: empty.") for name in self.unused}

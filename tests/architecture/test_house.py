@@ -1,10 +1,10 @@
 """The size of the house, counted from its source. A bound is lowered whenever the figure falls."""
 
 import ast
-import inspect
 from collections import Counter
 from functools import cache
 from pathlib import Path
+from types import FunctionType
 
 import pytest
 
@@ -25,7 +25,7 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (13_184, 12_000),
+    "core lines": (13_147, 12_000),
     "core imports of the workbench": (0, 0),
     "imports inside functions": (46, 60),
     "functions over 60 lines": (6, 10),
@@ -103,9 +103,10 @@ def lines_of_imports() -> int:
 
 
 def members(*kinds: type) -> set[str]:
-    """Methods that a subclass may define."""
+    """Methods and properties that a subclass may define."""
     known = (item for kind in kinds for item in vars(kind).items())
-    return {name for name, value in known if inspect.isfunction(value) and name[0] != "_"}
+    kinds_of = (FunctionType, property)
+    return {name for name, value in known if isinstance(value, kinds_of) and name[0] != "_"}
 
 
 def single_users() -> list[str]:

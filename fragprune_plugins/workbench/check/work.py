@@ -198,7 +198,7 @@ def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
     if not isinstance(adapter, ScriptAdapter):
         return []
     scripts, dialect = adapter.command_line(repo).scripts, adapter.dialect(repo)
-    answered = {*dialect.names(), *dialect.spares()}
+    answered = {*dialect.names(), *dialect.spares}
     return missing_imports(repo, [repo.root / name for name in scripts], answered)
 
 
