@@ -216,7 +216,7 @@ VALUES = {
     "iters = {a = 1}": "where text or a number belongs",
     "iters = 1979-05-27": "where text or a number belongs",
     "seed = 1e400": "not a valid integer",
-    "self = []": "where true or false belongs",
+    "portable = []": "where true or false belongs",
     "white-background = 3": "where true or false belongs",
     "log = 'csv:a.csv'": "where a list belongs",
     "log = [['csv:a.csv']]": "where text or a number belongs",
