@@ -25,6 +25,7 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     text = (
         f"\n{table}\n\n{outcome('run', report, report['control'])}\n"
         f"Of larger pictures, {larger['size']}: {frames(larger['before'], larger['after'])}.\n"
-        f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures."
+        f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures. "
+        f"To turn it: fragprune view {out}"
     )
     return Report(report, text)
