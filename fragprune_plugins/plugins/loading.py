@@ -96,13 +96,16 @@ class Plugins:
         try:
             self._manager.register(plugin, name)
             self._manager.check_pending()
-            for hook in self._manager.get_hookcallers(plugin) or ():
+            hooks = self._manager.get_hookcallers(plugin) or ()
+            if not (hooks or isinstance(plugin, HostAdapter)):
+                raise ValueError("no hooks")
+            for hook in hooks:
                 for each in hook.get_hookimpls():
                     if each.plugin is plugin and (each.wrapper or each.hookwrapper):
                         raise ValueError(f"{hook.name} is a wrapper")
         except (pluggy.PluginValidationError, ValueError) as error:
             self._manager.unregister(name=name)
-            expected = "plain functions for hooks of fragprune, with their arguments"
+            expected = "an adapter's class, or plain functions for hooks, with their arguments"
             raise _broken(name, "", str(error), expected) from error
         if isinstance(plugin, HostAdapter):
             _take(self, plugin)
@@ -206,8 +209,8 @@ def _load(plugins: Plugins, entry: EntryPoint, where: str) -> None:
                 "plugin-failed",
                 where,
                 found,
-                "a module that imports and implements known hooks",
-                "Fix or uninstall it, or set FRAGPRUNE_BLOCK.",
+                "an adapter's class, or a module that implements known hooks",
+                "Fix it, install it again or uninstall it, or set FRAGPRUNE_BLOCK.",
             )
         )
     else:
@@ -231,11 +234,7 @@ def _take(plugins: Plugins, adapter: HostAdapter) -> None:
 
 
 def _call(implementation: pluggy.HookImpl, hook: Hook, given: dict[str, Any]) -> Any:
-    """Call one plugin's hook and return its answer.
-
-    Raises:
-        PluginError: it raised.
-    """
+    """Call one plugin's hook and return its answer; PluginError if it raised."""
     arguments = [given[name] for name in implementation.argnames]
     try:
         return implementation.function(*arguments)

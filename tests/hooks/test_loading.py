@@ -75,6 +75,7 @@ class Nameless(Vanilla3DGS):
         (ImportError("libfancy.so is missing"), "ImportError: libfancy.so is missing"),
         (ZeroDivisionError("at import"), "ZeroDivisionError"),
         (Misspelt(), "fragprune_trunkate"),
+        (logging, "no hooks"),  # where an older installation names a module
         (WrongArgument(), "tau"),
         (Broken, "RuntimeError: my table is missing"),
         (HostAdapter, "abstract class HostAdapter"),
@@ -86,6 +87,7 @@ class Nameless(Vanilla3DGS):
         "import fails",
         "import raises",
         "misspelt hook",
+        "no hooks",
         "unknown argument",
         "adapter raises",
         "adapter is abstract",
