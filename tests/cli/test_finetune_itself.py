@@ -228,3 +228,12 @@ def test_a_file_of_options_says_it_with_or_without_a_share(scene, line, target, 
     config.write_text(f"self = {line}\niters = 2\n")
     arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply")
     assert run_json(*arguments, "--config", config)["target"] == target
+
+
+@pytest.mark.parametrize("share", [("--self",), ("--self", 0.5)])
+def test_cameras_of_ones_own_are_for_own_pictures_alone(scene, cameras, share, tmp_path):
+    _, path, _ = scene
+    words = ("finetune", path, *share, "--cameras", cameras, "--iters", 1)
+    result = run(*words, "--out", tmp_path / "out.ply")
+    assert result.exit_code == (2 if len(share) > 1 else 0)
+    assert ("cameras beside those of --data" in result.stderr) == (len(share) > 1)

@@ -50,15 +50,15 @@ def _share(
 
 
 def _own(ctx: click.Context, param: click.Parameter, value: str | float | None) -> float | None:
-    """The share of own pictures: 1 without a number, or 0 to 0.9."""
-    if value is None or value is False:
+    """The share of own pictures: 1 without a number, or above 0 to 0.9."""
+    if value is None:
         return None
     try:
         share = float(value)
     except ValueError:
         share = 0.0
     if share == 1 or 0 < share <= 0.9:
-        return share
+        return share if share < 1 else 1  # as rules spell it
     raise click.BadParameter(
         f"{value!r} is no share of the views with 0 < X <= 0.9, such as 0.5. For own pictures "
         "alone write --self behind MODEL, without a number."
@@ -70,13 +70,14 @@ _PARTS = "options that each process can follow with a part of the Gaussians"
 RULES = (
     *LEARNING_APART,
     Alone(("--data", "--cameras"), "one source of cameras"),
-    Needs("--cameras", ("--self 1.0",), "the model's own pictures alone, which those cameras show"),
+    Needs("--cameras", ("--self",), "the model's own pictures, which those cameras show"),
+    Alone(("--self 0.*", "--cameras"), "own pictures from cameras beside those of --data"),
     Alone(("--self", "--max-drop"), "photographs, and with them a control to lose against"),
     Alone(
         ("--self", "--control"),
         "something to learn: without truncation the model is its own target already",
     ),
-    Alone(("--self 1.0", "--keep auto"), "photographs, whose error says what can be spared"),
+    Alone(("--self 1", "--keep auto"), "photographs, whose error says what can be spared"),
     *apart("--shard-gaussians", "--self", "--portable", expected=_PARTS),
     *apart("--shard-gaussians", "--max-drop", "--keep", "--drop-invisible", expected=_PARTS),
 )

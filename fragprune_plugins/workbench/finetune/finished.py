@@ -280,7 +280,7 @@ def advise_own_pictures(data: dict[str, Any]) -> str | None:
         return None
     return (
         "MODEL as it came shows the held-out views better: if it was trained to its end, "
-        "--self 0.5 loses less."
+        "--self 0.5 may lose less."
     )
 
 
