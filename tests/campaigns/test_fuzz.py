@@ -4,10 +4,12 @@ Seconds of it; ``python -m campaigns.fuzz`` has the hours.
 """
 
 import os
+import shutil
 import signal
+import socket
 
 import pytest
-from campaigns.fuzz import seeds
+from campaigns.fuzz import commands, seeds
 from campaigns.fuzz.readers import READERS, Reader
 from campaigns.fuzz.running import BAD, GOOD, Nonsense, inputs, judge, run
 
@@ -41,6 +43,20 @@ def test_the_corpus_is_what_its_maker_makes():
     for name, files in made.items():
         kept = {path.name for path in (seeds.CORPUS / name).iterdir()}
         assert {each for each in kept if not each.startswith("found-")} == files.keys()
+
+
+@pytest.mark.parametrize("reader", [commands.COMMANDS[-3]], ids=lambda reader: reader.name)
+def test_commands_state_what_is_wrong_with_a_broken_file(reader, tmp_path):
+    assert judge(reader, b"{", tmp_path / "input")[0] == "stated"
+    assert judge(reader, reader.pool()[0], tmp_path / "input")[0] == "read"
+
+
+def test_no_command_uses_the_network(tmp_path, monkeypatch):
+    for name in ("socket", "create_connection", "getaddrinfo"):
+        monkeypatch.setattr(socket, name, None)
+    shutil.copytree(commands.scene(), tmp_path / "scene")
+    for name in commands.NAMES:
+        commands.command(name, tmp_path / "scene")
 
 
 def raising(error):
