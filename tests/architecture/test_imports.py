@@ -106,31 +106,6 @@ def test_loading_every_plugin_imports_no_torch(python):
     ) == [True, False]
 
 
-def test_no_module_warns_on_import(python):
-    """Our own modules only: torch and matplotlib are imported before warnings become errors."""
-    python(
-        """
-import sys, warnings
-from importlib import import_module
-import torch, scipy.spatial, safetensors.torch, PIL.Image, click, wrapt, pluggy, plyfile, tqdm
-import skimage.metrics, matplotlib.figure
-warnings.simplefilter("error")
-for name in sys.argv[1:]:
-    if not name.endswith("__main__"):
-        import_module(name)
-""",
-        *MODULES,
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("module", MODULES)
-def test_every_module_imports_alone(python, module):
-    if module.endswith("__main__"):
-        pytest.skip("a program")
-    python(f"import {module}")
-
-
 def test_import_rules_hold():
     program = shutil.which("lint-imports", path=str(Path(sys.executable).parent))
     if program is None:

@@ -127,29 +127,6 @@ def test_both_calls_of_a_late_state_are_vanillas_own(tmp_path):
     assert not Vanilla3DGS().match(skeleton(tmp_path / "early", arguments=["dc"])).fits
 
 
-@pytest.mark.parametrize("seam", [s for s in Vanilla3DGS.seams if not s.external], ids=str)
-def test_every_seam_that_is_gone_or_changed_is_named(tmp_path, seam):
-    repo = skeleton(tmp_path)
-    path = repo.path(seam.module)
-    head = f"def {seam.attribute.split('.')[-1]}("
-    whole = path.read_text()
-    path.write_text(whole.replace(head, "def renamed("))
-    *others, gone = errors(HostRepo(tmp_path))
-    assert gone.code == "seam-missing"
-    assert [f.code for f in others] == ["rasterizer-call"] * (seam.role is Role.VIEW)
-    assert gone.where.startswith(f"{seam} ({path.relative_to(tmp_path)}:")
-    for name in seam.needs:
-        changed = [
-            line.replace(name, "other", 1) if head in line else line for line in whole.splitlines()
-        ]
-        path.write_text("\n".join(changed))
-        found = errors(HostRepo(tmp_path))
-        line = next(n for n, text in enumerate(changed, 1) if head in text)
-        where = f"{seam} ({path.relative_to(tmp_path)}:{line})"
-        assert [(f.code, f.where) for f in found] == [("seam-signature", where)]
-        assert name in found[0].expected
-
-
 def test_a_folder_that_is_no_host_is_refused_with_a_reason_and_a_remedy(tmp_path):
     (tmp_path / "train.py").write_text("print('another project')")
     with pytest.raises(UnknownHostError) as caught:

@@ -26,17 +26,6 @@ def stepped():
         yield host, model
 
 
-def test_the_active_session_is_the_only_one(stepped):
-    host, _ = stepped
-    assert active_session() is host.session
-    with pytest.raises(SessionError, match="a session is active") as caught:
-        host.session.activate()
-    assert caught.value.where == "activate()"
-    assert active_session() is host.session
-    with host.session as inside:  # active already
-        assert inside is host.session
-
-
 def test_after_it_an_optimizer_has_no_hook_of_ours():
     with joint() as host:
         model = host.model()

@@ -183,28 +183,3 @@ def test_without_the_cpu_engine_large_frames_are_compared_with_themselves(
     assert only("large", device) == []
     found = only("large", Watched(device, another_picture_each_time))
     assert "large frame: picture is another in another run" in found
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_at_full_size_blocks_meet_and_a_sound_engine_agrees(device: EmulatedDevice) -> None:
-    work = Workload(steps=1)
-    lists, giants, passes = [], [], set()
-
-    def look(kernel: str, arguments: ctypes.Structure) -> None:
-        if kernel == "fp_emit":
-            tiles = array(arguments.tiles, arguments.inputs.count, ctypes.c_uint32)
-            giants.append(int(torch.frombuffer(tiles, dtype=torch.int32).max()))
-        if kernel == "fp_ranges":
-            count = 2 * arguments.tiles_x * arguments.tiles_y
-            ranges = torch.frombuffer(
-                array(arguments.ranges, count, ctypes.c_uint32), dtype=torch.int32
-            )
-            lists.append(int(ranges.reshape(-1, 2).diff(dim=1).max()))
-            passes.add(arguments.tile_passes)
-
-    assert compare(Watched(device, look), CPU, work) == []
-    assert max(lists) > 256
-    assert max(giants) > 32 * 16  # more than a round of rows
-    assert passes == {1, 2, 3}
-    assert work.gaussians >= 300_000

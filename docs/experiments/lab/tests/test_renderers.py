@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "renderers.md"
+PAGE = Path(__file__).parents[3] / "how-to" / "renderers.md"
 ROWS = re.findall(r"^\| (.+?), \S+ \| `(.+?)` \| (.+?) \|", PAGE.read_text("utf-8"), re.MULTILINE)
 FOLDERS = {
     "gsplat": "gsplat",
