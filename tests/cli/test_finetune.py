@@ -10,7 +10,7 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.files import sidecar
+from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.workbench.finetune import faster, loop
@@ -205,34 +205,37 @@ def test_an_interrupted_removal_goes_on_with_the_same_gaussians(scene, tmp_path,
     assert not run_json(*arguments[:-1], 0.6, "--out", parts)["already_finished"]
 
 
-def test_a_control_of_all_gaussians_is_none_for_fewer(scene, tmp_path):
-    data, path, _ = scene
-    arguments = ("finetune", path, "--data", data, "--iters", 3)
-    run_json(*arguments, "--out", tmp_path / "control.ply", "--control")
-    fewer = run_json(*arguments, "--out", tmp_path / "fewer.ply", "--keep", 0.5)
-    assert fewer["control"] is None
-    run_json(*arguments, "--out", tmp_path / "half.ply", "--control", "--keep", 0.5)
-    fewer = run_json(*arguments, "--out", tmp_path / "again.ply", "--keep", 0.5)
-    assert fewer["control"]["gaussians"] == 30
+ALIKE = {"train": "all", "opacity_lr": None, "seed": 0, "views_per_step": 1}
 
 
-def test_a_control_of_one_view_a_step_is_none_for_two(scene, tmp_path):
-    data, path, _ = scene
-    arguments = ("finetune", path, "--data", data, "--iters", 3)
-    run_json(*arguments, "--out", tmp_path / "control.ply", "--control")
-    two = run_json(*arguments, "--out", tmp_path / "two.ply", "--views-per-step", 2)
-    assert two["control"] is None
-    assert run_json(*arguments, "--out", tmp_path / "one.ply")["control"]
+def measured(goal, psnr=30.0, iterations=3, keep=None, **settings):
+    """A record's data of a training that began with so many dB."""
+    begun = {"views": 2, "gaussians": 60, "psnr": psnr}
+    figures = {"before": begun, "after": begun | {"goal": goal}, "iterations": iterations}
+    return figures | {"keep": keep, "settings": ALIKE | {"goal": goal} | settings}
 
 
-def test_a_control_with_a_stop_is_none_and_one_without_is_of_every_stop(scene, tmp_path):
-    data, path, _ = scene
-    arguments = ("finetune", path, "--data", data, "--iters", 3)
-    run_json(*arguments, "--out", tmp_path / "stopped.ply", "--control", "--stop", 0.01)
-    assert run_json(*arguments, "--out", tmp_path / "none.ply")["control"] is None
-    run_json(*arguments, "--out", tmp_path / "control.ply", "--control")
-    for stop in ("off", "auto", 0.02):
-        assert run_json(*arguments, "--out", tmp_path / f"{stop}.ply", "--stop", stop)["control"]
+@pytest.mark.parametrize(
+    ("control", "run", "quoted"),
+    [
+        ({}, {}, True),
+        ({"keep": 0.5}, {"keep": 0.5}, True),
+        ({}, {"keep": 0.5}, False),
+        ({}, {"views_per_step": 2}, False),
+        ({}, {"seed": 1}, False),
+        ({}, {"iterations": 4}, False),
+        ({}, {"psnr": 30.1}, False),
+        ({"stop": 0.01}, {"stop": 0.01}, False),
+        *(({}, {"stop": stop}, True) for stop in (None, "auto", 0.02)),
+    ],
+)
+def test_a_control_is_quoted_only_of_the_same_training_without_a_stop(
+    tmp_path, control, run, quoted
+):
+    path = records.leave(tmp_path / "control.ply", "finetune", measured("control", **control))
+    found = records.control_of(measured("pressure", **run), [tmp_path / "none", path])
+    assert (found is not None) == quoted
+    assert not quoted or found["goal"] == "control"
 
 
 def test_a_target_and_a_control(scene, tmp_path):
@@ -244,6 +247,8 @@ def test_a_target_and_a_control(scene, tmp_path):
     report = run_json(*arguments, "--control")
     assert report["speedup"] == pytest.approx(1, abs=0.05)  # nothing is truncated
     assert read_ply(out).falloff is None
+    pruned = ("--out", tmp_path / "pruned.ply", "--iters", 40)
+    assert run_json(*arguments[:4], *pruned)["control"] == report["after"]
 
 
 def test_a_target_time_says_what_was_reached(scene, tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -166,26 +167,33 @@ def test_a_loss_without_a_view_is_nobodys():
     assert it.progress().fragments_before is None
 
 
-@pytest.mark.parametrize("target", [1.2, 1.8])
-def test_a_target_is_met_late_and_thresholds_then_stay(target):
-    views: dict[str, object] = {}
-    it = stage(settings=Settings(iterations=20, goal=Fewer(target)), views=views)
+def falling(goal, iterations, names="abc", **options) -> tuple[Stage2, dict[str, Callable]]:
+    """A stage, and its views: their fragments fall from 20 to 0 as thresholds rise from 0 to 1."""
+    views: dict[str, Callable] = {}
+    it = stage(settings=Settings(iterations=iterations, goal=goal), views=views, **options)
 
     def draw(view):
-        # fragments fall from 20 to 0 per pixel as thresholds rise from 0 to 1
-        drawn = 20 * (1 - it.store.values.mean())
-        outputs = SimpleNamespace(fragments_per_pixel=drawn)
+        outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
         return it.drew(view, outputs, lambda: drawing(None, 20.0))
 
-    views |= {view: lambda view=view: draw(view) for view in "abc"}
+    views |= {view: lambda view=view: draw(view) for view in names}
+    return it, views
+
+
+def take(it: Stage2, view: Callable) -> None:
+    it.begin(lambda: OPACITIES)
+    if (term := view()) is not None:
+        term.backward()
+    it.end()
+
+
+@pytest.mark.parametrize("target", [1.2, 1.8])
+def test_a_target_is_met_late_and_thresholds_then_stay(target):
+    it, views = falling(Fewer(target), 20)
     held = []
     for number in range(20):
-        it.begin(lambda: OPACITIES)
-        term = draw("abc"[number % 3])
+        take(it, views["abc"[number % 3]])
         held.append(not it.learning)
-        if term is not None:
-            term.backward()
-        it.end()
     progress = it.progress()
     assert held == [number >= 17 for number in range(20)]  # from 85 per cent of the run on
     assert progress.target_reached
@@ -201,30 +209,14 @@ def clocked(ratio, measure):
 
 @pytest.mark.parametrize("fixed", [1.0, 5.0, 9.0])
 def test_a_target_time_is_met_by_the_clock(fixed):
-    views: dict[str, object] = {}
-    truth = {"frame": fixed, "rest": 1.0}  # of a frame, by its fragments; the rest is the same
-
-    def time_of(fragments: float) -> float:
-        return truth["frame"] + truth["rest"] * fragments
-
-    def measure(shots):
+    def measure(shots):  # a frame takes a fixed time, and one by its fragments
         assert shots == ["a", "b", "c"]
         now = 20 * (1 - it.store.values.detach().mean())
-        return time_of(20.0) / time_of(float(now))
+        return (fixed + 20.0) / (fixed + float(now))
 
-    clock = clocked(2.0, measure)
-    it = stage(settings=Settings(iterations=20, goal=Faster(2.0)), views=views, target=clock)
-
-    def draw(view):
-        outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
-        return it.drew(view, outputs, lambda: drawing(None, 20.0))
-
-    views |= {view: lambda view=view: draw(view) for view in "abc"}
+    it, views = falling(Faster(2.0), 20, target=clocked(2.0, measure))
     for number in range(20):
-        it.begin(lambda: OPACITIES)
-        if (term := draw("abc"[number % 3])) is not None:
-            term.backward()
-        it.end()
+        take(it, views["abc"[number % 3]])
     progress = it.progress()
     assert progress.target_reached
     assert progress.faster == pytest.approx(2.0, rel=0.02)
@@ -235,22 +227,13 @@ def test_a_target_time_is_met_by_the_clock(fixed):
 
 def test_what_the_clock_said_outlives_a_checkpoint():
     def make():
-        views = {}
-        clock = clocked(2.0, lambda shots: 1.5)
-        it = stage(settings=Settings(iterations=20, goal=Faster(2.0)), views=views, target=clock)
+        return falling(Faster(2.0), 20, "a", target=clocked(2.0, lambda shots: 1.5))
 
-        def draw(view):
-            outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
-            return it.drew(view, outputs, lambda: drawing(None, 20.0))
-
-        views |= {"a": lambda: draw("a")}
-        return it, draw
-
-    it, draw = make()
+    it, views = make()
     for _ in range(13):  # past two of the looks at the clock
         it.begin(lambda: OPACITIES)
         it.store.place(torch.zeros(5))  # half of the fragments
-        draw("a").backward()
+        views["a"]().backward()
         it.end()
     tensors, plain = it.state_dict()
     again, _ = make()
@@ -273,18 +256,10 @@ def test_what_a_stage_kept_gives_the_thresholds_alone(stop, rim):
 
 
 def test_no_target_makes_fragments_fewer_than_twentyfold():
-    views: dict[str, object] = {}
-    clock = clocked(2.0, lambda shots: 1.1)
-    it = stage(settings=Settings(iterations=4, goal=Faster(2.0)), views=views, target=clock)
-
-    def draw(view):
-        outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
-        return it.drew(view, outputs, lambda: drawing(None, 20.0))
-
-    views |= {"a": lambda: draw("a")}
+    it, views = falling(Faster(2.0), 4, "a", target=clocked(2.0, lambda shots: 1.1))
     for _ in range(4):
         it.begin(lambda: OPACITIES)
-        draw("a")
+        views["a"]()
         it.end()
     assert it.progress().target_reached is False
     assert float(1 - it.store.values.detach().mean()) >= 1 / 20 - 1e-3
@@ -332,15 +307,11 @@ def test_thresholds_do_not_begin_right_after_a_reset_of_opacities():
         it.begin(lambda: reset(0.95))
 
 
-def test_a_model_with_many_faint_gaussians_is_not_taken_for_a_reset_one():
-    it = Stage2(ThresholdStore(100), Settings(iterations=10))
-    it.begin(lambda: reset(0.8))
-    assert it.store.opened
-
-
-def test_a_control_may_begin_after_a_reset():
-    it = Stage2(ThresholdStore(100), Settings(iterations=10, goal=Control()))
-    it.begin(lambda: reset(1.0))
+@pytest.mark.parametrize(("goal", "share"), [(Pressure(), 0.8), (Control(), 1.0)])
+def test_many_faint_gaussians_are_no_reset_and_a_control_may_follow_one(goal, share):
+    it = Stage2(ThresholdStore(100), Settings(iterations=10, goal=goal))
+    it.begin(lambda: reset(share))
+    assert it.store.opened == (goal != Control())
 
 
 def test_joint_learning_warns_of_a_reset_and_goes_on_with_the_training(caplog):

@@ -171,23 +171,41 @@ def learn(plugins, tmp_path):
         return host.store(model).logits.detach().clone()
 
 
-@pytest.mark.parametrize("error", [RuntimeError("disk full"), SystemExit(7)], ids=["raise", "exit"])
-@pytest.mark.parametrize("hook", OBSERVERS)
-def test_an_observer_that_raises_is_switched_off_and_the_run_goes_on(hook, error, tmp_path, caplog):
+def others(told):
+    """An observer of everything that notes what it is told."""
+    hooks = {
+        name: getattr(plugin(name, lambda name=name: told.append(name)), name) for name in OBSERVERS
+    }
+    return SimpleNamespace(**hooks)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """What the others learn and are told where nobody raises."""
+    told: list[str] = []
+    return learn([others(told)], tmp_path_factory.mktemp("alone")), told
+
+
+@pytest.mark.parametrize(
+    ("hook", "error"),
+    [
+        *((hook, RuntimeError("disk full")) for hook in OBSERVERS),
+        ("fragprune_step", SystemExit(7)),
+    ],
+    ids=str,
+)
+def test_an_observer_that_raises_is_switched_off_and_the_run_goes_on(
+    hook, error, alone, tmp_path, caplog
+):
     told, calls = [], []
 
     def act():
         calls.append(hook)
         raise error
 
-    others = SimpleNamespace()
-    for name in OBSERVERS:
-        setattr(others, name, getattr(plugin(name, lambda name=name: told.append(name)), name))
-    alone = learn([others], tmp_path)
-    expected, told[:] = told.copy(), []
     with caplog.at_level(logging.WARNING, logger="fragprune"):
-        assert torch.equal(learn([others, plugin(hook, act)], tmp_path), alone)
-    assert told == expected
+        assert torch.equal(learn([others(told), plugin(hook, act)], tmp_path), alone[0])
+    assert told == alone[1]
     assert set(told) == set(OBSERVERS)
     assert calls == [hook]
     said = [record.getMessage() for record in caplog.records]

@@ -3,17 +3,13 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from finetune import tiny
 
 from fragprune_plugins.files.ply import write_ply
-from fragprune_plugins.testing.fresh import fresh
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -97,19 +93,14 @@ def install(folder: Path, name: str, points: str) -> None:
     (info / "entry_points.txt").write_text(points)
 
 
-def fragprune(*words: object, path: list[Path], cwd: Path) -> str:
-    """What a fresh ``fragprune`` prints that finds packages in these folders first."""
-    found = os.pathsep.join(map(str, path))
-    done = subprocess.run(
-        [sys.executable, "-m", "fragprune_plugins", *map(str, words)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": found},
-        timeout=240,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+COMMANDS = """
+import json, sys
+from click.testing import CliRunner
+from fragprune_plugins.workbench.commands import cli
+results = [CliRunner().invoke(cli, line.split()) for line in sys.argv[1:]]
+assert not any(result.exit_code for result in results), [result.output for result in results]
+print(json.dumps([result.stdout for result in results]))
+"""
 
 
 @pytest.fixture
@@ -121,34 +112,29 @@ def model(tmp_path: Path) -> Path:
     return path
 
 
-def invoked(site: str, folder: str, words: list[str]) -> str:
-    """What the command prints where a folder of packages comes first."""
-    sys.path.insert(0, site)
-    os.chdir(folder)
-    result = CliRunner().invoke(import_module("fragprune_plugins.workbench.commands").cli, words)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
-def test_one_package_adds_a_command_a_format_an_engine_and_a_log(tmp_path, model):
+@pytest.mark.usefixtures("model")
+def test_one_package_adds_a_command_a_format_an_engine_and_a_log(tmp_path, python):
     site = tmp_path / "site"
     install(site, "mine", POINTS)
     (site / "mine.py").write_text(MODULE)
-
-    def call(line: str) -> str:
-        return fresh(invoked, str(site), str(tmp_path), line.split())
-
-    assert "Count the Gaussians" in call("--help")
-    call("export model.ply --out model.mine")
-    assert json.loads(call("count model.mine --json")) == {"gaussians": 60}
-    drawn = call("render model.mine --engine mine --cameras cameras.json --out grey --json")
+    help, _, count, drawn, _ = python(
+        COMMANDS,
+        "--help",
+        "export model.ply --out model.mine",
+        "count model.mine --json",
+        "render model.mine --engine mine --cameras cameras.json --out grey --json",
+        "finetune model.mine --self --out p.mine --iters 3 --resolution 16 --train opacity "
+        "--log lines:steps.txt",
+        path=site,
+    )
+    assert "Count the Gaussians" in help
+    assert json.loads(count) == {"gaussians": 60}
     assert json.loads(drawn)["engine"] == "mine"
-    short = "--iters 3 --resolution 16 --train opacity --log lines:steps.txt"
-    call(f"finetune model.mine --self --out p.mine {short}")
     assert (tmp_path / "steps.txt").read_text().split() == ["1", "2", "3"]
 
 
-def test_an_adapter_and_a_slice_go_with_their_folders(tmp_path, model):
+@pytest.mark.usefixtures("model")
+def test_an_adapter_and_a_slice_go_with_their_folders(tmp_path, python):
     """On a copy of the tree: nothing else needs them."""
     copy = tmp_path / "copy"
     spare = shutil.ignore_patterns("__pycache__", "*.so")
@@ -164,21 +150,15 @@ def test_an_adapter_and_a_slice_go_with_their_folders(tmp_path, model):
     for group, values in points.items():
         lines += [f"[{group}]", *(f"{name} = {value}" for name, value in values.items())]
     install(copy, "fragprune_plugins", "\n".join(lines))
-    path = [copy, copy / "adapters"]
-    help = fragprune("--help", path=path, cwd=copy)
+    help, adapters, _ = python(
+        COMMANDS,
+        "--help",
+        "adapters --json",
+        "render model.ply --cameras cameras.json --engine reference --out pictures",
+        path=os.pathsep.join([str(copy), str(copy / "adapters")]),
+    )
     assert "  compare " in help
     assert "  audit " not in help
-    adapters = json.loads(fragprune("adapters", "--json", path=path, cwd=copy))
+    adapters = json.loads(adapters)
     assert adapters["findings"] == []
     assert "mcmc" not in [each["name"] for each in adapters["adapters"]]
-    words = ("--cameras", tmp_path / "cameras.json", "--engine", "reference", "--out", "pictures")
-    fragprune("render", model, *words, path=path, cwd=copy)
-    linted = subprocess.run(
-        [str(Path(sys.executable).with_name("lint-imports"))],
-        capture_output=True,
-        text=True,
-        cwd=copy,
-        env={**os.environ, "PYTHONPATH": str(copy)},
-        timeout=240,
-    )
-    assert linted.returncode == 0, linted.stdout

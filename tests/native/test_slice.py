@@ -18,22 +18,26 @@ SIZES = (1, 3, 1024 + 37)
 """Fewer than any register has lanes, and more than one piece of work, the last one odd."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_values_and_gradients_are_the_oracles(engine, kind):
-    for orders in (None, 0, 1, 2):
-        agree(engine, splats(kind, 200), moment(orders))
+AGREE = {
+    "with time": [(kind, 200, {}, {"orders": n}) for kind in KINDS for n in (None, 0, 1, 2)],
+    # below degree 3 time leaves colours alone but for one gradient
+    "degrees": [
+        ("joint", 100, {"degree": degree, "coefficients": (degree + 1) ** 2}, {"orders": orders})
+        for degree in range(3)
+        for orders in (None, 2)
+    ],
+    "any number": [("joint", count, {}, {}) for count in SIZES],
+    "a prefilter widens the marginal": [
+        (kind, 60, {}, {"prefilter_var": var}) for kind in ("apart", "joint") for var in (0, 0.05)
+    ],
+    "scale modifier": [(kind, 60, {}, {"scale_modifier": 0.6}) for kind in KINDS],
+}
 
 
-def test_below_degree_3_time_leaves_colours_alone_but_for_one_gradient(engine):
-    for degree in range(3):
-        given = splats("joint", 100, degree=degree, coefficients=(degree + 1) ** 2)
-        for orders in (None, 2):
-            agree(engine, given, moment(orders))
-
-
-def test_any_number_of_them(engine):
-    for count in SIZES:
-        agree(engine, splats("joint", count), moment())
+@pytest.mark.parametrize("case", AGREE)
+def test_values_and_gradients_are_the_oracles(engine, case):
+    for kind, count, of_splats, of_moment in AGREE[case]:
+        agree(engine, splats(kind, count, **of_splats), moment(**of_moment))
 
 
 def test_coefficients_that_are_not_in_use_have_no_gradient(engine):
@@ -44,26 +48,17 @@ def test_coefficients_that_are_not_in_use_have_no_gradient(engine):
     assert not by_sh[:, 32:].any()
 
 
-def test_a_prefilter_widens_the_marginal(engine):
-    for kind in ("apart", "joint"):
-        for prefilter in (0.0, 0.05):
-            agree(engine, splats(kind, 60), moment(prefilter_var=prefilter))
-
-
-def test_the_scale_modifier(engine):
-    for kind in KINDS:
-        agree(engine, splats(kind, 60), moment(scale_modifier=0.6))
-
-
 def test_each_output_has_its_own_gradients(engine):
     for output in spacetime.OUTPUTS:
         agree(engine, splats("joint", 60), moment(), outputs=(output,))
 
 
-def test_rotations_are_used_as_given(engine):
+def test_rotations_are_used_as_given_and_gaussians_may_be_flat_and_thin(engine):
     given = splats("joint", 60)
-    given = replace(given, rotations=1.2 * given.rotations, rotations_r=0.9 * given.rotations_r)
-    agree(engine, given, moment())
+    turned = replace(given, rotations=1.2 * given.rotations, rotations_r=0.9 * given.rotations_r)
+    agree(engine, turned, moment())
+    thin = given.scales * torch.tensor([1.0, 1e-3, 1e-6], dtype=torch.float64)
+    agree(engine, replace(given, scales=thin), moment())
 
 
 def test_who_is_not_there_is_nowhere_and_has_no_gradients(engine):
@@ -121,12 +116,6 @@ def test_what_is_not_finite_is_not_there_and_spoils_nobody(engine, kind, changes
     for grad in gradients(bad, result).values():
         assert not grad[:first].any()
         assert grad.isfinite().all()
-
-
-def test_flat_and_thin_gaussians(engine):
-    given = splats("joint", 60)
-    scales = given.scales * torch.tensor([1.0, 1e-3, 1e-6], dtype=torch.float64)
-    agree(engine, replace(given, scales=scales), moment())
 
 
 def test_a_fast_gaussian_keeps_its_shape(engine):

@@ -9,7 +9,7 @@ import torch
 from finetune import tiny
 
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.workbench.view.packing import pack, words_per_gaussian
+from fragprune_plugins.workbench.view.packing import pack
 
 
 def read(data, facts):
@@ -35,7 +35,8 @@ def test_tables_hold_the_model(degree):
     splat = tiny.random_model(degree=degree)
     thresholds = torch.linspace(0.005, 0.9, len(splat))
     data, facts = pack(replace(splat, thresholds=ThresholdStore.from_falloff(thresholds)))
-    assert len(data) == 4 * words_per_gaussian(degree) * len(splat)
+    texels = -(-3 * (degree + 1) ** 2 // 8)  # of eight half floats
+    assert len(data) == (32 + 16 * texels) * len(splat)
     assert facts["degree"] == degree
     assert facts["truncated"] is True
     table, harmonics = read(data, facts)

@@ -26,11 +26,6 @@ CUTOFF_MAX = -2 * math.log(ALPHA_MIN)
 _HALF_MAX = 65504.0
 
 
-def words_per_gaussian(degree: int) -> int:
-    """32-bit words of one Gaussian with harmonics of a degree, 0 to 3."""
-    return 8 + _texels(degree) * 4
-
-
 def _texels(degree: int) -> int:
     """Texels of four words, eight half floats, that hold the harmonics of a degree."""
     return -(-3 * (degree + 1) ** 2 // 8)
