@@ -36,6 +36,14 @@ def _frozen():
     gc.freeze()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _without_waiting_for_the_disk():
+    """Only a power cut would lose what the system has not written yet."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
 @pytest.fixture(scope="session")
 def photographs(tmp_path_factory):
     """The demo's room, very small."""
@@ -82,12 +90,12 @@ def plug() -> Iterator[Callable[..., None]]:
 def python(tmp_path: Path) -> Callable[..., Any]:
     """Run code in a fresh interpreter; what it prints last, as JSON."""
 
-    def run(code: str, *arguments: object, path: Path | None = None, options: tuple = ()) -> Any:
+    def run(code: str, *arguments: object, path: str | Path | None = None) -> Any:
         environment = dict(os.environ)
         if path is not None:
             environment["PYTHONPATH"] = str(path)
         done = subprocess.run(
-            [sys.executable, *options, "-c", code, *map(str, arguments)],
+            [sys.executable, "-c", code, *map(str, arguments)],
             capture_output=True,
             text=True,
             cwd=tmp_path,

@@ -51,20 +51,30 @@ def untouched(out):
     )
 
 
+WRONG = {
+    "model cut off": ("model-file", "not readable as PLY"),
+    "a checkpoint": ("model-file", "(4D models)"),
+    "data missing": ("dataset", "no such folder"),
+    "image missing": ("dataset", "no such image"),
+    "stale sidecar": ("sidecar", "thresholds of another model"),
+    "broken sidecar": ("sidecar", "unreadable"),
+    "sidecar of one row": ("sidecar", "thresholds of 1 Gaussian"),
+}
+
+
 @pytest.mark.parametrize(
-    ("how", "code", "words"),
+    ("command", "how"),
     [
-        ("model cut off", "model-file", "not readable as PLY"),
-        ("a checkpoint", "model-file", "(4D models)"),
-        ("data missing", "dataset", "no such folder"),
-        ("image missing", "dataset", "no such image"),
-        ("stale sidecar", "sidecar", "thresholds of another model"),
-        ("broken sidecar", "sidecar", "unreadable"),
-        ("sidecar of one row", "sidecar", "thresholds of 1 Gaussian"),
+        *(("finetune", how) for how in WRONG),
+        *(
+            (command, how)
+            for command in ("profile", "render", "compare")
+            for how in ("model cut off", "image missing", "stale sidecar")
+        ),
     ],
 )
-@pytest.mark.parametrize("command", ["finetune", "profile", "render", "compare"])
-def test_refused(scene, tmp_path, how, code, words, command):
+def test_refused(scene, tmp_path, command, how):
+    code, words = WRONG[how]
     data, path, out = scene
     if how == "model cut off":
         path.write_bytes(path.read_bytes()[:-50])
