@@ -47,7 +47,7 @@ COMMANDS = {
         *("--train", "all"),
     ),
     "finetune to a target": lambda data, path, cameras, out: (
-        *(path, "--data", data, "--out", out / "small.ply", "--iters", 20),
+        *(path, "--data", data, "--out", out / "small.ply", "--iters", 8),
         *("--target-speedup", 1.3),
     ),
     "render": lambda data, path, cameras, out: (path, "--data", data, "--out", out),

@@ -58,7 +58,7 @@ def test_the_first_process_writes_and_reports_and_the_others_say_nothing(scene, 
     assert other.left == (0, "", "")
 
 
-@pytest.mark.parametrize(("size", "killed"), [(2, 0), (4, 2)])
+@pytest.mark.parametrize(("size", "killed"), [(2, 0), (3, 1)])
 def test_a_kill_of_one_ends_all_with_one_error_and_leaves_what_was_saved(
     scene, tmp_path, size, killed
 ):
@@ -103,7 +103,7 @@ def test_a_process_that_raises_takes_all_down_with_its_own_words(scene, tmp_path
 
 @pytest.mark.parametrize(
     ("number", "more"),
-    [(signal.SIGTERM, ()), (signal.SIGINT, ()), (signal.SIGTERM, ("--shard-gaussians",))],
+    [(signal.SIGINT, ()), (signal.SIGTERM, ("--shard-gaussians",))],
 )
 def test_a_signal_to_one_ends_all_after_the_same_step(scene, tmp_path, number, more):
     """Then one process goes on; shards go on as shards."""
@@ -131,10 +131,10 @@ def test_a_signal_to_one_ends_all_after_the_same_step(scene, tmp_path, number, m
 @pytest.mark.parametrize(
     ("more", "found"),
     [
-        (("--target-time", 1.2), "2 processes"),
         (("--views-per-step", 3), "3 for 2 processes"),
         (("--quick",), "--quick with --iters"),
-        (("--no-such-option",), "No such option"),
+        (("--shard-gaussians", "--portable"), "--shard-gaussians with --portable"),
+        (("--shard-gaussians", "--self"), "--shard-gaussians with --self"),
     ],
 )
 def test_what_is_refused_is_said_once(scene, tmp_path, more, found):
@@ -175,22 +175,8 @@ def test_shards_report_and_write_what_one_process_does(scene, tmp_path):
     assert torch.allclose(model.falloff, read_ply(one).falloff, rtol=1e-4)
     with open(log) as file:
         assert len(list(csv.DictReader(file))) == 20
-    again, other = command(2, *words(scene, two, *more[:3]))
-    assert "nothing was done" in again.left[1]
-    assert other.left == (0, "", "")
-    text = command(2, *words(scene, two, *more[:3], "--again"))[0].left[1]
+    text = command(2, *words(scene, two, *more[:3], "--again", "--iters", 2))[0].left[1]
     assert "2 processes held a part of the Gaussians each" in text
-
-
-@pytest.mark.parametrize(
-    "more",
-    [("--portable",), ("--self",)],
-)
-def test_what_a_part_of_the_gaussians_cannot_do_is_refused(scene, tmp_path, more):
-    ended = command(2, *words(scene, tmp_path / "out.ply", "--shard-gaussians", *more))
-    assert [each.left[0] for each in ended] == [2, 2]
-    said = "".join(out + err for _, out, err in (each.left for each in ended))
-    assert said.count(f"--shard-gaussians with {more[0]}") == 1
 
 
 def test_one_process_has_nobody_to_share_gaussians_with(scene, tmp_path):

@@ -72,16 +72,16 @@ def test_ctrl_c_is_gone_on_from(scene, tmp_path, monkeypatch):
 
 def test_a_finished_command_says_so_and_does_nothing(scene, tmp_path, monkeypatch):
     out = tmp_path / "out.ply"
-    first = run_json(*words(scene, out))
+    first = run_json(*words(scene, out, "--iters", 2))
     with monkeypatch.context() as patch:
         patch.setattr("fragprune_plugins.workbench.finetune.api.finetune", None)  # cannot be called
-        again = run_json(*words(scene, out))
+        again = run_json(*words(scene, out, "--iters", 2))
         assert again == first | {"already_finished": True}
-        text = run(*words(scene, out))
+        text = run(*words(scene, out, "--iters", 2))
     assert text.exit_code == 0
     assert "PSNR, dB" in text.stdout  # the whole report
     assert "was finished before: nothing was done. --again" in text.stdout
-    assert run_json(*words(scene, out, "--again"))["already_finished"] is False
+    assert run_json(*words(scene, out, "--iters", 2, "--again"))["already_finished"] is False
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_a_finished_command_says_so_and_does_nothing(scene, tmp_path, monkeypatc
 def test_what_is_not_the_same_is_not_finished(scene, tmp_path, change):
     data, path = scene
     out, more = tmp_path / "out.ply", []
-    run_json(*words(scene, out))
+    run_json(*words(scene, out, "--iters", 2))
     if change == "other options":
         more = ["--pressure", 1e-3]
     elif change == "another model":
@@ -103,7 +103,7 @@ def test_what_is_not_the_same_is_not_finished(scene, tmp_path, change):
         os.utime(out, ns=(record.st_atime_ns, record.st_mtime_ns + 1))
     else:
         out.with_suffix(".fragprune.json").unlink()
-    assert run_json(*words(scene, out, *more))["already_finished"] is False
+    assert run_json(*words(scene, out, "--iters", 2, *more))["already_finished"] is False
 
 
 def test_another_command_is_refused_while_one_is_unfinished(scene, tmp_path):

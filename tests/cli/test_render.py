@@ -8,18 +8,9 @@ from finetune import tiny
 from finetune.several import command
 from PIL import Image
 
-from fragprune_plugins.files.ply import write_ply
 
-
-@pytest.fixture
-def scene(tmp_path):
-    data, path, model = tiny.scene(tmp_path)
-    write_ply(path, tiny.cut(model, 0.3))
-    return data, path
-
-
-def test_held_out_views(scene, tmp_path):
-    data, path = scene
+def test_held_out_views(cut_scene, tmp_path):
+    data, path = cut_scene
     out = tmp_path / "pictures"
     report = run_json("render", path, "--data", data, "--out", out)
     names = sorted(file.name for file in out.iterdir())
@@ -33,12 +24,12 @@ def test_held_out_views(scene, tmp_path):
     assert plain["fragments_per_pixel"] > report["fragments_per_pixel"]
 
 
-@pytest.mark.parametrize(("size", "views"), [(2, "test"), (2, "all"), (3, "test")])
+@pytest.mark.parametrize("size", [2, 3])
 def test_gaussians_divided_among_processes_give_the_same_pictures(
-    scene, tmp_path, size, views, single_thread
+    cut_scene, tmp_path, size, single_thread
 ):
-    data, path = scene
-    words = ("render", path, "--data", data, "--views", views, "--out")
+    data, path = cut_scene
+    words = ("render", path, "--data", data, "--out")
     one, many = tmp_path / "one", tmp_path / "many"
     whole = run_json(*words, one)
     first, *others = command(size, *words, many, "--shard-gaussians", "--json")
@@ -51,8 +42,8 @@ def test_gaussians_divided_among_processes_give_the_same_pictures(
         assert report[name] == pytest.approx(whole[name]), name
 
 
-def test_a_film_is_not_drawn_by_several_processes(scene, tmp_path, single_thread):
-    data, path = scene
+def test_a_film_is_not_drawn_by_several_processes(cut_scene, tmp_path, single_thread):
+    data, path = cut_scene
     film = tmp_path / "film.mp4"
     ended = command(2, "render", path, "--data", data, "--out", film, "--shard-gaussians")
     assert [each.left[0] for each in ended] == [2, 2]
@@ -61,8 +52,8 @@ def test_a_film_is_not_drawn_by_several_processes(scene, tmp_path, single_thread
     assert "torchrun" in alone.stderr
 
 
-def test_cameras_file_and_views(scene, tmp_path):
-    data, path = scene
+def test_cameras_file_and_views(cut_scene, tmp_path):
+    data, path = cut_scene
     content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
     cameras = tmp_path / "path.json"
     cameras.write_text(json.dumps(content))
@@ -76,8 +67,8 @@ def test_cameras_file_and_views(scene, tmp_path):
     assert len(report["files"]) == 9
 
 
-def test_two_views_of_one_name_are_two_pictures(scene, tmp_path):
-    _, path = scene
+def test_two_views_of_one_name_are_two_pictures(cut_scene, tmp_path):
+    _, path = cut_scene
     content = tiny.transforms(["train/r_0", "test/r_0"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
     (tmp_path / "path.json").write_text(json.dumps(content))
     out = tmp_path / "pictures"
@@ -87,8 +78,8 @@ def test_two_views_of_one_name_are_two_pictures(scene, tmp_path):
     assert report["warnings"] == []
 
 
-def test_a_view_that_shows_nothing_is_warned_of(scene, tmp_path):
-    _, path = scene
+def test_a_view_that_shows_nothing_is_warned_of(cut_scene, tmp_path):
+    _, path = cut_scene
     content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
     content["frames"][1]["transform_matrix"][2][3] = 1e5
     (tmp_path / "path.json").write_text(json.dumps(content))
@@ -97,8 +88,8 @@ def test_a_view_that_shows_nothing_is_warned_of(scene, tmp_path):
     assert len(run_json(*words)["warnings"]) == 1
 
 
-def test_needs_exactly_one_source_of_cameras(scene, tmp_path):
-    data, path = scene
+def test_needs_exactly_one_source_of_cameras(cut_scene, tmp_path):
+    data, path = cut_scene
     assert run("render", path, "--out", tmp_path / "x").exit_code == 2
     both = run("render", path, "--out", tmp_path / "x", "--data", data, "--cameras", data)
     assert both.exit_code == 2

@@ -14,7 +14,7 @@ def bridge(out, **how):
     return subprocess.run(words, capture_output=True, timeout=100, **how)
 
 
-@pytest.mark.parametrize("numbers", [(0,), (1,), (2,), (0, 1, 2)])
+@pytest.mark.parametrize("numbers", [(1,), (0, 1, 2)])
 def test_a_file_never_takes_the_place_of_a_closed_stream(tmp_path, numbers):
     done = bridge(tmp_path, preexec_fn=lambda: [os.close(number) for number in numbers])
     assert done.returncode == 0

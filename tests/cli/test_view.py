@@ -14,15 +14,8 @@ from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.workbench.view import server as serving
 
 
-@pytest.fixture
-def scene(tmp_path):
-    data, path, model = tiny.scene(tmp_path)
-    write_ply(path, tiny.cut(model, 0.3))
-    return data, path
-
-
-def test_a_folder_with_cameras_and_photographs(scene, tmp_path):
-    data, path = scene
+def test_a_folder_with_cameras_and_photographs(cut_scene, tmp_path):
+    data, path = cut_scene
     out = tmp_path / "page"
     report = run_json("view", path, "--data", data, "--out", out)
     held = json.loads((out / "scene.json").read_text())
@@ -37,8 +30,8 @@ def test_a_folder_with_cameras_and_photographs(scene, tmp_path):
 
 
 @pytest.mark.parametrize("name", [".", "index.html"])
-def test_a_page_of_somebody_else_is_not_overwritten(scene, tmp_path, name):
-    _, path = scene
+def test_a_page_of_somebody_else_is_not_overwritten(cut_scene, tmp_path, name):
+    _, path = cut_scene
     (tmp_path / "page").mkdir()
     run_json("view", path, "--out", tmp_path / "page" / name)
     run_json("view", path, "--out", tmp_path / "page" / name)  # our own may be
@@ -52,8 +45,8 @@ def test_a_page_of_somebody_else_is_not_overwritten(scene, tmp_path, name):
     assert list(own.parent.iterdir()) == [own]
 
 
-def test_two_models_are_two_sides(scene, tmp_path):
-    _, path = scene
+def test_two_models_are_two_sides(cut_scene, tmp_path):
+    _, path = cut_scene
     other = tmp_path / "other.ply"
     write_ply(other, tiny.random_model(20))
     report = run_json("view", path, other, "--out", tmp_path / "page")
@@ -79,10 +72,10 @@ def test_two_models_of_one_file_name_are_told_apart(tmp_path):
 
 @pytest.mark.parametrize("there", [True, False])
 def test_the_original_that_a_record_names_stands_left_if_it_lies_in_the_same_folder(
-    scene, tmp_path, there
+    cut_scene, tmp_path, there
 ):
     pruned = tmp_path / "pruned.ply"
-    shutil.copy(scene[1], pruned)
+    shutil.copy(cut_scene[1], pruned)
     original = (tmp_path if there else tmp_path.parent) / "before.ply"
     write_ply(original, tiny.random_model(20))
     records.leave(pruned, "finetune", {"model": str(original), "out": str(pruned)})
@@ -93,8 +86,8 @@ def test_the_original_that_a_record_names_stands_left_if_it_lies_in_the_same_fol
     assert report["compare"] == (str(original) if there else None)
 
 
-def test_the_cameras_of_a_training_are_found(scene, tmp_path):
-    _, path = scene
+def test_the_cameras_of_a_training_are_found(cut_scene, tmp_path):
+    _, path = cut_scene
     place = tmp_path / "out" / "point_cloud" / "iteration_7"
     place.mkdir(parents=True)
     path.rename(place / "point_cloud.ply")
@@ -109,13 +102,13 @@ def test_the_cameras_of_a_training_are_found(scene, tmp_path):
     assert held["start"]["position"] == [0, 0, -3]
 
 
-def test_one_page(scene, tmp_path):
-    report = run_json("view", scene[1], "--out", tmp_path / "pages" / "mine.html")
+def test_one_page(cut_scene, tmp_path):
+    report = run_json("view", cut_scene[1], "--out", tmp_path / "pages" / "mine.html")
     assert report["files"] == [str(tmp_path / "pages" / "mine.html")]
     assert [each.name for each in (tmp_path / "pages").iterdir()] == ["mine.html"]
 
 
-def test_serves_until_ctrl_c(scene, monkeypatch):
+def test_serves_until_ctrl_c(cut_scene, monkeypatch):
     opened = []
 
     def serve(server):
@@ -131,10 +124,10 @@ def test_serves_until_ctrl_c(scene, monkeypatch):
 
     monkeypatch.setattr(serving.ThreadingHTTPServer, "serve_forever", serve)
     monkeypatch.setattr("webbrowser.open", opened.append)
-    report = run_json("view", scene[1])
+    report = run_json("view", cut_scene[1])
     assert opened[0] == report["address"]
     assert b"<title>" in opened[1]
-    report = run_json("view", scene[1], "--no-browser")
+    report = run_json("view", cut_scene[1], "--no-browser")
     assert len(opened) == 3
 
 
@@ -145,7 +138,7 @@ def test_serves_until_ctrl_c(scene, monkeypatch):
         (("--port", "70000"), "--port"),
     ],
 )
-def test_options_that_do_not_fit(scene, options, words):
-    result = run("view", scene[1], *options)
+def test_options_that_do_not_fit(cut_scene, options, words):
+    result = run("view", cut_scene[1], *options)
     assert result.exit_code == 2
     assert words in result.stderr

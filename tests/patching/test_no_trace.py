@@ -42,7 +42,6 @@ def note():
 """
 
 RUNS: dict[str, tuple[str, str, type[FragpruneError] | None]] = {
-    "off": ("off", "", None),
     "auto": ("auto", "", None),
     "joint": ("joint", "", None),
     "the host fails": ("joint", FAIL, HostFailed),

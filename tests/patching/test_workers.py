@@ -106,16 +106,15 @@ def test_a_compiled_render_function_learns_the_same_bits(photographs, tmp_path):
     assert results[1][2] == []
 
 
-@pytest.mark.parametrize("stage", ["auto", "finetune", "joint"])
 def test_under_torchrun_learning_is_refused_before_the_host_runs(
-    stage, photographs, tmp_path, monkeypatch
+    photographs, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("WORLD_SIZE", "2")
     script = written(Host, tmp_path / "host") / "train.py"
     script.write_text(f"raise SystemExit('it ran')\n{script.read_text()}")
     words = command(script, photographs, tmp_path / "out", 12)
     with pytest.raises(RanksError) as caught:
-        run(words, RunOptions(stage=stage, device="cpu"))
+        run(words, RunOptions(device="cpu"))
     assert caught.value.found == "WORLD_SIZE=2 in the environment"
     assert "--stage finetune without torchrun" in caught.value.remedy
 
