@@ -11,7 +11,7 @@ import socket
 import pytest
 from campaigns.fuzz import commands, seeds
 from campaigns.fuzz.readers import READERS, Reader
-from campaigns.fuzz.running import BAD, GOOD, Nonsense, inputs, judge, run
+from campaigns.fuzz.running import BAD, GOOD, Nonsense, broken, judge, run
 
 from fragprune_plugins.errors import RecordError
 
@@ -30,9 +30,9 @@ def test_seeds_are_read_and_what_was_found_is_stated(reader, tmp_path):
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_broken_files_are_stated(reader, tmp_path):
-    for number, content in inputs(reader.pool(), reader.name, 20, 0):
-        if number == INPUTS:
-            break
+    pool = reader.pool()
+    for number in range(INPUTS):
+        content = broken(reader.name, pool, 20, number)
         kind, words = judge(reader, content, tmp_path / "input")
         assert kind in GOOD, (number, words)
 

@@ -1,18 +1,17 @@
 """Feeds inputs to readers in a child of bounded memory, and watches it."""
 
-import mmap
+import multiprocessing
 import os
 import random
 import resource
 import shutil
-import signal
-import struct
 import sys
 import tempfile
 import time
+import warnings
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from campaigns.fuzz.mutate import mutated
@@ -34,7 +33,7 @@ HANG = 60.0
 """Seconds after which a child is given up."""
 
 _OURS = str(Path(fragprune_plugins.__file__).parent)
-_STATE = struct.Struct("<qd")  # the input in hand, and when it was taken
+_FORK = multiprocessing.get_context("fork")
 
 
 @dataclass
@@ -61,12 +60,6 @@ class Tally:
         self.outcomes[kind] += 1
         if kind in BAD and len(self.found) < 200:
             self.found.setdefault((kind, words), content)
-
-
-def scratch() -> Path:
-    """A folder in memory, if there is such a place."""
-    shared = Path("/dev/shm")
-    return Path(tempfile.mkdtemp(prefix="fuzz-", dir=shared if shared.is_dir() else None))
 
 
 def judge(reader: Reader, content: bytes, folder: Path) -> tuple[str, str]:
@@ -106,12 +99,9 @@ def _place(error: BaseException) -> str:
     return place
 
 
-def inputs(pool: list[bytes], name: str, seed: int, first: int) -> Iterator[tuple[int, bytes]]:
-    """Inputs of a seed, from a number on."""
-    number = first
-    while True:
-        yield number, mutated(random.Random(f"{seed} {name} {number}"), pool)
-        number += 1
+def broken(name: str, pool: list[bytes], seed: int, number: int) -> bytes:
+    """An input of a seed, by its number, made of a reader's."""
+    return mutated(random.Random(f"{seed} {name} {number}"), pool)
 
 
 def run(reader: Reader, count: int, *, seed: int = 0, seconds: float = 1e9) -> Tally:
@@ -123,85 +113,56 @@ def run(reader: Reader, count: int, *, seed: int = 0, seconds: float = 1e9) -> T
         seed: of the inputs.
         seconds: wall clock, for all.
     """
-    tally, folder = Tally(), scratch()
-    shared = mmap.mmap(-1, _STATE.size)
-    end = time.monotonic() + seconds
-    try:
-        first = 0
+    tally, first, end = Tally(), 0, time.monotonic() + seconds
+    memory = "/dev/shm" if os.path.isdir("/dev/shm") else None
+    with tempfile.TemporaryDirectory(prefix="fuzz-", dir=memory) as folder:
         while first < count and time.monotonic() < end:
-            first = _child(reader, tally, folder, shared, (first, count, seed, end))
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+            place = Path(folder, str(first))  # what a child that died left stays where it is
+            first = _child(reader, tally, range(first, count), seed, (place, end))
     return tally
 
 
-def _child(
-    reader: Reader,
-    tally: Tally,
-    folder: Path,
-    shared: mmap.mmap,
-    task: tuple[int, int, int, float],
-) -> int:
+def _child(reader: Reader, tally: Tally, numbers: range, seed: int, how: tuple[Path, float]) -> int:
     """Let one child go on until it ends; returns the number of the next input."""
-    first, count, *_ = task
-    log, current = folder / "log", folder / "current"
-    log.write_bytes(b"")
-    shutil.rmtree(folder / "input", ignore_errors=True)  # of a child that died
-    shared[:] = _STATE.pack(first, time.monotonic())
-    sys.stdout.flush()
-    child = os.fork()
-    if child == 0:
-        status = 3
-        try:
-            _feed(reader, folder, shared, *task)
-            status = 0
-        finally:
-            os._exit(status)
-    hung = False
-    while True:
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            break
-        if time.monotonic() - _STATE.unpack(shared[:])[1] > HANG:
-            os.kill(child, signal.SIGKILL)
-            hung = True
-        time.sleep(0.05)
-    lines = log.read_text(encoding="utf-8").splitlines()
-    for kind, words, content in (line.split("\t") for line in lines):
-        tally.note(kind, words, bytes.fromhex(content))
-    number = _STATE.unpack(shared[:])[0]
-    if status:
-        tally.note("hang" if hung else "crash", f"status {status}", current.read_bytes())
-        return number + 1
-    return max(number + 1, first + 1) if number + 1 >= count else count
+    outcomes, told = _FORK.Pipe(duplex=False)
+    child = _FORK.Process(target=_feed, args=(told, reader, numbers, seed, *how))
+    child.start()
+    told.close()
+    for number in numbers:
+        if not outcomes.poll(HANG):
+            child.kill()
+            kind, words = "hang", ""
+        else:
+            try:
+                kind, words = outcomes.recv()
+            except EOFError:
+                child.join()
+                if not child.exitcode:  # the time is up
+                    return numbers.stop
+                kind, words = "crash", f"status {child.exitcode}"
+        content = broken(reader.name, reader.pool(), seed, number) if kind in BAD else b""
+        tally.note(kind, words, content)
+        if kind in ("hang", "crash"):
+            child.join()
+            return number + 1
+    child.join()
+    return numbers.stop
 
 
 def _feed(
-    reader: Reader,
-    folder: Path,
-    shared: mmap.mmap,
-    first: int,
-    count: int,
-    seed: int,
-    end: float,
+    told: Connection, reader: Reader, numbers: range, seed: int, place: Path, end: float
 ) -> None:
-    """In the child: one input after the other, until the count or the time is up."""
-    import warnings
-
+    """In the child: one input after the other, until the last or until the time is up."""
     warnings.simplefilter("ignore")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if sys.platform == "linux" else 0
-    if pages:
+    if sys.platform == "linux":
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
         limit = pages * resource.getpagesize() + MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    with (folder / "log").open("w", encoding="utf-8") as log:
-        for number, content in inputs(reader.pool(), reader.name, seed, first):
-            if number >= count or time.monotonic() > end:
-                break
-            (folder / "current").write_bytes(content)
-            shared[:] = _STATE.pack(number, time.monotonic())
-            kind, words = judge(reader, content, folder / "input")
-            kept = content.hex() if kind in BAD else ""
-            log.write(f"{kind}\t{' '.join(words.split()) if kind in BAD else ''}\t{kept}\n")
-            log.flush()
+    pool = reader.pool()
+    for number in numbers:
+        if time.monotonic() > end:
+            break
+        kind, words = judge(reader, broken(reader.name, pool, seed, number), place)
+        told.send((kind, " ".join(words.split()) if kind in BAD else ""))
