@@ -8,7 +8,7 @@ from cli.commands import run
 from finetune import tiny
 
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 
@@ -142,13 +142,6 @@ def test_a_file_is_not_written_under_the_name_of_another_kind(words, wrong, kind
     result = run(*words, wrong)
     assert result.exit_code == 2
     assert f"'{wrong}' does not end with {kind}" in result.stderr
-
-
-def test_upper_case_is_the_same_kind(scene, tmp_path):
-    _, path, _ = scene
-    write_ply(path, tiny.cut(tiny.random_model(8), 0.3))
-    assert run("export", path, "--out", tmp_path / "OUT.PLY").exit_code == 0
-    assert read_ply(tmp_path / "OUT.PLY").thresholds is not None
 
 
 def test_a_failed_write_touches_nothing(scene, monkeypatch):

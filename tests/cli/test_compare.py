@@ -31,14 +31,6 @@ def test_two_models(tmp_path):
     assert "x fewer fragments" in text
 
 
-def test_equal_models_have_finite_json(tmp_path):
-    """A perfect render has infinite PSNR, which JSON cannot say."""
-    data, path, _ = tiny.scene(tmp_path)
-    report = run_json("compare", path, path, "--data", data)
-    assert report["psnr_change"] == 0
-    assert report["speedup"] == 1
-
-
 def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):
     """Quality and fragments stay those of the photographs' size."""
     data, path, _ = tiny.scene(tmp_path)

@@ -83,11 +83,3 @@ def test_a_model_without_thresholds_is_written_as_it_is(tmp_path, name):
     assert result.exit_code == 0
     assert "no cutoffs" in result.stdout
     assert not models.load(tmp_path / name).pruned
-
-
-def test_a_link_to_itself_is_no_model(tmp_path):
-    loop = tmp_path / "loop.ply"
-    loop.symlink_to(loop)
-    result = run("export", loop, "--out", tmp_path / "out.spz")
-    assert result.exit_code == 1
-    assert f"[model-file] {loop}" in result.stderr

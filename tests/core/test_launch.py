@@ -378,15 +378,6 @@ def test_a_gpu_that_no_engine_of_ours_draws_on_is_refused_before_the_training(
     assert not (tmp_path / "trained").exists()
 
 
-def test_insisting_on_a_gpu_that_is_not_there_is_a_usage_error(host):
-    import torch
-
-    if torch.cuda.is_available():
-        pytest.skip("there is one")
-    with pytest.raises(UsageError, match="no CUDA device"):
-        run([host("")], RunOptions(device="cuda"))
-
-
 def test_a_script_of_no_host_is_refused_before_it_runs(tmp_path):
     (tmp_path / "train.py").write_text("raise SystemExit('it ran')")
     with pytest.raises(UnknownHostError):
