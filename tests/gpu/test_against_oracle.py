@@ -193,7 +193,7 @@ def test_thresholds_of_another_model_are_refused(
 
 
 def test_a_poisoned_pixel_reaches_those_alone_that_draw_there(engine: CudaEngine) -> None:
-    inputs = scenes.random_scene(6, 200, 50, 37, features=2)
+    inputs = scenes.random_scene(6, 200, 50, 37, features=3)
 
     def rows(at_pixel: float, elsewhere: float, found) -> torch.Tensor:
         """Of Gaussians with such a gradient, when the picture's gradients are these."""
@@ -202,7 +202,7 @@ def test_a_poisoned_pixel_reaches_those_alone_that_draw_there(engine: CudaEngine
         out = engine.rasterize(made, tau)
         upstream = torch.full((3, 37, 50), elsewhere)
         upstream[:, 20, 30] = at_pixel
-        torch.autograd.backward([out.image, out.features], [upstream, upstream[:2]])
+        torch.autograd.backward([out.image, out.features], [upstream, upstream])
         grads = (leaf.grad.reshape(200, -1) for k, leaf in leaves.items() if k != "background")
         return found(torch.cat(list(grads), dim=1)).any(1)
 

@@ -68,35 +68,24 @@ class Nameless(Vanilla3DGS):
     name = None
 
 
+FAULTS = {
+    "import fails": (ImportError("libfancy.so is missing"), "ImportError: libfancy.so is missing"),
+    "import raises": (ZeroDivisionError("at import"), "ZeroDivisionError"),
+    "misspelt hook": (Misspelt(), "fragprune_trunkate"),
+    "no hooks": (logging, "no hooks"),  # where an older installation names a module
+    "unknown argument": (WrongArgument(), "tau"),
+    "adapter raises": (Broken, "RuntimeError: my table is missing"),
+    "adapter is abstract": (HostAdapter, "abstract class HostAdapter"),
+    "import exits": (SystemExit(7), "SystemExit: 7"),
+    "wrapper": (Wrapper(), "fragprune_truncate is a wrapper"),
+    "no name": (Nameless, "has no name (str)"),
+}
+
+
 @pytest.mark.parametrize("order", ["before", "after"])
-@pytest.mark.parametrize(
-    ("plugin", "words"),
-    [
-        (ImportError("libfancy.so is missing"), "ImportError: libfancy.so is missing"),
-        (ZeroDivisionError("at import"), "ZeroDivisionError"),
-        (Misspelt(), "fragprune_trunkate"),
-        (logging, "no hooks"),  # where an older installation names a module
-        (WrongArgument(), "tau"),
-        (Broken, "RuntimeError: my table is missing"),
-        (HostAdapter, "abstract class HostAdapter"),
-        (SystemExit(7), "SystemExit: 7"),
-        (Wrapper(), "fragprune_truncate is a wrapper"),
-        (Nameless, "has no name (str)"),
-    ],
-    ids=[
-        "import fails",
-        "import raises",
-        "misspelt hook",
-        "no hooks",
-        "unknown argument",
-        "adapter raises",
-        "adapter is abstract",
-        "import exits",
-        "wrapper",
-        "no name",
-    ],
-)
-def test_one_bad_plugin_is_reported_and_stops_no_other(plugin, words, order):
+@pytest.mark.parametrize("fault", FAULTS)
+def test_one_bad_plugin_is_reported_and_stops_no_other(fault, order):
+    plugin, words = FAULTS[fault]
     bad = Entry("bad", plugin)
     plugins = load_plugins([bad, GOOD] if order == "before" else [GOOD, bad])
     assert names(plugins) == ["good-host"]

@@ -28,15 +28,15 @@ def everything(
         leaves["thresholds"] = thresholds = thresholds.detach().clone().requires_grad_()
     out = engine.rasterize(made, thresholds)
     loss = out.image.square().sum() + out.invdepth.sum() + out.alpha.sum()
-    if out.features is not None:
-        loss = loss + out.features.square().sum()
+    more = {name: getattr(out, name) for name in ("features", "surface")}
+    more = {name: plane for name, plane in more.items() if plane is not None}
+    loss = loss + sum(plane.square().sum() for plane in more.values())
     (loss + out.fragments_per_pixel).backward()
     kept = {name: getattr(out, name).detach() for name in ("image", "invdepth", "alpha", "radii")}
     scores = ("weights_per_gaussian", "wins_per_gaussian", "winners")
     counts = ("fragments", "fragments_per_gaussian")
     kept |= {name: getattr(out, name) for name in counts + scores}
-    if out.features is not None:
-        kept["features"] = out.features.detach()
+    kept |= {name: plane.detach() for name, plane in more.items()}
     return kept | {f"grad {name}": leaf.grad for name, leaf in leaves.items()}
 
 
@@ -47,8 +47,8 @@ def assert_identical(first: dict[str, torch.Tensor], second: dict[str, torch.Ten
 
 @pytest.mark.parametrize(
     "kind",
-    [{}, {"features": 2, "offsets": True}, {"rim": "soft"}],
-    ids=["plain", "extras", "soft rim"],
+    [{}, {"features": 2, "offsets": True}, {"rim": "soft"}, {"flat": True}],
+    ids=["plain", "extras", "soft rim", "surfels"],
 )
 def test_threads_and_runs_do_not_change_a_bit(
     engine: CpuEngine, single_thread: None, kind: dict

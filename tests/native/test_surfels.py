@@ -109,25 +109,6 @@ def test_thresholds_spare_what_they_cut_off(engine: CpuEngine) -> None:
     assert cut.entries_per_pixel < 0.8 * whole.entries_per_pixel
 
 
-def test_any_number_of_threads_draws_and_learns_the_same(engine: CpuEngine) -> None:
-    before = torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            made, leaves = scenes.leaves(scenes.random_scene(6, 200, 70, 50, flat=True))
-            made = replace(made, scores=True, counts=True)
-            thresholds = scenes.random_thresholds(6, 200).requires_grad_()
-            out = engine.rasterize(made, thresholds)
-            (out.image.square().sum() + out.surface.sum() + out.fragments_per_pixel).backward()
-            grads = [leaf.grad for leaf in (*leaves.values(), thresholds)]
-            results.append([out.image, out.surface, out.weights_per_gaussian, out.winners, *grads])
-    finally:
-        torch.set_num_threads(before)
-    for one, other in zip(*results, strict=True):
-        assert torch.equal(one, other)
-
-
 def test_a_surface_is_drawn_where_it_is_asked_for(engine: CpuEngine) -> None:
     scene = scenes.random_scene(6, 20, flat=True)
     assert engine.rasterize(replace(scene, planes=("alpha",)), None).surface is None
