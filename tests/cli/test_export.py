@@ -8,9 +8,7 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.models import model as models
 
 
@@ -48,20 +46,6 @@ def test_drops_what_no_view_can_draw(tmp_path):
     assert torch.equal(exported.xyz, model.xyz[kept])
     text = run("export", path, "--out", out, "--drop-invisible").stdout
     assert "Dropped 4 of 60 Gaussians, too faint for any view: " in text
-
-
-def test_over_a_pair_leaves_no_stale_sidecar(tmp_path):
-    _, path, model = tiny.scene(tmp_path)
-    out = tmp_path / "out.ply"
-    for pair in (path, out):
-        write_ply(pair, model)
-        sidecar.save(pair, ThresholdStore(len(model)))
-    store = ThresholdStore(len(model))
-    store.open(model.splats().opacities)
-    sidecar.save(path, store)
-    assert run("export", path, "--out", out).exit_code == 0
-    assert torch.equal(read_ply(out).falloff, store.values)
-    assert models.load(out).thresholds is not None  # a neutral sidecar would have hidden the column
 
 
 def test_any_model_may_get_a_stop(tmp_path):

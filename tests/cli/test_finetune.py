@@ -182,29 +182,6 @@ def test_what_a_model_itself_can_spare_is_not_known(scene, tmp_path):
     assert report["after"]["gaussians"] == 54
 
 
-def test_an_interrupted_removal_goes_on_with_the_same_gaussians(scene, tmp_path, monkeypatch):
-    data, path, _ = scene
-    whole, parts = tmp_path / "whole.ply", tmp_path / "parts.ply"
-    arguments = ("finetune", path, "--data", data, "--iters", 6, "--keep", 0.5)
-    run_json(*arguments, "--out", whole)
-    loss, calls = loop.photometric_loss, []
-
-    def stopped(*given):
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return loss(*given)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(loop, "photometric_loss", stopped)
-        assert run(*arguments, "--out", parts).exit_code == 130
-    report = run_json(*arguments, "--out", parts)
-    assert report["iterations"] == 6
-    assert parts.read_bytes() == whole.read_bytes()
-    assert run_json(*arguments, "--out", parts)["already_finished"]
-    assert not run_json(*arguments[:-1], 0.6, "--out", parts)["already_finished"]
-
-
 ALIKE = {"train": "all", "opacity_lr": None, "seed": 0, "views_per_step": 1}
 
 

@@ -50,9 +50,9 @@ def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path)
 
 
 @pytest.mark.usefixtures("ctrl_c")
-def test_ctrl_c_is_gone_on_from(scene, tmp_path, monkeypatch):
+def test_ctrl_c_is_gone_on_from_with_the_same_gaussians(scene, tmp_path, monkeypatch):
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
-    assert run(*words(scene, whole)).exit_code == 0
+    assert run(*words(scene, whole, "--keep", 0.5)).exit_code == 0
     loss, calls = loop.photometric_loss, []
 
     def photometric(*args):
@@ -62,10 +62,10 @@ def test_ctrl_c_is_gone_on_from(scene, tmp_path, monkeypatch):
         return loss(*args)
 
     monkeypatch.setattr(loop, "photometric_loss", photometric)
-    result = run(*words(scene, out))
+    result = run(*words(scene, out, "--keep", 0.5))
     assert result.exit_code == 130
     assert "The same command goes on from there." in result.stdout
-    assert run_json(*words(scene, out))["resumed_at"] == 7
+    assert run_json(*words(scene, out, "--keep", 0.5))["resumed_at"] == 7
     assert out.read_bytes() == whole.read_bytes()
     assert not resuming.path_beside(out).exists()
 

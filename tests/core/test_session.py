@@ -52,32 +52,6 @@ def test_only_a_session_that_learns_minds_how_many_processes_train(monkeypatch, 
         assert (active_session() is host.session) is not learn
 
 
-def test_the_summary_is_of_what_was_learned_and_observers_get_it(monkeypatch):
-    class Observer:
-        def fragprune_finished(self, summary):
-            told.append(summary)
-
-    from fragprune_plugins.plugins.hookspecs import hookimpl
-
-    Observer.fragprune_finished = hookimpl(Observer.fragprune_finished)
-    told = []
-    with joint(Settings(iterations=2), plugins=[Observer()]) as host:
-        model, camera = host.model(), host.camera()
-        for iteration in (1, 2):
-            host.step(model, camera, iteration)
-        assert len(host.session.curves) == 1  # the last step is closed at the end
-        summary = host.session.finish()
-    progress = host.session.models[model].stage.progress()
-    assert told == [summary]
-    assert len(host.session.curves) == 2
-    assert (summary.adapter, summary.engine) == ("vanilla-3dgs", "cpu")
-    assert (summary.steps, summary.gaussians) == (2, 30)
-    assert summary.fragments_before == progress.fragments_before > 0
-    assert summary.fragments_after == progress.fragments_after > 0
-    assert summary.target_reached is progress.target_reached
-    assert summary.settings == host.session.settings.as_dict()
-
-
 @pytest.mark.parametrize(
     ("steps", "viewed", "truncate", "refused"),
     [

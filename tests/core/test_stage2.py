@@ -11,7 +11,6 @@ import torch
 
 from fragprune_plugins.errors import ResetError, UsageError
 from fragprune_plugins.learning.goals import Control, Fewer, Pressure
-from fragprune_plugins.learning.pressure import ELASTICITY
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2, evenly, stored_thresholds
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -130,12 +129,6 @@ def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
     assert it.progress().fragments_before == 20.0
     assert [stats.fragments_per_pixel for stats in told] == [20.0, it.progress().fragments_after]
     assert told[1].fragments_per_pixel < 20.0
-
-
-def test_the_pressure_is_the_schedules():
-    settings = Settings(iterations=10)
-    assert stage(schedule=JointSchedule(settings, 1)).pressure.elasticity == ELASTICITY
-    assert stage(schedule=Schedule(settings)).pressure.elasticity == 2 * ELASTICITY
 
 
 def test_rates_follow_the_schedule():

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from cli.commands import run_json
 
-from fragprune_plugins.errors import OutputError
 from fragprune_plugins.workbench.demo import folder
-from fragprune_plugins.workbench.demo.demo import DemoSettings, host_command, run_demo
+from fragprune_plugins.workbench.demo.demo import DemoSettings, host_command
 from fragprune_plugins.workbench.demo.page import BANNER
 from fragprune_plugins.workbench.figures.wording import outcome
 
@@ -117,11 +116,3 @@ def test_command_is_one_a_user_could_type():
     assert command[command.index("--densify_until_iter") + 1] == "325"
     assert command[command.index("--seed") + 1] == "4"
     assert command[-1] == "--eval"
-
-
-def test_a_folder_with_something_else_is_refused(tmp_path):
-    (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(OutputError, match=r"thesis\.tex"):
-        run_demo(tmp_path)
-    assert (tmp_path / "thesis.tex").exists()
-    assert not (tmp_path / "scene").exists()

@@ -5,7 +5,6 @@ import torch
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.errors import OutputError
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure, measure_all
 from fragprune_plugins.workbench.figures.pictures import save_image, save_panel
 
@@ -80,9 +79,3 @@ def test_a_panel_shows_pictures_and_maps(tmp_path):
         assert min(picture.size) > 100
         assert len(picture.convert("RGB").getcolors(1 << 20)) > 20
     assert list(tmp_path.iterdir()) == [file]
-
-
-def test_unwritable_place(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError):
-        save_image(tmp_path / "file" / "x.png", torch.zeros(3, 2, 2))

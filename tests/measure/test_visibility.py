@@ -12,7 +12,6 @@ from fragprune_plugins import rasterize
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, Splats
 from fragprune_plugins.workbench.pruning.visibility import visible
 
@@ -103,19 +102,6 @@ def test_one_outside_one_view_stays_for_another():
     both = visible(model, VIEWS)
     each = torch.stack([visible(model, [view]) for view in VIEWS])
     assert torch.equal(both, each.any(dim=0))
-
-
-def test_kept_rows_keep_their_thresholds_and_moments():
-    model = with_strays()
-    store = ThresholdStore(len(model))
-    store.open(model.splats().opacities)
-    store.logits.grad = torch.linspace(-1, 1, len(model))
-    store.step(0.05)
-    model = replace(model, thresholds=store)
-    state, kept = tiny.state(model), torch.arange(len(model)) % 3 == 0
-    for name, each in tiny.state(model.keep(kept)).items():
-        assert torch.equal(each, state[name][kept] if each.ndim else state[name])
-    assert len(model) == len(store) == len(kept)  # what was given is as it was
 
 
 def test_views_of_something_else_are_refused():

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.errors import InputError
 from fragprune_plugins.types import Compensation, RasterInputs, RasterOutputs, Rim
 
 # Enough Gaussians and tiles for several pieces of work per thread, in sorting and binning too.
@@ -236,10 +235,3 @@ def test_double_backward_is_refused(engine: CpuEngine) -> None:
     (grad,) = torch.autograd.grad(loss, leaves["means"], create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         grad.sum().backward()
-
-
-def test_wrong_thresholds_never_reach_the_library(engine: CpuEngine) -> None:
-    from fragprune_plugins import rasterize
-
-    with pytest.raises(InputError, match="thresholds"):
-        rasterize(scenes.random_scene(0), torch.zeros(3), engine=engine)
