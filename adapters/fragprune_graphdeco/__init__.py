@@ -6,7 +6,7 @@ densifying    the rows that their densify methods copy
 reading       the getters and the flags that every adapter needs
 kernels       the rule in the CUDA sources of a vendored rasterizer
 plain         whether the PLY that a codebase saves is plain 3DGS
-prover        proves their rasterizers: ``proof`` draws by both, ``likeness`` compares
+proof         proves their rasterizers: it draws by both, and ``likeness`` compares
 stand_ins     modules of ours for their compiled packages
 
 Importing this package imports no torch; ``proof``, ``likeness`` and ``stand_ins`` do.

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, splits
-from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels
-from fragprune_graphdeco.prover import RasterizerProver
+from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import defaults, read_flags, read_getters, training_scripts
 from fragprune_plugins.adapting import (
     CHECKPOINT_KEY,
@@ -107,11 +106,7 @@ class GraphdecoDialect(Dialect):
         outputs: number of values that the host unpacks: 2 (colour, radii) or 3 (also inverse
             depth).
         sparse_adam: the revision looks for SparseGaussianAdam in the package.
-        otherwise: how the host's own rasterizer is known to draw otherwise than our engines; its
-            proof then warns.
     """
-
-    otherwise: ClassVar[str] = ""
 
     package: str
     settings: tuple[str, ...]
@@ -121,7 +116,16 @@ class GraphdecoDialect(Dialect):
     @property
     def prover(self) -> Prover:
         """Compares any rasterizer that takes these calls."""
-        return RasterizerProver(self, self.package, self.otherwise)
+        from fragprune_graphdeco.proof import RasterizerProver
+
+        return RasterizerProver(self)
+
+    def unproved(self, repo: HostRepo) -> str:
+        """Its picture, if the sources of the rasterizer are not vendored."""
+        if repo.package:
+            return super().unproved(repo)
+        absent = f"its picture; the sources of {self.package} are not in the checkout"
+        return "" if vendored(repo, self.package) else absent
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call. The host's matrices are already transposed for row vectors."""

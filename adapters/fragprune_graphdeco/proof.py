@@ -22,6 +22,7 @@ from fragprune_plugins.adapting import (
     HostCall,
     Place,
     Proof,
+    Prover,
     RasterInputs,
     RasterOutputs,
     SeamCall,
@@ -43,47 +44,51 @@ _SHAPE = ("means3D", "scales", "rotations", "cov3D_precomp")
 once more. Ours is the derivative, so antialiased calls are not compared in them."""
 
 
-def shape(call: HostCall) -> Iterator[tuple[str, str]]:
-    """Which arguments a call has, and every rule that it sets."""
-    settings = call.settings._asdict() if hasattr(call.settings, "_asdict") else {}
-    for name, value in settings.items():
-        if name not in OF_A_VIEW:
-            yield name, _rule(value)
-    for name, value in call.arguments.items():
-        if isinstance(value, Tensor) and name in (*ARGUMENTS, "dc"):
-            yield name, str(value.numel() and (*value.shape[1:], value.dtype))
-        elif value is not None:
-            yield name, _rule(value)
+@dataclass(frozen=True)
+class RasterizerProver(Prover):
+    """Compares any rasterizer that takes the calls of a dialect of this family."""
 
+    dialect: Dialect
 
-def prove(dialect: Dialect, call: SeamCall, drawn: HostCall, place: Place) -> Proof:
-    """Compare every output and every gradient; see ``Prover``."""
-    trial = _Trial(dialect, call, drawn, place)
-    try:
-        return trial.prove()
-    except _OtherwiseError as error:
-        return Proof(trial.where, (), failed=str(error))
+    def shape(self, call: HostCall) -> Iterator[tuple[str, str]]:
+        """Which arguments a call has, and every rule that it sets."""
+        settings = call.settings._asdict() if hasattr(call.settings, "_asdict") else {}
+        for name, value in settings.items():
+            if name not in OF_A_VIEW:
+                yield name, _rule(value)
+        for name, value in call.arguments.items():
+            if isinstance(value, Tensor) and name in (*ARGUMENTS, "dc"):
+                yield name, str(value.numel() and (*value.shape[1:], value.dtype))
+            elif value is not None:
+                yield name, _rule(value)
 
+    def prove(self, call: SeamCall, drawn: HostCall, place: Place) -> Proof:
+        """Compare every output and every gradient."""
+        trial = _Trial(self.dialect, call, drawn, place)
+        try:
+            return trial.prove()
+        except _OtherwiseError as error:
+            return Proof(trial.where, (), failed=str(error))
 
-def answer(
-    dialect: Dialect,
-    call: HostCall,
-    inputs: RasterInputs,
-    draw: Callable[..., RasterOutputs],
-    proof: Proof,
-) -> Any:
-    """Answer a call by the dialect, and by what the proof found beyond it; see ``Prover``.
+    def answer(
+        self,
+        call: HostCall,
+        inputs: RasterInputs,
+        draw: Callable[..., RasterOutputs],
+        proof: Proof,
+    ) -> Any:
+        """Answer by the dialect, and by what the proof found beyond it.
 
-    An output that is unknown and that the host does not read is the dialect's, or None.
-    """
-    if not proof.made:
-        packed: tuple[Any, ...] = _tuple(dialect.answer(call, inputs, draw))
-    else:
-        packed, seen = _packed(dialect, call, inputs, draw)
-    answered = [*packed, *[None] * (len(proof.outputs) - len(packed))]
-    for number, name in proof.made.items():
-        answered[number] = _made(name, seen)
-    return tuple(answered) if len(answered) > 1 else answered[0]
+        An output that is unknown and that the host does not read is the dialect's, or None.
+        """
+        if not proof.made:
+            packed: tuple[Any, ...] = _tuple(self.dialect.answer(call, inputs, draw))
+        else:
+            packed, seen = _packed(self.dialect, call, inputs, draw)
+        answered = [*packed, *[None] * (len(proof.outputs) - len(packed))]
+        for number, name in proof.made.items():
+            answered[number] = _made(name, seen)
+        return tuple(answered) if len(answered) > 1 else answered[0]
 
 
 def _packed(

@@ -91,18 +91,7 @@ class Proof:
 
 
 class Prover(ABC):
-    """Compares a host's own rasterizer with our engines, for the calls of one dialect.
-
-    Attributes:
-        otherwise: how the rasterizer is known to draw otherwise than ours; a proof that fails then
-            warns. "" if nothing is known.
-    """
-
-    otherwise: str = ""
-
-    @abstractmethod
-    def unproved(self, repo: HostRepo) -> str:
-        """What a checkout lacks to be read for the rule of its pictures; "" if nothing."""
+    """Compares a host's own rasterizer with our engines, for the calls of one dialect."""
 
     @abstractmethod
     def shape(self, call: HostCall) -> Iterable[Any]:
@@ -141,6 +130,14 @@ class Dialect(ABC):
 
     spares: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     """Packages that the host can do without on a CPU, by import name: what it needs of each."""
+
+    otherwise: ClassVar[str] = ""
+    """How the host's own rasterizer is known to draw otherwise than our engines; a proof that fails
+    then warns. "" if nothing is known."""
+
+    def unproved(self, repo: HostRepo) -> str:
+        """What reading a host cannot show of its pictures; "" if it shows their rule."""
+        return "the picture, until it is compared on the first run"
 
     @property
     def prover(self) -> Prover | None:

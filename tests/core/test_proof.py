@@ -13,7 +13,7 @@ from cli.commands import run_json
 from miniatures import compiled, vanilla_3dgs
 from miniatures.compiled import DIFFERENCES
 
-from fragprune_graphdeco.prover import RasterizerProver
+from fragprune_graphdeco.proof import RasterizerProver
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError, ProofError
 from fragprune_plugins.injection import rasterizing

@@ -117,10 +117,7 @@ def models_of(repo: HostRepo, plugins: Plugins) -> Sequence[Plain]:
 def _unproved(repo: HostRepo, fitting: Tried) -> str:
     """What reading cannot show about a host that fits."""
     warned = [each.found for each in fitting.match.findings if each.level == "warning"]
-    prover = None if repo.package else fitting.adapter.dialect(repo).prover
-    if prover is None:
-        return "; ".join(warned) or "the picture, until it is compared on the first run"
-    told = "; ".join(filter(None, [*warned, prover.unproved(repo)]))
+    told = "; ".join(filter(None, [*warned, fitting.adapter.dialect(repo).unproved(repo)]))
     return told or "its picture; the rule in its vendored rasterizer is the known one"
 
 

@@ -208,7 +208,6 @@ def _kept(repo: HostRepo, dialect: Dialect) -> list[Proof]:
     None that failed for a host that is known to draw otherwise.
     """
     found: dict[str, Proof] = {}
-    excused = dialect.prover is not None and dialect.prover.otherwise
     for name in sorted(dialect.names()):
         file = repo.path(name)
         if file is None and "." not in name and name not in sys.modules:
@@ -217,7 +216,7 @@ def _kept(repo: HostRepo, dialect: Dialect) -> list[Proof]:
         pattern = proofs.file_of(proofs.digest_of(file), "*") if file else None
         for path in sorted(pattern.parent.glob(pattern.name)) if pattern else ():
             proof = proofs.read(path)
-            if proof is not None and not (proof.failed and excused):
+            if proof is not None and not (proof.failed and dialect.otherwise):
                 found[str(proof)] = proof
     return list(found.values())
 
