@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from argparse import ArgumentParser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -21,6 +21,7 @@ from fragprune_3dgs_fork.fork import (
     CHECKPOINT,
     CLASS,
     MODEL,
+    Fork,
     plain_distances,
     read_fork,
     read_getters,
@@ -110,22 +111,10 @@ class ForkDialect(GraphdecoDialect):
     """The calls of a fork, with the values back that its source names.
 
     Attributes:
-        values: what each rasterizer returns, by its package.
-        fields: names of each rasterizer's settings, likewise.
-        blended: by package, the argument with further channels.
-        off: settings and arguments that must be None, False or empty.
-        scaled: settings that change the gradient on the screen, which ours ignores.
-        screens: arguments besides means2D that get a gradient on the screen, which ours do not.
-        own_distances: its simple_knn returns more than that of 3DGS, and has no stand-in.
+        fork: what was read of it.
     """
 
-    values: Mapping[str, tuple[Output, ...]] = field(default_factory=dict)
-    fields: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    blended: Mapping[str, str] = field(default_factory=dict)
-    off: frozenset[str] = frozenset()
-    scaled: frozenset[str] = frozenset()
-    screens: frozenset[str] = frozenset()
-    own_distances: bool = False
+    fork: Fork = field(kw_only=True)
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call; depth and objects are further channels, with their gradients.
@@ -134,28 +123,24 @@ class ForkDialect(GraphdecoDialect):
             EngineError: a setting is not neutral, or the host reads gradients that our engines do
                 not compute.
         """
-        inputs = super().unpack(call)
+        fork, inputs = self.fork, super().unpack(call)
         confidence = getattr(call.settings, "confidence", None)
         if confidence is not None and not bool((confidence == 1).all()):
             self._refuse("confidence", "values other than 1", "1 everywhere, which changes nothing")
         self.expect_off(call)
         if not call.still and call["means2D"].shape[1] > SCREEN:
             self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
-        if not call.still and self.scaled:
+        if not call.still and fork.scaled:
             tell_once(
-                f"{', '.join(sorted(self.scaled))}: the gradient on the screen is not changed by "
+                f"{', '.join(sorted(fork.scaled))}: the gradient on the screen is not changed by "
                 "it here, so other Gaussians are densified than by the host's own rasterizer"
             )
-        if not call.still and self.screens:
+        if not call.still and fork.screens:
             tell_once(
-                f"{', '.join(sorted(self.screens))}: gets no gradient here, and a densification "
+                f"{', '.join(sorted(fork.screens))}: gets no gradient here, and a densification "
                 "that reads it fails; only the host's own rasterizer computes it"
             )
-        roles = [each.role for each in self._values(call)]
-        planes = tuple(name for name in ("invdepth", "alpha") if name in roles)
-        counts, scores = ("count" in roles), ("weight" in roles)
-        inputs = replace(inputs, planes=planes, counts=counts, scores=scores)
-        return self._with(inputs, self._channels(call), 0)
+        return self._with(inputs, inputs.splats.features, 0)
 
     def expect_off(self, call: HostCall) -> None:
         """Refuse a call with a value where the source has None or False by default.
@@ -163,23 +148,20 @@ class ForkDialect(GraphdecoDialect):
         Raises:
             EngineError: it has one.
         """
-        for name in sorted(self.off):
+        for name in sorted(self.fork.off):
             value = getattr(call.settings, name, call.arguments.get(name))
             empty = getattr(value, "shape", ())[:1] == (0,)
             if not (value is None or value is False or empty):
                 self._refuse(name, "a value", "None or False, which changes nothing")
 
-    def _channels(self, call: HostCall) -> Tensor | None:
-        """(N, F) what is blended beside the colours: depth, then objects; None if nothing is."""
+    def features(self, call: HostCall) -> Tensor | None:
+        """(N, F) what is blended beside the colours: depth, then objects."""
         import torch
 
-        roles = [each.role for each in self._values(call)]
-        channels = []
-        if "depth" in roles:
-            view = call.settings.viewmatrix
-            channels.append(call["means3D"] @ view[:3, 2:3] + view[3, 2])
-        if "objects" in roles:
-            channels.append(call[self.blended[call.entry.split(":")[0]]].flatten(1))
+        depth, package = super().features(call), call.entry.split(":")[0]
+        wanted = "objects" in self.values(call)
+        objects = call[self.fork.blended[package]].flatten(1) if wanted else None
+        channels = [each for each in (depth, objects) if each is not None]
         return torch.cat(channels, dim=1) if channels else None
 
     def _with(self, inputs: RasterInputs, channels: Tensor | None, first: int) -> RasterInputs:
@@ -194,7 +176,7 @@ class ForkDialect(GraphdecoDialect):
         """Draw and pack; several times if there are more channels than an engine blends."""
         import torch
 
-        outputs, channels = draw(inputs), self._channels(call)
+        outputs, channels = draw(inputs), self.features(call)
         if channels is not None:
             rest = range(CHANNELS, channels.shape[1], CHANNELS)
             drawn = [outputs, *(draw(self._with(inputs, channels, first)) for first in rest)]
@@ -210,52 +192,49 @@ class ForkDialect(GraphdecoDialect):
             "Train stage 1 with the host's own rasterizer, or prune its PLY: fragprune finetune.",
         )
 
-    def _values(self, call: HostCall) -> tuple[Output, ...]:
+    def _outputs(self, call: HostCall) -> tuple[Output, ...]:
         package = call.entry.split(":")[0]
-        if package not in self.values:
+        if package not in self.fork.outputs:
             self._refuse(package, "a function that no training script calls", "a known call")
-        return self.values[package]
+        return self.fork.outputs[package]
+
+    def values(self, call: HostCall) -> tuple[str, ...]:
+        """What the source says that a call returns."""
+        return tuple(each.role for each in self._outputs(call))
+
+    def made(self, outputs: RasterOutputs, call: HostCall) -> dict[str, Any]:
+        """Depth and objects have gradients."""
+        made, blended = super().made(outputs, call), outputs.features
+        if blended is not None:
+            deep = int("depth" in self.values(call))
+            made |= {"depth": blended[:1], "objects": blended[deep:]}
+        return made
 
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
-        """The host's values in its order: picture (3, H, W), radii (P,) int32, and others."""
-        values = self._values(call)
-        deep = any(each.role == "depth" for each in values)
-        made: dict[str, Any] = {
-            "image": outputs.image,
-            "radii": outputs.radii,
-            "invdepth": outputs.invdepth,
-            "alpha": outputs.alpha,
-        }
-        if outputs.features is not None:
-            made |= {"depth": outputs.features[:1], "objects": outputs.features[int(deep) :]}
-        sums = {
-            "count": outputs.fragments_per_gaussian,
-            "weight": outputs.weights_per_gaussian,
-        }
+        """The host's values in its order, with the shape and the type of its sums."""
 
-        def packed(value: Output) -> Any:
+        def packed(value: Output, made: Any) -> Any:
             if value.role in IN_PLACE:
                 return IN_PLACE[value.role](value.name)
-            if value.role not in sums:
-                return made[value.role]
-            each = sums[value.role]
-            assert each is not None  # unpack asked for it
-            each = each[:, None] if value.column else each
-            return each.int() if value.integer else each.float()
+            if value.role not in ("count", "weight"):
+                return made
+            made = made[:, None] if value.column else made
+            return made.int() if value.integer else made.float()
 
-        return tuple(map(packed, values))
+        return tuple(map(packed, self._outputs(call), super().pack(outputs, call)))
 
     def names(self) -> frozenset[str]:
         """The import names of the rasterizers and simple_knn."""
-        distances = {"simple_knn", "simple_knn._C"} if self.own_distances else frozenset()
-        return (super().names() | self.fields.keys()) - distances
+        plain = plain_distances(self.fork.repo)
+        distances = frozenset() if plain else {"simple_knn", "simple_knn._C"}
+        return (super().names() | self.fork.settings.keys()) - distances
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizers and simple_knn."""
         from fragprune_graphdeco import stand_ins
 
         made = super().modules(draw)
-        for package, names in self.fields.items():
+        for package, names in self.fork.settings.items():
             made[package] = stand_ins.rasterizer(package, names, self.sparse_adam, draw)
         return {name: module for name, module in made.items() if name in self.names()}
 
@@ -341,13 +320,7 @@ class ForkAdapter(GraphdecoAdapter):
             settings=next(iter(fork.settings.values()), ()),
             outputs=2,
             sparse_adam=bool(repo.mentions(["train", MODEL], ["SparseGaussianAdam"])),
-            values=fork.outputs,
-            fields=fork.settings,
-            blended=fork.blended,
-            off=fork.off,
-            scaled=fork.scaled,
-            screens=fork.screens,
-            own_distances=not plain_distances(repo),
+            fork=fork,
         )
 
     def command_line(self, repo: HostRepo) -> CommandLine:

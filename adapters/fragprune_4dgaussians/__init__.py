@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 import fragprune_graphdeco as graphdeco
 from fragprune_4dgaussians.config import PythonFile
-from fragprune_graphdeco import DepthDialect, GraphdecoAdapter, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
     Door,
@@ -55,10 +55,11 @@ _NETWORK = Door(
 
 
 @dataclass(frozen=True)
-class MovingDialect(DepthDialect):
+class MovingDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with depth."""
 
     spares = UNUSED
+    returned = ("image", "radii", "depth")
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call.

@@ -103,10 +103,12 @@ class GraphdecoDialect(Dialect):
     Attributes:
         package: import name of the rasterizer.
         settings: field names of GaussianRasterizationSettings, as this revision passes them.
-        outputs: number of values that the host unpacks: 2 (colour, radii) or 3 (also inverse
-            depth).
+        outputs: number of values that the host unpacks.
         sparse_adam: the revision looks for SparseGaussianAdam in the package.
     """
+
+    returned: ClassVar[tuple[str, ...]] = ("image", "radii", "invdepth")
+    """What the rasterizer returns, in order; for a name that ``made`` lacks it is None."""
 
     package: str
     settings: tuple[str, ...]
@@ -127,11 +129,20 @@ class GraphdecoDialect(Dialect):
         absent = f"its picture; the sources of {self.package} are not in the checkout"
         return "" if vendored(repo, self.package) else absent
 
+    def values(self, call: HostCall) -> tuple[str, ...]:
+        """What a call returns, by the names of ``returned``."""
+        return self.returned[: self.outputs]
+
+    def features(self, call: HostCall) -> Tensor | None:
+        """(N, F) what is blended beside the colours: depth, if the call returns it."""
+        view = call.settings.viewmatrix if "depth" in self.values(call) else None
+        return None if view is None else call["means3D"] @ view[:3, 2:3] + view[3, 2]
+
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call. The host's matrices are already transposed for row vectors."""
         import torch
 
-        s = call.settings
+        s, values = call.settings, self.values(call)
         sh, dc = call.get("shs"), call.get("dc")
         if dc is not None:  # the accelerated rasterizer takes the constant band on its own
             sh = dc if sh is None else torch.cat([dc, sh], dim=1)
@@ -155,16 +166,39 @@ class GraphdecoDialect(Dialect):
                 sh=sh,
                 colors=call.get("colors_precomp"),
                 sh_degree=0 if sh is None else int(s.sh_degree),
+                features=self.features(call),
             ),
             means2d_hook=call.get("means2D"),
             scale_modifier=float(s.scale_modifier),
             compensation="antialiasing" if getattr(s, "antialiasing", False) else "none",
-            planes=("invdepth",) if self.outputs > 2 else (),
+            planes=tuple(name for name in ("invdepth", "alpha") if name in values),
+            counts="count" in values,
+            scores="weight" in values,
         )
 
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
-        """(colour (3, H, W), radii (P,) int32), and inverse depth (1, H, W) if ``outputs`` is 3."""
-        return (outputs.image, outputs.radii, outputs.invdepth)[: self.outputs]
+    def made(self, outputs: RasterOutputs, call: HostCall) -> dict[str, Any]:
+        """The values that a call may return, by name; numbers of each Gaussian are (P,).
+
+        Depth is the sum of z alpha T, invdepth that of alpha T / z. Without gradients are depth,
+        count (int32, drawn fragments), weight (sum of alpha T) and wins (pixels where it is
+        largest).
+        """
+        depth, wins = outputs.features, outputs.wins_per_gaussian
+        return {
+            "image": outputs.image,
+            "radii": outputs.radii,
+            "invdepth": outputs.invdepth,
+            "alpha": outputs.alpha,
+            "depth": None if depth is None else depth[:1].detach(),
+            "count": outputs.fragments_per_gaussian,
+            "weight": outputs.weights_per_gaussian,
+            "wins": None if wins is None else wins.float(),
+        }
+
+    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
+        """The values that the call returns: colour (3, H, W), radii (P,) int32, and others."""
+        made = self.made(outputs, call)
+        return tuple(made.get(name) for name in self.values(call))
 
     def names(self) -> frozenset[str]:
         """The import names of the rasterizer and simple_knn, without an import of torch."""
@@ -176,22 +210,6 @@ class GraphdecoDialect(Dialect):
 
         rasterizer = stand_ins.rasterizer(self.package, self.settings, self.sparse_adam, draw)
         return {self.package: rasterizer, **stand_ins.simple_knn()}
-
-
-@dataclass(frozen=True)
-class DepthDialect(GraphdecoDialect):
-    """A call with depth as third output, the sum of z alpha T; it is not differentiated."""
-
-    def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call; depth is one more channel."""
-        inputs, view = super().unpack(call), call.settings.viewmatrix
-        depth = call["means3D"].detach() @ view[:3, 2:3] + view[3, 2]
-        return replace(inputs, splats=replace(inputs.splats, features=depth), planes=())
-
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
-        """(colour (3, H, W), radii (P,) int32, depth (1, H, W))."""
-        assert outputs.features is not None  # unpack asked for it
-        return outputs.image, outputs.radii, outputs.features.detach()
 
 
 class GraphdecoAdapter(ScriptAdapter):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
@@ -18,15 +18,10 @@ from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
     HostRepo,
-    RasterInputs,
     RasterOutputs,
     Role,
     Seam,
 )
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
 
 MODEL = "scene.gaussian_model"
 TRAIN, PRUNE, DISTIL = "train_densify_prune.py", "prune_finetune.py", "distill_train.py"
@@ -36,24 +31,21 @@ TRAIN, PRUNE, DISTIL = "train_densify_prune.py", "prune_finetune.py", "distill_t
 class LightGaussianDialect(GraphdecoDialect):
     """Vanilla's call of 2023, and its counting form."""
 
-    def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call; with counts if the host wants them."""
-        inputs = super().unpack(call)
-        return inputs.with_counts() if call.settings.f_count else inputs
+    def values(self, call: HostCall) -> tuple[str, ...]:
+        """Colour and radii; in the counting form, which has no gradients, two more before them."""
+        plain = super().values(call)
+        return ("count", "score", *plain) if call.settings.f_count else plain
 
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
-        """(colour (3, H, W), radii (P,)); counting, (count (P,) int32, score (P,)) before them.
+    def made(self, outputs: RasterOutputs, call: HostCall) -> dict[str, Any]:
+        """Also the score (P,). The host adds a Gaussian's opacity once per fragment.
 
-        The counting form has no gradients. The host adds a Gaussian's opacity once per fragment;
-        the product of count and opacity is the same sum, rounded once.
+        The product of count and opacity is the same sum, rounded once.
         """
-        drawn = super().pack(outputs, call)
-        if not call.settings.f_count:
-            return drawn
-        count = outputs.fragments_per_gaussian
-        assert count is not None  # unpack asked for it
-        score = count * call["opacities"].detach().reshape(-1)
-        return (count, score, *(tensor.detach() for tensor in drawn))
+        made = super().made(outputs, call)
+        if call.settings.f_count:
+            made = {name: each.detach() for name, each in made.items() if each is not None}
+            made["score"] = made["count"] * call["opacities"].detach().reshape(-1)
+        return made
 
 
 class LightGaussian(GraphdecoAdapter):

@@ -7,7 +7,7 @@ four values, the last two None unless a setting asks for a score.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +19,6 @@ from fragprune_plugins.adapting import (
     HostInfo,
     HostRepo,
     RasterInputs,
-    RasterOutputs,
     Role,
     Seam,
     SeamCall,
@@ -47,7 +46,7 @@ class LP3DGSDialect(GraphdecoDialect):
     spares = SILENT
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call; with scores if the host wants blending weights.
+        """Translate the call.
 
         Raises:
             EngineError: the host wants another score.
@@ -61,11 +60,11 @@ class LP3DGSDialect(GraphdecoDialect):
                 "Train with the host's own rasterizer and start from what it saved with "
                 "--stage finetune.",
             )
-        return replace(super().unpack(call), scores=bool(call.settings.bw_score))
+        return super().unpack(call)
 
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
-        """(colour (3, H, W), radii (P,), None, score (P,) sum of alpha T or None)."""
-        return outputs.image, outputs.radii, None, outputs.weights_per_gaussian
+    def values(self, call: HostCall) -> tuple[str, ...]:
+        """The picture, radii, None, and the blending weights if the host wants them."""
+        return ("image", "radii", "", "weight" if call.settings.bw_score else "")
 
 
 def nothing_rendered(call: SeamCall) -> dict[str, float]:

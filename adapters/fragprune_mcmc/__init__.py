@@ -21,7 +21,6 @@ from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
     HostRepo,
-    RasterOutputs,
     Role,
     RowTrace,
     Seam,
@@ -40,12 +39,7 @@ MODEL = "scene.gaussian_model"
 class MCMCDialect(GraphdecoDialect):
     """Vanilla's call, with ``is_used`` as third output and the relocation formula beside it."""
 
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
-        """(colour (3, H, W), radii (P,) int32, None for ``is_used``).
-
-        The host passes ``is_used`` on and never reads it.
-        """
-        return outputs.image, outputs.radii, None
+    returned = ("image", "radii", "is_used")  # the last is passed on and never read
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Vanilla's stand-ins, with the relocation formula in the rasterizer's module."""

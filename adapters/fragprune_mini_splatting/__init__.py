@@ -9,7 +9,7 @@ thresholds the scores count only fragments that remain after truncation.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -41,11 +41,10 @@ SCRIPTS = ("ms/train.py", "ms_d/train.py", "gs/train.py")
 class MiniSplattingDialect(GraphdecoDialect):
     """Vanilla's call of 2023 in one package, and with scores or depth in the other."""
 
-    def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call; with scores if it goes to the scoring rasterizer."""
-        inputs = super().unpack(call)
-        scoring = call.entry.startswith(SCORING)
-        return replace(inputs, counts=True, scores=True) if scoring else inputs
+    def values(self, call: HostCall) -> tuple[str, ...]:
+        """Colour and radii; of the scoring rasterizer, three numbers of each Gaussian more."""
+        scores = ("weight", "count", "wins") if call.entry.startswith(SCORING) else ()
+        return (*super().values(call), *scores)
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
@@ -56,20 +55,6 @@ class MiniSplattingDialect(GraphdecoDialect):
         from fragprune_mini_splatting.depth import render_depth
 
         return render_depth(inputs, draw)
-
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
-        """(colour (3, H, W), radii (P,)); scoring, three more (P,).
-
-        These are the sum of the weights alpha T, the number of drawn fragments (int32), and the
-        number of pixels where the Gaussian has the largest weight (float32, as the host's). They
-        have no gradients.
-        """
-        drawn = super().pack(outputs, call)
-        weights, wins = outputs.weights_per_gaussian, outputs.wins_per_gaussian
-        count = outputs.fragments_per_gaussian
-        if weights is None or wins is None or count is None:
-            return drawn
-        return (*drawn, weights, count, wins.float())
 
     def names(self) -> frozenset[str]:
         """The import names of vanilla's packages and of the scoring rasterizer."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import DepthDialect, GraphdecoAdapter, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     CommandLine,
     HostCall,
@@ -48,11 +48,12 @@ where it holds several, that of the last."""
 
 
 @dataclass(frozen=True)
-class RainDialect(DepthDialect):
+class RainDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with a dilation of its own, and depth."""
 
     own_kernels = "compiler"
     spares = UNUSED
+    returned = ("image", "radii", "depth")
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -34,31 +34,33 @@ class RT4DGSDialect(GraphdecoDialect):
     """Cuts the 4D Gaussians at the call's moment; an engine draws the 3D Gaussians."""
 
     own_kernels = "compiler"
+    returned = ("image", "radii", "depth", "alpha", "flow")
+
+    def features(self, call: HostCall) -> Tensor:
+        """(N, 3) depth and flow."""
+        import torch
+
+        depths, flow = super().features(call), call.get("flow_2d")
+        assert depths is not None  # it is returned
+        flow = depths.new_zeros(len(depths), 2) if flow is None else flow
+        return torch.cat([depths, flow], dim=1)
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call. Depth and flow become features; absent rows are at the camera.
+        """Translate the call. Absent rows are at the camera.
 
         The host also drops a Gaussian whose integer radius is not above 0.4. With a dilation of 0.3
         pixels^2 no radius is below 3, so this drops only covariances that are not finite.
         """
-        import torch
-
-        s, sliced = call.settings, at_moment(call)
-        means = sliced.means
+        sliced = at_moment(call)
         flat = {
-            "means3D": means,
+            "means3D": sliced.means,
             "means2D": call.get("means2D"),
+            "flow_2d": call.get("flow_2d"),
             "opacities": sliced.opacities,
             "cov3D_precomp": sliced.cov3d,
             "colors_precomp": call["colors_precomp"] if sliced.colors is None else sliced.colors,
         }
-        inputs = super().unpack(HostCall(s, flat))
-        depths = means @ s.viewmatrix[:3, 2:3] + s.viewmatrix[3, 2]
-        flow = call.get("flow_2d")
-        flow = means.new_zeros(len(means), 2) if flow is None else flow
-        features = torch.cat([depths, flow], dim=1)
-        splats = replace(inputs.splats, features=features)
-        return replace(inputs, splats=splats, planes=("alpha",))
+        return super().unpack(HostCall(call.settings, flat))
 
     def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
         """Rows of a call: with ``compute_cov3D_python`` only those present at the moment.
@@ -94,11 +96,11 @@ class RT4DGSDialect(GraphdecoDialect):
         assert inputs.splats.cov3d is not None
         return (*drawn, inputs.splats.cov3d.detach())
 
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:
-        """(colour (3, H, W), radii (P,), depth (1, H, W), alpha (1, H, W), flow (2, H, W))."""
+    def made(self, outputs: RasterOutputs, call: HostCall) -> dict[str, Any]:
+        """Depth (1, H, W) and flow (2, H, W) have gradients."""
         features = outputs.features
         assert features is not None  # unpack asked for them
-        return outputs.image, outputs.radii, features[:1], outputs.alpha, features[1:]
+        return super().made(outputs, call) | {"depth": features[:1], "flow": features[1:]}
 
     def names(self) -> frozenset[str]:
         """The import names of vanilla's packages and of pointops2_cuda."""

@@ -2,24 +2,27 @@
 
 from collections import namedtuple
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import scenes
 import torch
 
 from fragprune_3dgs_fork import ForkDialect
-from fragprune_3dgs_fork.fork import Output
+from fragprune_3dgs_fork.fork import Fork, Output
 from fragprune_graphdeco import proof
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.hosts.dialect import HostCall
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.rasterizing import further_picture
 from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 ROLES = ("image", "radii", "objects", "alpha", "depth", "invdepth", "unread")
 VALUES = {"p": tuple(Output(each, each) for each in ROLES)}
-DIALECT = ForkDialect("p", (), 2, values=VALUES, blended={"p": "sh_objs"})
+FORK = Fork(HostRepo(Path()), outputs=VALUES, blended={"p": "sh_objs"})
+DIALECT = ForkDialect("p", (), 2, fork=FORK)
 OBJECTS = 19
 
 
