@@ -507,40 +507,10 @@ def read_getters(fork: Fork) -> list[Finding]:
         for node in nodes(methods[name])
         if isinstance(node, ast.Assign) and not is_off(node.value)
     }
-    unset = {each for each in _guards(methods) if fork.is_off(each)} - made
-    found = graphdeco.read_getters(fork.repo, MODEL)
     body = methods.get("get_xyz")
-    if body is not None and unset and _positions(body.body, unset):
-        found = [each for each in found if not each.found.startswith("computed")]
-    return found
-
-
-def _guards(methods: dict[str, Function]) -> set[str]:
-    """Attributes that getters ask for."""
-    tests = [
-        ast.unparse(node.test)
-        for name, body in methods.items()
-        if name.startswith("get_")
-        for node in nodes(body)
-        if isinstance(node, ast.If)
-    ]
-    return {name for test in tests for name in re.findall(r"self\.(\w+) is not None", test)}
-
-
-def _positions(body: list[ast.stmt], unset: set[str]) -> bool:
-    """Whether statements return ``self._xyz`` while attributes are None."""
-    for node in body:
-        if isinstance(node, ast.If):
-            asked = re.fullmatch(r"self\.(\w+) is not None", ast.unparse(node.test))
-            if asked is None or asked[1] not in unset:
-                return False
-            if node.orelse:
-                return _positions(node.orelse, unset)
-        elif isinstance(node, ast.Return):
-            return node.value is not None and ast.unparse(node.value) == "self._xyz"
-        elif not isinstance(node, ast.Expr):
-            return False
-    return False
+    asked = re.findall(r"self\.(\w+) is not None", ast.unparse(body)) if body else []
+    unset = {each for each in asked if fork.is_off(each)} - made
+    return graphdeco.read_getters(fork.repo, MODEL, unset)
 
 
 # -- draws -----------------------------------------------------------------------------------------

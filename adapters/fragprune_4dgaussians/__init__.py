@@ -15,7 +15,7 @@ import os
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import fragprune_graphdeco as graphdeco
 from fragprune_4dgaussians.config import PythonFile
@@ -27,7 +27,6 @@ from fragprune_plugins.adapting import (
     HostInfo,
     HostRepo,
     ModelFileError,
-    NotComparedError,
     ParamGroup,
     RasterInputs,
     Role,
@@ -114,6 +113,11 @@ class MovingGaussians(GraphdecoAdapter):
     )
     own_names = (f"{graphdeco.MODEL}:save_deformation", f"{graphdeco.MODEL}:_deformation_table")
     dialect_type = MovingDialect
+    undrawn = (
+        "Gaussians that a network moves for each moment",
+        "Draw with fragprune run -- python render.py -m OUTPUT --skip_train --skip_video; "
+        "the host's metrics.py measures the pictures.",
+    )
     steps_by_rendering = True
     checkpoints = "chkpnt_fine_"
     seams = (
@@ -183,16 +187,6 @@ class MovingGaussians(GraphdecoAdapter):
             place = camera["camera"].viewmatrix.flatten().tolist()
             return hash((camera["time"], *place))
         return int(camera.uid)
-
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
-        """Refuse: our readers do not know the network."""
-        raise NotComparedError(
-            "4DGaussians",
-            "Gaussians that a network moves for each moment",
-            "models that our readers can draw",
-            "Draw with fragprune run -- python render.py -m OUTPUT --skip_train --skip_video; "
-            "the host's metrics.py measures the pictures.",
-        )
 
     # -- its files -------------------------------------------------------------------------------
 

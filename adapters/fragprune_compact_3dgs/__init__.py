@@ -11,13 +11,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from fragprune_graphdeco import GraphdecoAdapter
 from fragprune_plugins.adapting import (
     HostInfo,
-    HostRepo,
-    NotComparedError,
     ParamGroup,
     Role,
     RowTrace,
@@ -92,6 +90,10 @@ class Compact3DGS(GraphdecoAdapter):
         ParamGroup("mask"),
         ParamGroup(NETWORK, colour=True, named=False),
     )
+    undrawn = (
+        "models whose colours are a network's and not in the file",
+        "Draw and measure with the host's render.py and metrics.py.",
+    )
     densifies_until = ()  # it prunes by its mask to the end
     own_names = tuple(f"{MODEL}:{name}" for name in ("vq_scale", "recolor", "mlp_head"))
     seams = (
@@ -114,15 +116,6 @@ class Compact3DGS(GraphdecoAdapter):
             "checkpoints without its mask and its colour network: the host cannot resume them",
             "--stage finetune --from-iter N and --iterations N + 5000 of one run",
             "Add --from-iter with the iteration that training should end at.",
-        )
-
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
-        """Refuse: our engines cannot draw colours from a network."""
-        raise NotComparedError(
-            "Compact-3DGS",
-            "models whose colours are a network's and not in the file",
-            "models that our readers can draw",
-            "Draw and measure with the host's render.py and metrics.py.",
         )
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:

@@ -21,6 +21,7 @@ from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
     Finding,
+    HostAdapter,
     HostCall,
     HostInfo,
     HostRepo,
@@ -183,17 +184,8 @@ class GaussianSplatting(GraphdecoAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check that this is the installed package, not a checkout of the same name."""
-        if repo.package in self.installed:
-            revision = Finding("info", "revision", repo.package, repo.commit)
-            return [revision, *super().fingerprint(repo)]
-        return [
-            Finding.error(
-                "other-host",
-                repo.root,
-                "a folder",
-                f"the installed package {PACKAGE}, as python -m {PACKAGE}.train runs it",
-            )
-        ]
+        package = HostAdapter.fingerprint(self, repo)
+        return [*package, *super().fingerprint(repo)] if repo.package else package
 
     def dialect(self, repo: HostRepo) -> PackageDialect:
         """The dialect of the only rasterizer call, in ``GaussianModel.render``."""

@@ -227,6 +227,7 @@ class GraphdecoAdapter(ScriptAdapter):
         densifies_until: arguments with the iterations after which the host adds, relocates, prunes
             and resets no Gaussian; () if it does so to its end.
         filtered: its PLYs have a 3D filter, or flat Gaussians, by whose rules it draws them.
+        undrawn: its models, if our readers cannot draw them, and how a user can; () if they can.
     """
 
     package = "diff_gaussian_rasterization"
@@ -239,6 +240,7 @@ class GraphdecoAdapter(ScriptAdapter):
     optimizer = "Adam"
     densifies_until: tuple[str, ...] = ("densify_until_iter",)
     filtered = False
+    undrawn: tuple[str, ...] = ()
     checkpoints = "chkpnt"
     seams = (
         *MODEL_SEAMS,
@@ -456,6 +458,9 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """No fields: vanilla's rules apply."""
+        if self.undrawn:
+            found, remedy = self.undrawn
+            raise NotComparedError(self.info.title, found, "models that we can draw", remedy)
         for flag in ("--antialiasing", "--train_test_exp"):
             if flag in arguments:
                 raise NotComparedError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 from fragprune_plugins.adapting import CommandLine, Finding, Function, HostRepo, imported, nodes
 
@@ -12,10 +12,13 @@ GETTERS = ("get_xyz", "get_opacity")
 _OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "click", "absl")
 
 
-def read_getters(repo: HostRepo, module: str, model: str = "GaussianModel") -> list[Finding]:
+def read_getters(
+    repo: HostRepo, module: str, unset: Collection[str] = (), model: str = "GaussianModel"
+) -> list[Finding]:
     """An error for each getter that is no property, and for computed positions.
 
-    A threshold belongs to a row of the positions that the optimizer moves.
+    A threshold belongs to a row of the positions that the optimizer moves. Attributes in ``unset``
+    are None.
     """
     found = []
     for name in GETTERS if repo.tree(module) else ():  # if not, the seams say so
@@ -25,7 +28,7 @@ def read_getters(repo: HostRepo, module: str, model: str = "GaussianModel") -> l
         elif not is_property(function):
             what = "a method"
         elif name == "get_xyz":
-            what = computed(function, "_xyz")
+            what = computed(function, "_xyz", unset)
         else:
             what = None
         if what:
@@ -51,16 +54,28 @@ def is_property(function: Function) -> bool:
     return any("property" in ast.unparse(each) for each in function.decorator_list)
 
 
-def computed(function: Function, attribute: str) -> str | None:
-    """How a getter computes its value; None if it always returns an attribute of ``self``."""
-    names = {f"self.{attribute}"}
-    for node in nodes(function):
-        if isinstance(node, ast.Assign) and ast.unparse(node.value) in names:
+def computed(function: Function, attribute: str, unset: Collection[str] = ()) -> str | None:
+    """How a getter computes its value; None if it always returns an attribute of ``self``.
+
+    What it does where attributes in ``unset`` are not None does not count.
+    """
+    off = {f"self.{each} is not None" for each in unset}
+    skipped = {
+        id(inner)
+        for node in nodes(function)
+        if isinstance(node, ast.If) and ast.unparse(node.test) in off
+        for each in node.body
+        for inner in nodes(each)
+    }
+    body = [node for node in nodes(function) if id(node) not in skipped]
+    names, assigned = {f"self.{attribute}"}, [each for each in body if isinstance(each, ast.Assign)]
+    for node in assigned:
+        if ast.unparse(node.value) in names:
             names |= {each.id for each in node.targets if isinstance(each, ast.Name)}
-    for node in nodes(function):
-        if isinstance(node, ast.Assign) and ast.unparse(node.value) not in names:
+    for node in assigned:
+        if ast.unparse(node.value) not in names:
             names -= {ast.unparse(each) for each in node.targets}
-    returned = [node.value for node in nodes(function) if isinstance(node, ast.Return)]
+    returned = [node.value for node in body if isinstance(node, ast.Return)]
     others = [ast.unparse(each) for each in returned if each and ast.unparse(each) not in names]
     if others:
         return f"computed, it returns {others[0][:60]}"

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapting import (
-    Finding,
     HostAdapter,
     HostInfo,
     HostRepo,
@@ -188,19 +187,6 @@ class Gsplat(HostAdapter):
         """All; versions before 1.5.1 export nothing."""
         exports = repo.path(EXPORTER) is not None
         return self.seams if exports else revised(self.seams, {"export_splats": None})
-
-    def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Check that this is the installed package."""
-        if repo.package == PACKAGE:
-            return [Finding("info", "revision", PACKAGE, repo.commit)]
-        return [
-            Finding.error(
-                "other-host",
-                repo.root,
-                "a folder",
-                "the installed package gsplat, or a script that imports it",
-            )
-        ]
 
     def dialect(self, repo: HostRepo) -> GsplatDialect:
         """The version's dialect, read off its source.

@@ -130,18 +130,10 @@ class Nerfstudio(HostAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check that this is the installed package, and that gsplat is installed beside it."""
-        if repo.package == PACKAGE and HostRepo.installed("gsplat") is not None:
-            return [Finding("info", "revision", PACKAGE, repo.commit)]
-        found = "no gsplat beside it" if repo.package == PACKAGE else "a folder"
-        return [
-            Finding.error(
-                "other-host",
-                repo.root,
-                found,
-                "the installed packages nerfstudio and gsplat",
-                f"Train with: ns-train {METHOD}",
-            )
-        ]
+        found = super().fingerprint(repo)
+        alone = repo.package and HostRepo.installed("gsplat") is None
+        absent = Finding.error("other-host", repo.root, "no gsplat beside it", "gsplat 1.4")
+        return [*found, *([absent] if alone else [])]
 
     def dialect(self, repo: HostRepo) -> Dialect:
         """That of the installed gsplat."""

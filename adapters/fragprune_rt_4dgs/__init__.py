@@ -19,7 +19,6 @@ from fragprune_plugins.adapting import (
     HostInfo,
     HostRepo,
     ModelFileError,
-    NotComparedError,
     ParamGroup,
     SeamCall,
     UsageError,
@@ -64,6 +63,10 @@ class RT4DGS(GraphdecoAdapter):
     )
     own_names = (f"{MODEL}:get_marginal_t", f"{RASTERIZER}:GaussianRasterizer")
     dialect_type = RT4DGSDialect
+    undrawn = (
+        "checkpoints of Gaussians in time for models, and no PLY",
+        "Read the PSNR that the host prints at its test_iterations.",
+    )
     seams = revised(
         GraphdecoAdapter.seams,
         {
@@ -106,15 +109,6 @@ class RT4DGS(GraphdecoAdapter):
                 "Learn inside one run, with fragprune run --stage finetune --from-iter N.",
             )
         return script, arguments
-
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
-        """Refuse: our readers have no notion of time."""
-        raise NotComparedError(
-            "RT-4DGS",
-            "checkpoints of Gaussians in time for models, and no PLY",
-            "models that our readers can draw",
-            "Read the PSNR that the host prints at its test_iterations.",
-        )
 
     def view(self, camera: Any) -> int:
         """The camera's number, because every render gets a copy of its camera."""

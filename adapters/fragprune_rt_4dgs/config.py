@@ -29,10 +29,10 @@ class YAMLFile(ConfigFile):
         except (OmegaConfBaseException, YAMLError) as error:
             raise ValueError(str(error)) from error
 
-    def overrule(self, text: str, values: dict[str, Any]) -> str:
+    def copied(self, path: Path, values: dict[str, Any]) -> str:
         """The file's text with one more section that holds the new values."""
         lines = [f"  {name}: {json.dumps(value)}" for name, value in values.items()]
-        return "\n".join([text.rstrip(), "fragprune:", *lines, ""])
+        return "\n".join([path.read_text(encoding="utf-8").rstrip(), "fragprune:", *lines, ""])
 
 
 def _flat(section: Any) -> dict[str, Any]:

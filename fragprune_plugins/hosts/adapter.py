@@ -16,7 +16,7 @@ from fragprune_plugins.hosts.dialect import Dialect
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.seams import Seam, SeamCall
-from fragprune_plugins.hosts.source import HostRepo, check_seams
+from fragprune_plugins.hosts.source import HostRepo, look_up
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -125,13 +125,9 @@ class ConfigFile:
             raise ValueError("not an object of names and values")
         return values
 
-    def overrule(self, text: str, values: dict[str, Any]) -> str:
-        """Replace the file's values by these; returns the new text."""
-        return json.dumps(json.loads(text) | values)
-
     def copied(self, path: Path, values: dict[str, Any]) -> str:
         """The text of a copy with these values, which may lie in any folder."""
-        return self.overrule(path.read_text(encoding="utf-8"), values)
+        return json.dumps(json.loads(path.read_text(encoding="utf-8")) | values)
 
 
 def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
@@ -301,14 +297,22 @@ class HostAdapter(ABC):
         """The seams of this revision; by default all of ``seams``."""
         return self.seams
 
-    @abstractmethod
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Findings on whether the source is this host; an error finding means that it is not."""
+        """Findings on whether the source is this host; an error finding means that it is not.
+
+        By default it is where it is an installed package of this host.
+        """
+        if repo.package in self.installed:
+            return [Finding("info", "revision", repo.package, repo.commit)]
+        expected = f"the installed package {self.installed[0]}, or a script that imports it"
+        return [Finding.error("other-host", repo.root, "a folder", expected)]
 
     def match(self, repo: HostRepo) -> Match:
         """Check fingerprint and seams. An adapter that raises does not fit."""
         try:
-            findings = [*self.fingerprint(repo), *check_seams(repo, self.seams_for(repo))]
+            states = look_up(repo, self.seams_for(repo))
+            seams = (each.finding for each in states if each.finding)
+            findings = [*self.fingerprint(repo), *seams]
         except Exception as error:  # the adapter's own; others are still tried
             findings = [
                 Finding.error(

@@ -281,8 +281,3 @@ def _look_up(repo: HostRepo, seam: Seam) -> SeamState:
     found, expected = f"parameters ({', '.join(have)})", f"also {', '.join(missing)}"
     changed = Finding.error("seam-signature", where, found, expected)
     return SeamState(seam, "changed", at, changed)
-
-
-def check_seams(repo: HostRepo, seams: Iterable[Seam]) -> list[Finding]:
-    """An error finding for each seam that is missing or changed."""
-    return [state.finding for state in look_up(repo, seams) if state.finding]

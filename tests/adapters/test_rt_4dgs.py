@@ -312,7 +312,7 @@ def test_the_last_section_of_the_file_wins(tmp_path):
     file.write_text("batch_size: 2\nA:\n  rate: 1e-5\n  iterations: 30_000\n  eval: True")
     assert yaml.read(file) == {"batch_size": 2, "rate": 1e-5, "iterations": 30000, "eval": True}
     values = {"iterations": 7, "save_iterations": [3, 7], "start_checkpoint": "a b/c'd.pth"}
-    file.write_text(yaml.overrule(file.read_text(), values))
+    file.write_text(yaml.copied(file, values))
     assert yaml.read(file) == {"batch_size": 2, "rate": 1e-5, "eval": True} | values
 
 
