@@ -41,7 +41,6 @@ from fragprune_plugins.adapting import (
     RasterOutputs,
     Role,
     Seam,
-    Splats,
     UsageError,
 )
 
@@ -140,7 +139,7 @@ class ForkDialect(GraphdecoDialect):
                 f"{', '.join(sorted(fork.screens))}: gets no gradient here, and a densification "
                 "that reads it fails; only the host's own rasterizer computes it"
             )
-        return self._with(inputs, inputs.splats.features, 0)
+        return inputs
 
     def expect_off(self, call: HostCall) -> None:
         """Refuse a call with a value where the source has None or False by default.
@@ -155,7 +154,12 @@ class ForkDialect(GraphdecoDialect):
                 self._refuse(name, "a value", "None or False, which changes nothing")
 
     def features(self, call: HostCall) -> Tensor | None:
-        """(N, F) what is blended beside the colours: depth, then objects."""
+        """(N, F) the first of the channels that are blended beside the colours."""
+        channels = self._channels(call)
+        return None if channels is None else channels[:, :CHANNELS]
+
+    def _channels(self, call: HostCall) -> Tensor | None:
+        """(N, F) all of them: depth, then objects."""
         import torch
 
         depth, package = super().features(call), call.entry.split(":")[0]
@@ -164,22 +168,17 @@ class ForkDialect(GraphdecoDialect):
         channels = [each for each in (depth, objects) if each is not None]
         return torch.cat(channels, dim=1) if channels else None
 
-    def _with(self, inputs: RasterInputs, channels: Tensor | None, first: int) -> RasterInputs:
-        """The inputs with as many channels from ``first`` on as an engine blends at once."""
-        some = None if channels is None else channels[:, first : first + CHANNELS]
-        assert isinstance(inputs.splats, Splats)  # the base makes these
-        return replace(inputs, splats=replace(inputs.splats, features=some))
-
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
     ) -> Any:
         """Draw and pack; several times if there are more channels than an engine blends."""
         import torch
 
-        outputs, channels = draw(inputs), self.features(call)
+        outputs, channels = draw(inputs), self._channels(call)
         if channels is not None:
-            rest = range(CHANNELS, channels.shape[1], CHANNELS)
-            drawn = [outputs, *(draw(self._with(inputs, channels, first)) for first in rest)]
+            rest = torch.split(channels, CHANNELS, dim=1)[1:]
+            splats = (replace(inputs.splats, features=each) for each in rest)
+            drawn = [outputs, *(draw(replace(inputs, splats=each)) for each in splats)]
             blended = [each.features for each in drawn if each.features is not None]
             outputs = replace(outputs, features=torch.cat(blended))
         return self.pack(outputs, call)
